@@ -41,7 +41,6 @@ DOORS = {
     "xarray": (),
     "scipy": (
         "recordings/matlab.py",
-        "recordings/volume_balance.py",
         "blind/statistics.py",
         "estimate/state_noise.py",
         "logbook/compare.py",

@@ -11,6 +11,7 @@ import torch
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.effects import build_network, place
 from fdi_torch.estimate.diagnosis import Diagnosis, diagnose
+from fdi_torch.estimate.misfit import UNEXPLAINED_RATIO, unexplained_ratio
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlacedEffect
 
@@ -39,3 +40,14 @@ def test_only_a_fault_of_a_tank_has_a_hole() -> None:
     assert leak.hole is not None and leak.flow is not None and plugging.flow is not None
     assert 0.6 * math.pi / 4.0 * leak.hole**2 * math.sqrt(2 * 9.81 * 0.5) == pytest.approx(leak.flow)
     assert plugging.flow > 0.0 and plugging.hole is None
+
+
+@pytest.mark.parametrize(("error", "explained"), [(2e-6, True), (2e-5, False)])
+def test_the_error_of_the_simulation_is_no_misfit_of_a_recording_without_noise_that_rests(
+    error: float, explained: bool
+) -> None:
+    """A level that settles within 100 s of an hour; the plant that made it predicts it to within a few micrometres."""
+    time = torch.arange(3600.0, dtype=torch.float64)[:, None]
+    levels = 1.0 - 0.5 * torch.exp(-time / 20.0)
+    ratio = unexplained_ratio(levels.new_tensor([error]), levels, torch.ones_like(levels))
+    assert (ratio <= UNEXPLAINED_RATIO) == explained

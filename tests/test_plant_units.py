@@ -122,14 +122,23 @@ def test_a_faulty_plant_is_no_wrong_unit(folder: Path, faults: dict[str, float |
     assert wrong_units(plant, recorded(plant, faults)) == ""
 
 
-def test_a_plant_without_pumps_at_rest_or_too_short_says_nothing(folder: Path) -> None:
+def test_a_recording_without_metered_flows_or_too_short_says_nothing(folder: Path) -> None:
     run = recorded(load_plant(folder / "rig.yaml"), {})
     (folder / "large.yaml").write_text(PLANT.replace("200 cm^2", "200 m^2").replace("150 cm^2", "150 m^2"))
     large = load_plant(folder / "large.yaml")
     display_in(large.units)
     assert wrong_units(large, run.stretch(0, 32)) == "" != wrong_units(large, run)
-    at_rest = replace(run, inputs=0.0 * run.inputs)
-    assert wrong_units(large, at_rest) == ""
+    unmetered = replace(run, inputs=0.0 * run.inputs)
+    assert wrong_units(large, unmetered) == ""
+    assert wrong_units(large, replace(unmetered, outputs=0.0 * run.outputs)) == ""
+
+
+def test_flows_that_no_recording_can_tell_apart_are_no_wrong_unit(folder: Path) -> None:
+    """A leaking tank at a constant level: flows by pump and by laws are proportional, the regression is singular."""
+    plant = load_plant(folder / "rig.yaml")
+    run = recorded(plant, {})
+    constant = replace(run, inputs=0.0 * run.inputs + 5e-5, outputs=0.0 * run.outputs + 0.1)
+    assert wrong_units(plant, constant) == ""
 
 
 def test_swapped_sensors_are_no_wrong_unit(folder: Path) -> None:

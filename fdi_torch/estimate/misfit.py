@@ -22,7 +22,8 @@ from fdi_torch.recordings.repeated_readings import resolution
 UNEXPLAINED_RATIO = 1.2
 """The model is rejected if the standard deviation of its residuals exceeds this multiple of the noise of a sensor."""
 EXACT = 1e-5
-"""Relative error of a simulated reading: a trajectory counts as converged at this defect."""
+"""Relative error of a simulated reading: `gap.free_runs.prediction` stops at this defect. A recording without noise
+that is mostly at rest has smaller second differences, and would count as unexplained by the plant that made it."""
 UNRELIABLE = "Unreliable: the model does not explain the recording"
 
 

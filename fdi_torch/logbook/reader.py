@@ -74,10 +74,9 @@ class Attachment:
 class Run:
     """An opened log. metadata: record name -> texts. attachments by name. damages: unreadable parts."""
 
-    def __init__(self, path: str | Path, salvage: bool = False, max_chunk_bytes: int = scan.MAX_CHUNK_BYTES) -> None:
+    def __init__(self, path: str | Path, salvage: bool = False) -> None:
         self.path = Path(path)
         self.salvage = salvage
-        self.max_chunk_bytes = max_chunk_bytes
         self.profile = self.library = ""
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, Attachment] = {}
@@ -153,7 +152,7 @@ class Run:
     def _part_messages(self, part: scan.Frame, directory: Directory) -> list[Message]:
         """Messages of a chunk. The total expansion of compressed chunks is limited relative to the file's size."""
         try:
-            cap = min(self.max_chunk_bytes, self._allowed)
+            cap = min(scan.MAX_CHUNK_BYTES, self._allowed)
             messages = open_part(self.data, part, directory, cap, require_crc=self.ours)
             self._allowed -= scan.unpacked_size(self.data, part)
             return messages
@@ -194,9 +193,9 @@ class Run:
         )
 
 
-def read_run(path: str | Path, salvage: bool = False, max_chunk_bytes: int = scan.MAX_CHUNK_BYTES) -> Run:
+def read_run(path: str | Path, salvage: bool = False) -> Run:
     """Open a log of this or another program. Raises LogError if it is not an MCAP file."""
-    return Run(path, salvage, max_chunk_bytes)
+    return Run(path, salvage)
 
 
 class Directory:

@@ -9,6 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from fdi_torch.parameters import parse_quantity
 from fdi_torch.recording import LARGEST as LARGEST_QUANTITY
 
@@ -131,3 +134,7 @@ class Sensor(Component):
     @property
     def column(self) -> str:
         return self.channel or self.name
+
+    def clipped(self, reading: Tensor) -> Tensor:
+        """The reading limited to low..high."""
+        return reading if self.low is None and self.high is None else torch.clamp(reading, self.low, self.high)

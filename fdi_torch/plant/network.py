@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from fdi_torch.parameters import ParameterSpace, by_prefix
 from fdi_torch.plant.constants import constant_parameters
-from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor
+from fdi_torch.plant.description import OUTSIDE, PlantDescription
 from fdi_torch.plant.effect import Memory, Placement, Stage, Values
 from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
 from fdi_torch.plant.local_conditions import Local
@@ -80,7 +80,7 @@ class TankNetwork(nn.Module):
         return other
 
     def bind(self, space: ParameterSpace, theta: Float[Tensor, "*batch P"]) -> PlaceValues:
-        """All constants by place and field: from theta (*batch, P) where `space` names them, else nominal."""
+        """All constants by place and field: from theta where `space` names them, else nominal."""
         named = self.constants.named(self.nominal)
         for name, value in space.named(theta).items():
             self.constants.index(name)
@@ -94,9 +94,7 @@ class TankNetwork(nn.Module):
         clock: Clock,
         values: PlaceValues,
     ) -> Float[Tensor, "*batch order"]:
-        """Rate of change of the state (*batch, order), m/s; state: as in `rates`, last dimension; commands: outputs of
-        the actuators (*batch, actuators).
-        """
+        """Rate of change of the state, m/s. state: as in `rates`. commands: outputs of the actuators."""
         rates = self.rates(state.unbind(-1), commands.unbind(-1), clock, values)
         return torch.stack(torch.broadcast_tensors(*rates), dim=-1)
 
@@ -247,7 +245,7 @@ class TankNetwork(nn.Module):
         signals = self._signals(levels, values)
         readings, new_memory = self._reading_chain.propagate(signals, memory, clock, values)
         sensors = self.description.sensors
-        return [_clipped(sensor, value) for sensor, value in zip(sensors, readings, strict=True)], new_memory
+        return [sensor.clipped(value) for sensor, value in zip(sensors, readings, strict=True)], new_memory
 
     def steady_reading_memory(self, levels: Sequence[Tensor], clock: Clock, values: PlaceValues) -> Memory:
         """The sensors' memories in steady state, after the levels have been constant for a long time."""
@@ -298,7 +296,3 @@ class TankNetwork(nn.Module):
         self.transfer(net, *((OUTSIDE, location) if at_tank else (first, last)), flow)
         for tank, share in placement.effect.recipients(parameters).items():
             self.transfer(net, tank, OUTSIDE, share * flow)
-
-
-def _clipped(sensor: Sensor, value: Tensor) -> Tensor:
-    return value if sensor.low is None and sensor.high is None else torch.clamp(value, sensor.low, sensor.high)

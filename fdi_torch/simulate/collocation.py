@@ -92,17 +92,14 @@ class Collocation:
         self._fixed_commands: list[Tensor] | None = None
 
     def linearise(self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L nodes n"]) -> Linearised:
-        """One Newton step from the trajectories levels (L, K+1, n), with derivatives; theta (L, P).
+        """One Newton step from the trajectories `levels`, with derivatives.
 
         A trajectory of the tanks' levels alone (n = tanks) is completed by the steady states of the effects.
         """
         lanes, nodes, _ = levels.shape
         what = f"{lanes} trajectories of {nodes:.3g} steps with {len(self.by)} sensitivities each"
-        expect_room(
-            float(lanes * nodes * self.network.order) * (self.network.order + len(self.by)),
-            what,
-            "choose a longer step",
-        )
+        numbers = float(lanes * nodes * self.network.order) * (self.network.order + len(self.by))
+        expect_room(numbers, what, "choose a longer step")
         path = self._path(theta, levels)
         middle = 0.5 * (path[..., :-1] + path[..., 1:])
         values = self.network.bind(self.space, theta.unsqueeze(-2))
@@ -133,7 +130,7 @@ class Collocation:
         return corrected.movedim(2, 1), defect
 
     def converge(self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L nodes n"], rounds: int = 12) -> Linearised:
-        """Newton steps at fixed theta from levels (L, K+1, tanks), m, until they converge or `rounds` are used up."""
+        """Newton steps at fixed theta from `levels`, m, until they converge or `rounds` are used up."""
         for _ in range(rounds - 1):
             levels, defect = self.corrected(theta, levels)
             if float(defect.max()) < CONVERGED * self._length:
@@ -153,16 +150,15 @@ class Collocation:
             inverse = 1.0 / (1.0 - 0.5 * step * by_level[:, tank, tank])
             misfit = step * rates[:, tank] - torch.diff(level)
             zero = level.new_zeros(len(level), 1, 1)
-            correction = scan_in_time((2.0 * inverse - 1.0)[:, None, None], (inverse * misfit)[:, None, None], zero)[
-                :, 0, 0
-            ]
+            transition, forcing = (2.0 * inverse - 1.0)[:, None, None], (inverse * misfit)[:, None, None]
+            correction = scan_in_time(transition, forcing, zero)[:, 0, 0]
             levels[..., tank] += correction
             if float(correction.abs().max()) < ONE_CONVERGED * self._length:
                 break
         return levels
 
     def rates(self, middle: Float[Tensor, "#L K m"], theta: Float[Tensor, "L P"]) -> Float[Tensor, "L K n"]:
-        """dh/dt (L, K, tanks), m/s, at given mid-step levels (L or 1, K, tanks)."""
+        """dh/dt of the tanks, m/s, at given mid-step levels, m."""
         values = self.network.bind(self.space, theta.unsqueeze(-2))
         shape = (len(theta), middle.shape[1])
         commands, levels = self._actuation.commands(values, len(theta)), middle.movedim(-1, 0).contiguous()
@@ -170,17 +166,17 @@ class Collocation:
         return torch.stack([r.expand(shape) for r in rates], dim=1).movedim(1, 2)
 
     def read(self, levels: Float[Tensor, "#L nodes n"], theta: Float[Tensor, "L P"]) -> Float[Tensor, "L S C"]:
-        """Readings (L, S, C) of given levels (L or 1, K+1, tanks), m."""
+        """Readings at given levels, m."""
         path = levels.expand(len(theta), *levels.shape[1:]).movedim(1, 2)
         return self._output_map.read(path, self.network.bind(self.space, theta.unsqueeze(-2))).movedim(1, 2)
 
     def look(self, levels: Float[Tensor, "L nodes n"], theta: Float[Tensor, "L P"]) -> LinearisedOutputs:
-        """The sensors linearised at given levels (L, K+1, tanks)."""
+        """The sensors linearised at given levels, m."""
         values = self.network.bind(self.space, theta.unsqueeze(-2))
         return self._output_map.look(levels.movedim(1, 2), values, self._columns(theta))
 
     def constant_guess(self, theta: Float[Tensor, "L P"]) -> Float[Tensor, "L nodes n"]:
-        """Trajectories that stay at their start, (L, K+1, n)."""
+        """Trajectories that stay at their start, m."""
         start, _ = self._start(theta, self.network.bind(self.space, theta.unsqueeze(-2)), slopes=False)
         return start.unsqueeze(1).expand(-1, len(self.experiment.nodes), -1).clone()
 

@@ -26,8 +26,8 @@ def newton_step(
 ) -> tuple[Tensor, ...]:
     """One Newton step of all lanes and steps at once.
 
-    span (K,): lengths of the steps, s. path (L, n, K+1): levels. rates (L, n, K): at mid-step, with their slopes
-    by_level (L, n, n, K) and by_theta (L, n, P, K). start (L, n) and start_slopes (L, n, P): initial levels.
+    span: lengths of the steps, s. path: levels. rates: at mid-step, with their slopes by_level and by_theta. start and
+    start_slopes: initial levels and their slopes.
 
     Returns the corrected levels (L, n, K+1), their sensitivities (L, n, P, K+1), transition and gain of a disturbance
     (L, n, n, K), and the largest correction (L,).
@@ -49,7 +49,7 @@ def newton_correction(
     by_level: Float[Tensor, "L n n K"],
     start: Float[Tensor, "L n"],
 ) -> tuple[Float[Tensor, "L n K+1"], Float[Tensor, " L"]]:
-    """The corrected levels (L, n, K+1) and the largest correction (L,) of `newton_step`, without sensitivities."""
+    """The corrected levels and the largest correction of `newton_step`, without sensitivities."""
     compiled = midpoint_correction(span, path, rates, by_level, start)
     if compiled is not None:
         return compiled
