@@ -57,7 +57,7 @@ WRONG_RUN = {
     "fault": ("T1.leak", "T1.leek", "run.yaml: estimate.parameters.0: ", "the nearest is 'T1.leak'"),
     "plant": ("plant: ", "plant: three_tanks #", "run.yaml: plant: ", "the nearest is 'three_tank'"),
     "no YAML": ("[T1.leak]", "[T1.leak", "run.yaml: line 3: ", "not valid YAML"),
-    "recording": ("rig.csv", "rigs.csv", "rigs.csv: ", "expected a file, got none there"),
+    "recording": ("rig.csv", "rigs.csv", "rigs.csv: ", "file not found"),
     "log folder": ("folder: logs", "folder: rig.csv", "rig.csv/run.mcap: ", "is a file, not a folder"),
 }
 WRONG_PLANT = {
