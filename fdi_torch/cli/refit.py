@@ -27,8 +27,8 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
 DISTURBED = (
-    "the standard errors below take the residual for noise of the sensors; fdi gap --adopt FILE --narrow calibrates with "
-    "random disturbances of the flows"
+    "the standard errors below take the residual for noise of the sensors; fdi gap --adopt FILE --narrow calibrates "
+    "with random disturbances of the flows"
 )
 
 

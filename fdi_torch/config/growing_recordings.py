@@ -34,7 +34,9 @@ def growing_rows(config: RecordingConfig, plant: PlantDescription, base: Path, i
     if config.mask or config.every != 1:
         raise ConfigError([f"{config.file}: expected neither mask nor every for a file that is followed; remove them"])
     if config.also or config.tags:
-        raise ConfigError([f"{config.file}: expected one row for each time in a file that is followed; remove also and tags"])
+        raise ConfigError(
+            [f"{config.file}: expected one row for each time in a file that is followed; remove also and tags"]
+        )
     if config.sheet or not config.header:
         raise ConfigError([f"{config.file}: expected a CSV file with a header to follow; remove sheet and header"])
     clock = config.columns.get("t", ColumnConfig())

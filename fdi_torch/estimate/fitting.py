@@ -59,7 +59,9 @@ class Fitting:
     engine: EngineKind = "auto"
 
     def __repr__(self) -> str:
-        return f"Fitting of {self.plant.name} to {len(self.recordings)} recordings; the columns of theta are\n{self.space}"
+        return (
+            f"Fitting of {self.plant.name} to {len(self.recordings)} recordings; the columns of theta are\n{self.space}"
+        )
 
     @property
     def plant(self) -> PlantDescription:

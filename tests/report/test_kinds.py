@@ -58,8 +58,7 @@ def gap_page(gap_report: RunReport) -> str:
 def test_a_gap_page_says_where_which_how_far_and_what_next(gap_report: RunReport, gap_page: str) -> None:
     made, text = gap_report, gap_page
     assert headline(made.material) == (
-        "The gap comes from pump lag at Q1 (8.10 ± 0.20 s), or equivalently pump delay at Q1"
-        ", probability 90.0 %"
+        "The gap comes from pump lag at Q1 (8.10 ± 0.20 s), or equivalently pump delay at Q1, probability 90.0 %"
     )
     assert titles(made)[:10] == [
         "The rig",
