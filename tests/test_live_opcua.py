@@ -168,6 +168,6 @@ def test_ctrl_c_ends_the_command(tmp_path: Path, plc: Plc) -> None:
             assert process.stderr is not None
             waiting = next(line for line in process.stderr if "waiting for samples" in line)
             process.send_signal(signal.SIGINT)
-            assert waiting and process.wait(20.0) == 130
+            assert waiting and process.wait(60.0) == 130
         finally:
             process.kill()

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from fdi_torch.report.html import short
 from fdi_torch.report.style import INK, MARK, MODEL, OTHER, panel
 
-BAR_NAME = 26  # letters of a line of a bar's name, which has at most two
+BAR_NAME = 28  # letters of a line of a bar's name, which has at most two
 
 
 def bar_panel(
@@ -23,7 +23,7 @@ def bar_panel(
     strong: Sequence[bool],
 ) -> Figure:
     """Horizontal bars from the top, each with its value at the end; `strong` ones are highlighted."""
-    labels = [fill(short(name, 2 * BAR_NAME), BAR_NAME) for name in names]
+    labels = [fill(short(name, 80), BAR_NAME, max_lines=2, placeholder="…") for name in names]
     height = 0.6 + (0.4 if any("\n" in label for label in labels) else 0.29) * len(names)
     figure, axes = panel(short(title), short(x_label), "", height=height)
     rows = list(range(len(names)))
