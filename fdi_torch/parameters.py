@@ -255,10 +255,16 @@ def display_unit(si_unit: str, name: str = "") -> tuple[str, float]:
     return ("" if unit == "1" else unit), 1.0 if unit == si_unit else 1.0 / unit_factor(unit, si_unit)
 
 
+def significant(value: float, digits: int) -> str:
+    """A number with significant digits, such as '0.0123'; with an exponent only below 1e-4 and from 1e6 on."""
+    text = f"{value:.{digits}g}"
+    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
+
+
 def quantity_text(value: float, si_unit: str, digits: int = 4, name: str = "") -> str:
     """An SI value as text in the unit for display, such as '4.2 cm'; name: as for `display_unit`."""
     unit, scale = display_unit(si_unit, name)
-    return f"{scale * value:.{digits}g} {unit}".rstrip()
+    return f"{significant(scale * value, digits)} {unit}".rstrip()
 
 
 def display_in(units: Mapping[str, str]) -> None:

@@ -57,7 +57,7 @@ WRONG_RUN = {
     "fault": ("T1.leak", "T1.leek", "run.yaml: estimate.parameters.0: ", "the nearest is 'T1.leak'"),
     "plant": ("plant: ", "plant: three_tanks #", "run.yaml: plant: ", "the nearest is 'three_tank'"),
     "no YAML": ("[T1.leak]", "[T1.leak", "run.yaml: line 3: ", "not valid YAML"),
-    "recording": ("rig.csv", "rigs.csv", "rigs.csv: ", "expected a file, got none there"),
+    "recording": ("rig.csv", "rigs.csv", "rigs.csv: ", "file not found"),
     "log folder": ("folder: logs", "folder: rig.csv", "rig.csv/run.mcap: ", "is a file, not a folder"),
 }
 WRONG_PLANT = {
@@ -72,6 +72,7 @@ WRONG_DATA = {
     "backward time": ("\n21,", "\n2,", "row 23, column t_s", "expected time that increases, got 2 s after 20 s"),
     "missing column": (",h3_cm", ",x3_cm", "expected a column for h3", "map it under columns"),
     "unit": ("Q1_cm3_s", "Q1_cm", "Q1", "expected a unit of the kind m^3/s"),
+    "per cent of a level": ("h1_cm", "h1_pct", "h1", "(a level in %: gain: 100 %/m)"),
     "no number": ("\n5,50,50,45,", "\n5,50,50,five,", "row 7, column h1_cm", "got 'five'"),
     "fewer cells": ("\n5,50,50,45,", "\n5,50,", "row 7", "expected 6 cells"),
 }

@@ -164,8 +164,8 @@ def test_check_of_a_run_file_says_what_is_usable(tmp_path: Path, capsys: pytest.
     [
         (["RIG"], "fdi check: expected --plant, a recording and --plant, or --config; see fdi check --help"),
         (["RIG", "--plant", "three_tonk"], "got 'three_tonk'; the nearest is 'three_tank'"),
-        (["gone.csv", "--plant", "three_tank"], "fdi check: gone.csv: expected a file, got none there"),
-        (["--config", "gone.yaml"], "fdi check: gone.yaml: expected a file, got none there"),
+        (["gone.csv", "--plant", "three_tank"], "fdi check: gone.csv: file not found"),
+        (["--config", "gone.yaml"], "fdi check: gone.yaml: file not found"),
         (["--config", "CONFIG"], "fdi check: expected recordings in the run file, got a simulation"),
     ],
 )

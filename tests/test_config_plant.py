@@ -177,7 +177,7 @@ def test_a_plant_file_is_found_by_shipped_name_by_folder_and_by_path(tmp_path: P
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(GOOD))
     assert load_plant("mine.yaml", tmp_path).name == "mine"
     assert load_plant(tmp_path / "mine.yaml") == load_plant("mine.yaml", tmp_path)
-    with pytest.raises(ConfigError, match=r"mime.yaml: expected a file, got none there .* the nearest is 'mine.yaml'"):
+    with pytest.raises(ConfigError, match=r"mime.yaml: file not found .* the nearest is 'mine.yaml'"):
         load_plant("mime.yaml", tmp_path)
 
 

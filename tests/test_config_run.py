@@ -300,7 +300,7 @@ def test_columns_by_mapping_constants_and_missing_sensors(tmp_path: Path) -> Non
             {"start": "5 s", "stop": "6 s"},
             "a segment with all inputs known, got none: unknown are Q2 at 0.5 of",
         ),
-        ({"file": "rigg.csv"}, "rigg.csv: expected a file, got none there .* the nearest is 'rig.csv'"),
+        ({"file": "rigg.csv"}, "rigg.csv: file not found .* the nearest is 'rig.csv'"),
     ],
 )
 def test_recordings_that_do_not_fit_are_refused(tmp_path: Path, recording: dict[str, Any], sentence: str) -> None:
@@ -312,7 +312,7 @@ def test_recordings_that_do_not_fit_are_refused(tmp_path: Path, recording: dict[
 def test_recordings_are_found_below_the_data_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = real(tmp_path)
     monkeypatch.delenv("FDI_TORCH_DATA", raising=False)
-    with pytest.raises(ConfigError, match="set FDI_TORCH_DATA to the folder that holds the recordings"):
+    with pytest.raises(ConfigError, match="to look in a further folder, set FDI_TORCH_DATA to it"):
         load_recordings(wanted.config.recordings, wanted.plant, Path("/"))
     monkeypatch.setenv("FDI_TORCH_DATA", str(tmp_path))
     assert load_recordings(wanted.config.recordings, wanted.plant, Path("/"))

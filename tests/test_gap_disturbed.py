@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+from fdi_torch.cli import main
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.effects import effect
 from fdi_torch.estimate.evidence import ODDS
 from fdi_torch.estimate.kalman import StateNoise
@@ -26,6 +30,7 @@ from fdi_torch.gap.structure_search import search
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of_all
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.csv_writing import write_csv
 from tests.rigs import blank_recording
 from tests.test_gap import nominal_plant
 from tests.test_gap import recorded as gap_recording
@@ -192,3 +197,17 @@ def test_onsets_are_as_dense_as_the_random_flows_require() -> None:
         counts.append(len(fine_onsets([option], with_disturbances(fitter, null, noise))))
     slow, fast, white = counts
     assert white == 0 and fast == pytest.approx(4 * slow, rel=0.05)
+
+
+def test_a_calibration_beside_random_flows_narrows_tolerances_that_hold_the_truth(tmp_path: Path) -> None:
+    """`fdi refit` takes the residual for noise of the sensors: its OUT2 lies 26 of its standard errors away."""
+    plant, file = tmp_path / "rig.yaml", write_csv(recorded(4e-6, 10, 3), tmp_path / "run.csv")
+    plant.write_text(dump_plant(nominal_plant()))
+    words = ["gap", "--plant", str(plant), "--recording", str(file), "--library", ",".join(LIBRARY), "--quiet"]
+    calibrated = tmp_path / "calibrated.yaml"
+    assert main([*words, "--out", str(tmp_path), "--adopt", str(calibrated), "--narrow"]) == 0
+    found, nominal = load_plant(calibrated), nominal_plant()
+    for pipe, truth in zip(found.pipes, nominal.pipes, strict=True):
+        name = f"{pipe.name}.discharge_coefficient"
+        share = pipe.discharge_coefficient / truth.discharge_coefficient - 1.0
+        assert abs(share) < 3.0 * found.tolerances[name] < 3.0 * nominal.tolerances[name]

@@ -173,6 +173,8 @@ def test_a_gap_is_found_closed_and_adopted_in_python(tmp_path: Path) -> None:
     better = found.adopted()
     before, after = (fdi_torch.predict(plant, other).prediction.rmse["h"] for plant in (RIG, better))
     assert after < 0.5 * before
+    name = "drain.discharge_coefficient"
+    assert 0.0 < found.narrowed().tolerances[name] < RIG.tolerances[name] == better.tolerances[name]
     with pytest.raises(ValueError, match=r"gap: expected a setting .* got 'libary'; the nearest is 'library'"):
         fdi_torch.gap(RIG, other, libary=())
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -155,3 +158,16 @@ def test_a_node_or_server_that_is_missing_is_named(
     clock = config(tmp_path, recording=None, source=source(plc.port, clock={"tag": "t"}))
     assert main(["monitor", "--config", clock, "--quiet"]) == 2
     assert "clock: expected none for OPC UA" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_the_command(tmp_path: Path, plc: Plc) -> None:
+    file = config(tmp_path, recording=None, source=source(plc.port))
+    words = [sys.executable, "-m", "fdi_torch", "monitor", "--config", file]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stderr is not None
+            waiting = next(line for line in process.stderr if "waiting for samples" in line)
+            process.send_signal(signal.SIGINT)
+            assert waiting and process.wait(60.0) == 130
+        finally:
+            process.kill()

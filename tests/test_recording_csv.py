@@ -143,7 +143,7 @@ def test_a_unit_of_the_wrong_kind_is_refused(tmp_path: Path) -> None:
 
 
 def test_no_such_file(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"gone.csv: expected a CSV file, got none there"):
+    with pytest.raises(ValueError, match=r"gone.csv: file not found"):
         read_csv(tmp_path / "gone.csv", ["Q1"], ["h1"])
 
 

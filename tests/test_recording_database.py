@@ -72,7 +72,7 @@ def test_the_database_is_only_read(rig: Path) -> None:
         with pytest.raises(ConfigError, match=r"readonly|does not return rows"):
             read(f"sqlite:///plant.db?query={query}")
     assert Path("plant.db").read_bytes() == before
-    with pytest.raises(ConfigError, match=r"none\.db: expected a file, got none there"):
+    with pytest.raises(ConfigError, match=r"none\.db: file not found"):
         read("sqlite:///none.db?query=SELECT 1")
     assert not Path("none.db").exists()
 

@@ -13,7 +13,7 @@ from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.run_file import load_run
 from fdi_torch.gap.preprocess.acquisition import examined
-from fdi_torch.parameters import display_unit
+from fdi_torch.parameters import display_unit, significant
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
 from fdi_torch.plant.scales import emptying_time
 from fdi_torch.recording import Recording
@@ -84,7 +84,13 @@ def _show_plant(plant: PlantDescription, screen: Screen) -> None:
     for tank in plant.tanks:
         sizes = (per_area * tank.area, per_height * tank.height, 1e3 * tank.area * tank.height)
         time = emptying_time(plant, tank)
-        rows.append([tank.name, *(f"{size:.4g}" for size in sizes), f"{time:.3g}" if math.isfinite(time) else "never"])
+        rows.append(
+            [
+                tank.name,
+                *(significant(size, 4) for size in sizes),
+                significant(time, 3) if math.isfinite(time) else "never",
+            ]
+        )
     header = ("tank", f"area, {area}", f"height, {height}", "volume, l", "empties from full in, s")
     screen.table("", header, rows)
 

@@ -11,7 +11,10 @@ def say_first(misfit: Misfit, screen: Screen, *hints: str) -> None:
     """Print the warning and what to do next if the model does not explain the recording."""
     if misfit.warning:
         screen.say(f"{misfit.warning}.")
-        gap = "next: fdi gap finds where and by which effect the plant file deviates from the recording"
+        gap = (
+            "next: fdi gap tells random disturbances of the flows from an error of the plant file, and names its place "
+            "and cause"
+        )
         for hint in (gap, *hints):
             screen.say(f"- {hint}")
         screen.say()

@@ -20,6 +20,7 @@ from fdi_torch.gap.answer import UNKNOWN, Answer, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.experiment_design import planned_recording
 from fdi_torch.gap.free_runs.prediction import predict
+from fdi_torch.gap.free_runs.refit import narrowed
 from fdi_torch.jobs.gap import run_gap
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.plant.description import PlantDescription
@@ -43,6 +44,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     if arguments.most < 1:
         raise ValueError(f"--most: expected at least one effect, got {arguments.most}")
     left_out = names(arguments.leave_out)
+    arguments.with_constants |= arguments.narrow
     folder = Path(arguments.out)
     log = free_path(folder, "gap")
     with screen.progress("gap") as advance:
@@ -76,7 +78,7 @@ def _keep(
         screen.complain("fdi gap: nothing adopted: the fit of the likeliest explanation has not converged")
     elif arguments.adopt and named:
         target = Path(arguments.adopt)
-        better = adopted(plant, answer, arguments.with_constants)
+        better = _adopted(plant, answer, arguments)
         if not _error(better, recordings) <= _error(plant, recordings):
             screen.complain(
                 "fdi gap: nothing adopted: the plant with the causes has a larger free-run error than the plant file; "
@@ -89,11 +91,18 @@ def _keep(
         )
         screen.note(f"plant file with the causes, its constants {constants}: {target}")
     elif arguments.adopt and arguments.with_constants and answer.verdict == "no_gap":
-        write_adopted(arguments.plant, plant, adopted(plant, answer, True), Path(arguments.adopt), screen)
+        write_adopted(arguments.plant, plant, _adopted(plant, answer, arguments), Path(arguments.adopt), screen)
         screen.note(f"plant file with its fitted constants; no cause was found: {arguments.adopt}")
     elif arguments.adopt:
         screen.complain(f"fdi gap: nothing to adopt: the verdict is {answer.verdict.replace('_', ' ')}")
     return _next_input(plant, answer, folder)
+
+
+def _adopted(plant: PlantDescription, answer: Answer, arguments: argparse.Namespace) -> PlantDescription:
+    better = adopted(plant, answer, arguments.with_constants)
+    if not arguments.narrow:
+        return better
+    return narrowed(better, {name: float(constant["std"]) for name, constant in answer.constants.items()})
 
 
 def _next_input(plant: PlantDescription, answer: Answer, folder: Path) -> Path | None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.cli.screen import Screen
-from fdi_torch.gap.answer import UNKNOWN, Answer, CauseName, names
+from fdi_torch.gap.answer import UNKNOWN, Answer
 from fdi_torch.gap.verdict_words import causes_of, explanation_words, probability_words, verdict_sentence
 from fdi_torch.parameters import display_unit
 
@@ -93,9 +93,6 @@ def _causes(answer: Answer, screen: Screen) -> None:
             rows.append([cause.effect, cause.location, name, *numbers, unit])
     if rows:
         screen.table("causes", ("effect", "at", "parameter", "value", "std error", "unit"), rows, left=3)
-    for cause in answer.causes:
-        if cause.same_as:
-            screen.say(f"- {_listed([(cause.effect, cause.location)])} is equivalent to {_listed(cause.same_as)}")
 
 
 def _disturbances(disturbances: Mapping[str, Any], screen: Screen) -> None:
@@ -177,7 +174,3 @@ def _confusability(impostors: Mapping[str, Any] | None) -> list[str]:
         f"check by simulation: a gap of this size from any of {simulated['rivals']} other causes would be given this "
         f"name in {confused} of {draws} recordings, or in {passed} if the library lacked that cause"
     ]
-
-
-def _listed(causes: Sequence[CauseName]) -> str:
-    return " or ".join(f"{c['effect']} at {c['location']}" for c in names(causes))

@@ -26,6 +26,11 @@ from fdi_torch.parameters import ParameterSpace, display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
+DISTURBED = (
+    "the standard errors below take the residual for noise of the sensors; fdi gap --adopt FILE --narrow calibrates "
+    "with random disturbances of the flows"
+)
+
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     plant = chosen_plant(arguments.plant)
@@ -42,7 +47,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     with one_thread():
         fitted = fitted_to(recordings)
         misfit = misfit_of(fitted.rmse, recordings, plant)
-        say_first(misfit, screen)
+        say_first(misfit, screen, DISTURBED)
         _show(fitted, plant, screen)
         _show_run_specific(fitted, screen)
         if arguments.adopt:

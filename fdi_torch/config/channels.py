@@ -92,11 +92,14 @@ def _units(plant: PlantDescription) -> dict[str, str]:
 def expect_units(source: str, names: Sequence[str], units: Sequence[str], plant: PlantDescription) -> None:
     """Raises ValueError if a channel's SI unit differs from the plant's."""
     expected = _units(plant)
+    heights = {tank.name: tank.height for tank in plant.tanks}
+    rims = {sensor.column: heights[sensor.tank] for sensor in plant.sensors}
     for name, unit in zip(names, units, strict=True):
         if unit != expected[name]:
+            share = f" (a level in %: gain: {100.0 / rims[name]:.4g} %/m)" if unit == "1" and name in rims else ""
             raise ValueError(
                 f"{source}: {name}: expected a unit of the kind {expected[name]} (plant {plant.name}), "
-                f"got one of the kind {unit}; correct the header, columns, or the gain in the plant file"
+                f"got one of the kind {unit}; correct the header, columns, or the gain in the plant file{share}"
             )
 
 

@@ -32,14 +32,16 @@ def growing_rows(config: RecordingConfig, plant: PlantDescription, base: Path, i
     Ends when the file is finished, or when nothing has arrived for `idle` s. Raises ConfigError for an unusable file.
     """
     if config.mask or config.every != 1:
-        raise ConfigError([f"{config.file}: expected neither mask nor every for a file that is followed; leave them"])
+        raise ConfigError([f"{config.file}: expected neither mask nor every for a file that is followed; remove them"])
     if config.also or config.tags:
-        raise ConfigError([f"{config.file}: expected a file with a row an instant to follow; leave also and tags"])
+        raise ConfigError(
+            [f"{config.file}: expected one row for each time in a file that is followed; remove also and tags"]
+        )
     if config.sheet or not config.header:
-        raise ConfigError([f"{config.file}: expected a CSV file with a header to follow; leave sheet and header"])
+        raise ConfigError([f"{config.file}: expected a CSV file with a header to follow; remove sheet and header"])
     clock = config.columns.get("t", ColumnConfig())
     if clock.zone or clock.sort or clock.period:
-        raise ConfigError([f"{config.file}: expected neither zone, sort nor period to follow a file; leave them"])
+        raise ConfigError([f"{config.file}: expected neither zone, sort nor period to follow a file; remove them"])
     path = _find(config.file, base)
     rows = _mcap_rows if ".mcap" in path.suffixes else _csv_rows
     if isinstance(config.start, datetime) or isinstance(config.stop, datetime):

@@ -204,7 +204,7 @@ def _read(
     if is_log(path):
         if config.also or config.tags or config.sheet or not config.header:
             raise ValueError(
-                f"{config.file}: expected neither also, tags, sheet nor header beside an MCAP file; leave them"
+                f"{config.file}: expected neither also, tags, sheet nor header beside an MCAP file; remove them"
             )
         return read_mcap(path, inputs, outputs, mapping, config.hold)
     files = [_source(config, path, mapping)]

@@ -22,7 +22,7 @@ DEFAULT_RUN = SHIPPED / "default.yaml"
 def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file. Raises ConfigError if there is no such file, no YAML or no mapping."""
     if not path.is_file():
-        raise ConfigError([f"{path}: expected a YAML file, got none there; check the path"])
+        raise ConfigError([f"{path}: file not found; check the path"])
     with path.open("rb") as file:
         return parse_yaml(file.read(MOST_YAML_BYTES + 1), str(path))
 
@@ -189,7 +189,7 @@ def find_file(name: str, base: Path, also: Sequence[Path] = ()) -> Path:
         if (folder / name).is_dir():
             raise ConfigError([f"{folder / name}: expected a file, got a folder; name a file in it"])
     looked = ", ".join(dict.fromkeys(str(folder) for folder in folders))
-    raise ConfigError([f"{name}: expected a file, got none there (looked in {looked}){_similar(name, folders)}"])
+    raise ConfigError([f"{name}: file not found (looked in {looked}){_similar(name, folders)}"])
 
 
 def find_data(name: str, base: Path) -> Path:
@@ -198,7 +198,7 @@ def find_data(name: str, base: Path) -> Path:
     try:
         return find_file(name, base, [Path(data)] if data else [])
     except ConfigError as error:
-        hint = "" if data else "; set FDI_TORCH_DATA to the folder that holds the recordings"
+        hint = "" if data else "; to look in a further folder, set FDI_TORCH_DATA to it"
         raise ConfigError([error.problems[0] + hint]) from None
 
 

@@ -58,6 +58,11 @@ class Fitting:
     columns: tuple[Tensor, ...]
     engine: EngineKind = "auto"
 
+    def __repr__(self) -> str:
+        return (
+            f"Fitting of {self.plant.name} to {len(self.recordings)} recordings; the columns of theta are\n{self.space}"
+        )
+
     @property
     def plant(self) -> PlantDescription:
         return self.networks[0].description

@@ -50,7 +50,7 @@ def verdict_sentence(answer: Named, best: str = "") -> str:
     first: Named = next(iter(answer.get("posterior") or []), {})
     probability = first.get("probability")
     chance = f", probability {probability_words(probability)}" if isinstance(probability, int | float) else ""
-    best = best or explanation_words(causes_of(first))
+    best = best or _with_equivalents(causes_of(first), answer.get("causes") or [])
     if verdict == "no_gap":
         return "No gap: the plant file explains the recording within noise and tolerances."
     if verdict == "named":
@@ -69,6 +69,18 @@ def verdict_sentence(answer: Named, best: str = "") -> str:
         return f"The gap comes from {best}{chance}; no effect of the library describes the unknown part."
     place = next((str(w["location"]) for w in answer.get("where") or []), "a sensor")  # logs of earlier versions
     return f"Readings of {place} are outliers or stuck; apart from these, the plant file explains the recording."
+
+
+def _with_equivalents(explanation: Sequence[Named], fitted: Sequence[Named]) -> str:
+    """'plugging at drain, or equivalently leak at B'. fitted: the causes with their equivalents."""
+    words = {cause_words(c): equivalents_words(c) for c in fitted}
+    return " and ".join(name + words.get(name, "") for name in map(cause_words, explanation)) or explanation_words([])
+
+
+def equivalents_words(cause: Named) -> str:
+    """', or equivalently leak at B'; empty for a cause without an equivalent."""
+    equivalents = [c for c in cause.get("same_as") or [] if isinstance(c, Mapping)]
+    return f", or equivalently {' or '.join(map(cause_words, equivalents))}" if equivalents else ""
 
 
 def _unfitted(answer: Named) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 from fdi_torch.estimate.misfit import Misfit, misfit_of
 from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.free_runs.prediction import Prediction
-from fdi_torch.gap.free_runs.refit import Refit
+from fdi_torch.gap.free_runs.refit import Refit, narrowed
 from fdi_torch.gap.verdict_words import cause_words, explanation_words, verdict_sentence
 from fdi_torch.monitor.events import Event
 from fdi_torch.parameters import quantity_text
@@ -52,6 +52,10 @@ class GapResult(Shown):
     def adopted(self, constants: bool = False) -> PlantDescription:
         """The plant with the causes added as effects. constants: also use the constants fitted together with them."""
         return adopted(self.plant, self.answer, constants)
+
+    def narrowed(self) -> PlantDescription:
+        """The plant with the causes and the fitted constants, their standard errors as tolerances where smaller."""
+        return narrowed(self.adopted(constants=True), {n: float(c["std"]) for n, c in self.answer.constants.items()})
 
 
 @dataclass(frozen=True, repr=False)

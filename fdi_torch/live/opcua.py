@@ -93,7 +93,8 @@ class OpcUaSource:
         try:
             await self._subscribe(client)
             self._connected.set()
-            await asyncio.to_thread(self._stop.wait)
+            while not self._stop.is_set():  # a waiting thread of the pool would outlive Ctrl-C
+                await asyncio.sleep(0.1)
         except Exception as error:
             self._refuse(error)
         finally:

@@ -41,7 +41,7 @@ def open_csv(path: Path, sheet: str | None = None) -> TextIO | TableText:
     sheet: of an Excel workbook. Raises ValueError for any other content.
     """
     if not path.is_file():
-        raise ValueError(f"{path}: expected a CSV file, got none there; check the path")
+        raise ValueError(f"{path}: file not found; check the path")
     beginning = _beginning(path)
     if known := format_of(beginning):
         return table_text(path, known, sheet)

@@ -17,7 +17,7 @@ from fdi_torch.report.html import short
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import percent
 from fdi_torch.report.progress import SensorResidual, sensor_residuals
-from fdi_torch.report.verdict import headline
+from fdi_torch.report.verdict import headline, kind_words
 
 MOST_LISTED, MOST_LETTERS = 4, 60
 AT_95 = 1.96
@@ -87,8 +87,11 @@ def _differences(compared: Comparison, runs: Sequence[Material]) -> str:
     """What differs in the inputs: recordings, settings, versions."""
     parts = []
     if not _same_readings(runs):
-        parts.append(f"the recording ({'; '.join(_recordings(run) for run in runs)})")
-    settings = setting_differences(compared)
+        parts.append(f"the recording ({_recordings_in_words(runs)})")
+    kinds = [kind_words(run) for run in runs]
+    several = len(set(kinds)) > 1  # their settings have different keys
+    parts += [f"the kind of run ({'; '.join(kinds)})"] if several else []
+    settings = {} if several else setting_differences(compared)
     parts += [f"{key} ({'; '.join(texts)})" for key, texts in list(settings.items())[:MOST_LISTED]]
     if len(settings) > MOST_LISTED:
         parts.append(f"{len(settings) - MOST_LISTED} more settings")
@@ -124,6 +127,15 @@ def _in_words(value: Any) -> str:
             _in_words(each) if key == "name" else f"{key} {_in_words(each)}" for key, each in given.items()
         )
     return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _recordings_in_words(runs: Sequence[Material]) -> str:
+    """Names of the recordings; what tells them apart if the names are the same."""
+    names = [_recordings(run) for run in runs]
+    if len(set(names)) > 1:
+        return "; ".join(names)
+    counts = [f"{sum(len(recording.time) for recording in run.recordings)} samples" for run in runs]
+    return f"{names[0]}: {'; '.join(counts) if len(set(counts)) > 1 else 'other readings'}"
 
 
 def _recordings(run: Material) -> str:

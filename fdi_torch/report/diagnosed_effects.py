@@ -9,7 +9,7 @@ from typing import Any
 
 from fdi_torch.effects import effect
 from fdi_torch.estimate.combinations import Combination
-from fdi_torch.gap.verdict_words import cause_words
+from fdi_torch.gap.verdict_words import cause_words, equivalents_words
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import fits
@@ -35,11 +35,13 @@ class DiagnosedEffect:
     flow: float = NAN
     hole: float = NAN
     quantity: str = "size"
+    equivalents: str = ""
+    """Other effects that act alike, ', or equivalently leak at B'."""
 
     @property
     def words(self) -> str:
         """'leak at T1', 'something unknown at Q1'."""
-        return cause_words({"effect": self.effect, "location": self.location}).replace("_", " ")
+        return cause_words(readable({"effect": self.effect, "location": self.location}))
 
     @property
     def sized(self) -> str:
@@ -50,6 +52,11 @@ class DiagnosedEffect:
         sizes = [size] if math.isfinite(self.size) else []
         sizes += [f"{amount(self.flow, 'm^3/s', 3)}"] if math.isfinite(self.flow) else []
         return f"{self.words} ({', '.join(sizes)})" if sizes else self.words
+
+
+def readable(cause: Mapping[str, Any]) -> dict[str, Any]:
+    """The cause with its effect in words: pump_lag -> 'pump lag'."""
+    return {**cause, "effect": str(cause.get("effect", "")).replace("_", " ")}
 
 
 def diagnosed_effects(material: Material) -> list[DiagnosedEffect]:
@@ -90,7 +97,9 @@ def _cause(cause: Mapping[str, Any], plant: PlantDescription | None) -> Diagnose
     quantity = quantity if quantity in parameters else next(iter(parameters), "size")
     size: Mapping[str, Any] = parameters.get(quantity, {})
     value, std = as_float(size.get("value")), as_float(size.get("std"))
-    return DiagnosedEffect(name, location, True, value, std, str(size.get("unit", "")), quantity=quantity)
+    others = equivalents_words({"same_as": [readable(c) for c in cause.get("same_as") or []]})
+    unit = str(size.get("unit", ""))
+    return DiagnosedEffect(name, location, True, value, std, unit, quantity=quantity, equivalents=others)
 
 
 def _size_of(name: str, location: str, plant: PlantDescription | None) -> str:

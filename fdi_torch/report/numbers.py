@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.parameters import display_unit
+from fdi_torch.parameters import display_unit, significant
 
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
@@ -47,7 +47,7 @@ def number(value: float, digits: int = 4) -> str:
     """A number with the given significant digits; a dash for NaN."""
     if not math.isfinite(value):
         return "–" if math.isnan(value) else ("∞" if value > 0 else "−∞")
-    return _minus(f"{value:.{digits}g}")
+    return _minus(significant(value, digits))
 
 
 def with_error(value: float, std: float) -> str:

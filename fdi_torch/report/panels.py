@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import fill
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,7 +11,7 @@ from matplotlib.figure import Figure
 from fdi_torch.report.html import short
 from fdi_torch.report.style import INK, MARK, MODEL, OTHER, panel
 
-BAR_NAME = 26  # letters of a bar's name
+BAR_NAME = 28  # letters of a line of a bar's name, which has at most two
 
 
 def bar_panel(
@@ -22,7 +23,8 @@ def bar_panel(
     strong: Sequence[bool],
 ) -> Figure:
     """Horizontal bars from the top, each with its value at the end; `strong` ones are highlighted."""
-    height = 0.6 + 0.29 * len(names)
+    labels = [fill(short(name, 80), BAR_NAME, max_lines=2, placeholder="…") for name in names]
+    height = 0.6 + (0.4 if any("\n" in label for label in labels) else 0.29) * len(names)
     figure, axes = panel(short(title), short(x_label), "", height=height)
     rows = list(range(len(names)))
     lengths = np.nan_to_num(np.asarray(values, dtype=float))
@@ -31,7 +33,7 @@ def bar_panel(
     for row, length, text in zip(rows, lengths, texts, strict=True):
         axes.text(length + 0.02 * reach, row, text, va="center", fontsize=9.0, color=INK)
     axes.set_xlim(0.0, 1.28 * reach)
-    axes.set_yticks(rows, [short(name, BAR_NAME) for name in names])
+    axes.set_yticks(rows, labels)
     axes.invert_yaxis()
     axes.grid(visible=False, axis="y")
     return figure

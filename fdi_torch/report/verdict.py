@@ -8,7 +8,7 @@ from typing import Any
 from fdi_torch.estimate.combinations import Combination
 from fdi_torch.estimate.misfit import UNRELIABLE, Misfit
 from fdi_torch.gap.verdict_words import verdict_sentence
-from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects, fault_at
+from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects, fault_at, readable
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
 from fdi_torch.report.sections.rehearsal import rehearsal_tables
@@ -82,8 +82,9 @@ def _rivals(combination: Combination) -> str:
 
 def gap_words(material: Material) -> str:
     """The sentence of the terminal, with the sizes of the named causes."""
-    sized = _listed([finding.sized for finding in diagnosed_effects(material)])
-    return verdict_sentence(material.answer, sized).removesuffix(".")
+    sized = _listed([finding.sized + finding.equivalents for finding in diagnosed_effects(material)])
+    certain = [readable(cause) for cause in material.answer.get("certain") or []]
+    return verdict_sentence({**material.answer, "certain": certain}, sized).removesuffix(".")
 
 
 def monitor_words(material: Material) -> str:

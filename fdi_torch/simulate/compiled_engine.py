@@ -183,7 +183,8 @@ class CompiledEngine:
                 "use the traced engine there"
             )
         if theta.shape[-1] != len(self.space):
-            raise ValueError(f"expected theta with {len(self.space)} columns, got {tuple(theta.shape)}")
+            columns = f"{len(self.space)} columns ({', '.join(map(str, self.space.names))})"
+            raise ValueError(f"expected theta with {columns}, got {tuple(theta.shape)}")
         return theta.detach().reshape(theta.shape[:-1].numel(), len(self.space)).contiguous()
 
     def _experiment(self, like: Tensor) -> dict[str, Tensor | None]:

@@ -110,7 +110,7 @@ def bound(folder: Path, port: int = 0) -> Iterator[tuple[str, Callable[[], None]
     Raises ValueError if the folder or the extra `view` is missing, or the port is not available.
     """
     if not folder.is_dir():
-        raise ValueError(f"{folder}: expected a folder with logs, got none there; name another folder")
+        raise ValueError(f"{folder}: folder not found; name another folder")
     uvicorn = needed("uvicorn", "view")
     # Without access log, WebSockets and lifespan events, none of which these pages have.
     config = uvicorn.Config(

@@ -61,7 +61,7 @@ def test_runs_of_different_recordings_are_not_ranked(tmp_path: Path) -> None:
     assert verdicts.startswith("a: ") and verdicts.endswith(
         "They read different recordings, so their residuals do not rank them."
     )
-    assert differ == "They differ in the recording (simulated; simulated)."
+    assert differ == "They differ in the recording (simulated: other readings)."
 
 
 def test_settings_are_told_in_words(tmp_path: Path) -> None:

@@ -244,6 +244,6 @@ def test_the_error_is_the_root_mean_square_of_the_residuals(tmp_path: Path) -> N
 
 def test_what_cannot_be_served_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["view", str(tmp_path / "none")]) == MISUSE
-    assert "expected a folder with logs, got none there" in capsys.readouterr().err
+    assert "folder not found" in capsys.readouterr().err
     assert main(["view", str(tmp_path), "--port", "70000"]) == MISUSE
     assert "--port: expected a free port, got 70000" in capsys.readouterr().err

@@ -22,6 +22,7 @@ examples:
   fdi gap --plant three_tank --recording run.csv                       location and effect
   fdi gap --plant three_tank --recording run.csv --holdout other.csv   and how far the gap closes on other.csv
   fdi gap --plant rig.yaml --recording run.csv --adopt better.yaml     write the plant file with the causes
+  fdi gap --plant rig.yaml --recording run.csv --adopt calibrated.yaml --narrow    calibrate despite disturbed flows
   fdi gap --plant rig.yaml --recording run.csv --library pump_lag,leak@T1
   fdi gap --plant rig.yaml --recording runs.yaml --most 8              several recordings together, many causes
 """
@@ -40,5 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--adopt", metavar="FILE", help="write the plant file with the causes added to its effects")
     parser.add_argument(
         "--with-constants", action="store_true", help="--adopt also writes the constants fitted with the causes"
+    )
+    parser.add_argument(
+        "--narrow",
+        action="store_true",
+        help="as --with-constants, with the constants' standard errors as tolerances where smaller",
     )
     parser.add_argument("--out", metavar="DIR", default="logs", help="folder for log, gap.json and next_input.csv")

@@ -52,15 +52,20 @@ class Refit:
     own: Sequence[RunConstant] = ()
 
     def narrowed(self) -> PlantDescription:
-        """The plant with the standard errors of the fit as tolerances where these are smaller.
+        """The plant with the standard errors of the fit as tolerances where these are smaller."""
+        return narrowed(self.plant, {name: std for name, (_, std) in self.fitted.items()})
 
-        That is what the recordings show of constants that stay the same in later ones; the fit does not know how far
-        they drift from day to day.
-        """
-        constants = build_network(self.plant).constants
-        shares = {n: std / constants[n].std for n, (_, std) in self.fitted.items() if n in self.plant.tolerances}
-        narrower = {n: float(f"{s * self.plant.tolerances[n]:.2g}") for n, s in shares.items() if 0.0 < s < 1.0}
-        return replace(self.plant, tolerances={**self.plant.tolerances, **narrower})
+
+def narrowed(plant: PlantDescription, errors: Mapping[str, float]) -> PlantDescription:
+    """The plant with these standard errors of a fit, by constant and in SI, as tolerances where they are smaller.
+
+    That is what the recordings show of constants that stay the same in later ones; the fit does not know how far
+    they drift from day to day.
+    """
+    constants = build_network(plant).constants
+    shares = {n: std / constants[n].std for n, std in errors.items() if n in plant.tolerances}
+    narrower = {n: float(f"{s * plant.tolerances[n]:.2g}") for n, s in shares.items() if 0.0 < s < 1.0}
+    return replace(plant, tolerances={**plant.tolerances, **narrower})
 
 
 def refit(

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from fdi_torch.gap.verdict_words import FORMAT_1, causes_of
 from fdi_torch.gap.verdict_words import explanation_words as in_words
+from fdi_torch.report.diagnosed_effects import readable
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, number, percent, probability_text, shown_unit, with_error
@@ -53,7 +54,6 @@ def causes_section(material: Material) -> Section | None:
     header = ("effect", "at", "parameter", "value", "unit")
     rows = [row for cause in answer.get("causes", []) for row in _cause_rows(cause)]
     blocks: list[Any] = [table(header, rows, left=3)] if rows else []
-    blocks += _twins(answer.get("causes", []))
     certain = answer.get("certain") or []
     if certain and answer.get("verdict") != "named":
         blocks.append(f"With 95 % probability, whichever explanation is true: {explanation_words(certain)}.")
@@ -102,7 +102,10 @@ def _content(answer: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
 def _posterior(answer: Mapping[str, Any]) -> list[Any]:
     """Bars of the explanations' probabilities, and of that of unexamined ones."""
     weighted = [item for item in answer.get("posterior", []) if as_float(item.get("probability")) >= LEAST_SHOWN]
-    names = [explanation_words(causes_of(item)) for item in weighted[:MOST_BARS]]
+    explanations = [causes_of(item) for item in weighted[:MOST_BARS]]
+    first = explanations[0] if len(explanations) > 1 else []
+    shared = [cause for cause in first if all(cause in each for each in explanations)]
+    names = [_beside(shared, each) for each in explanations]
     chances = [as_float(item["probability"]) for item in weighted[:MOST_BARS]]
     within = [k < len(_content(answer)) for k in range(len(chances))]
     if as_float(answer.get("unexamined")) >= LEAST_SHOWN:
@@ -113,7 +116,14 @@ def _posterior(answer: Mapping[str, Any]) -> list[Any]:
     texts = [probability_text(0.01 * percent) for percent in percents]
     figure = bar_panel("", "probability, %", names, percents, texts, within)
     _up_to_all(figure)
-    return [[Picture("gap_posterior", figure, "Orange: together they have 95 % of the probability.")]]
+    caption = f"All contain {explanation_words(shared)}. " if shared else ""
+    return [[Picture("gap_posterior", figure, f"{caption}Orange: together they have 95 % of the probability.")]]
+
+
+def _beside(shared: Sequence[Mapping[str, Any]], causes: Sequence[Mapping[str, Any]]) -> str:
+    """The causes other than those that all explanations contain, which would not fit beside a bar."""
+    others = [cause for cause in causes if cause not in shared]
+    return explanation_words(others) if others or not causes else "nothing else"
 
 
 def _up_to_all(figure: Figure) -> None:
@@ -137,12 +147,6 @@ def _cause_rows(cause: Mapping[str, Any]) -> list[list[str]]:
     return rows or [[effect, location, "", "", ""]]
 
 
-def _twins(causes: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Sentences about causes that are equivalent to another effect."""
-    equivalents = [(c, explanation_words(c["same_as"])) for c in causes if c.get("same_as")]
-    return [f"{explanation_words([cause])} is equivalent to {twin}." for cause, twin in equivalents]
-
-
 def explanation_words(causes: Sequence[Mapping[str, Any]]) -> str:
     """'leak at T1 and something unknown at Q1'."""
-    return in_words(causes).replace("_", " ")
+    return in_words([readable(cause) for cause in causes])
