@@ -382,3 +382,20 @@ def test_a_second_recording_keeps_the_first_unless_it_is_replaced(
     assert (tmp_path / "run.csv").read_bytes() == first
     assert cli.main([*short, "--seed", "2", "--replace"]) == 0 and "kept" not in capsys.readouterr().out
     assert (tmp_path / "run.csv").read_bytes() == (tmp_path / "run_2.csv").read_bytes() != first
+
+
+@pytest.mark.parametrize(("words", "expected"), [("fdi diagnos", "diagnosability"), ("fdi gap --hold", "--holdout")])
+def test_a_shell_completes_commands_and_options(
+    words: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["completion", "bash"]) == 0
+    (tmp_path / "fdi").write_text(capsys.readouterr().out)
+    *before, last = words.split()
+    script = f"""
+        source {tmp_path}/fdi
+        COMP_WORDS=({words}) COMP_CWORD={len(before)}
+        $(complete -p fdi | grep -o "_[a-z_]*") fdi {last} {before[-1]}
+        echo "${{COMPREPLY[@]}}"
+    """
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [expected]

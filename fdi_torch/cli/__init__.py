@@ -17,7 +17,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from contextvars import copy_context
 from pathlib import Path
-from types import ModuleType
 from typing import NoReturn
 
 from fdi_torch.disk import sentence
@@ -46,6 +45,7 @@ COMMANDS = {
     "refit": "fit all effects and constants of a plant file together, without a search",
     "plan": "tell what planned inputs cannot show before an experiment",
     "predict": "run a plant freely along a recording and report the error",
+    "completion": "print a script with which a shell completes commands and options",
     "challenge": "blind benchmark of the gap diagnosis on hidden rigs",
     "study": "repeat an experiment many times: errors against their bounds, coverage, failures",
 }
@@ -117,8 +117,7 @@ def ending(error: KeyboardInterrupt | Terminated) -> str:
 
 
 def _carried_out(name: str, words: list[str]) -> int:
-    options = importlib.import_module(f"fdi_torch.cli.options.{name}")
-    arguments = _parser(name, options).parse_args(words)
+    arguments = command_parser(name).parse_args(words)
     _say_that_it_began(name, arguments.quiet)
     command = importlib.import_module(f"fdi_torch.cli.{name}")
     from fdi_torch.cli.screen import Screen
@@ -173,7 +172,9 @@ class _Parser(argparse.ArgumentParser):
         return known, others
 
 
-def _parser(name: str, options: ModuleType) -> argparse.ArgumentParser:
+def command_parser(name: str) -> argparse.ArgumentParser:
+    """The parser of a command's arguments."""
+    options = importlib.import_module(f"fdi_torch.cli.options.{name}")
     parser = _Parser(
         prog=f"fdi {name}",
         description=options.__doc__,
