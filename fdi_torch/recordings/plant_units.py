@@ -61,7 +61,9 @@ def wrong_units(plant: PlantDescription, recording: Recording) -> str:
     if not bool((as_is.metered.nan_to_num() != 0.0).any()):
         return ""
     corrections = list(_corrections(plant, recording, as_is))
-    evidence = torch.tensor([as_is.log_evidence(), *(each.volumes.log_evidence() for each in corrections)])
+    # A correction that puts a level above a pump's switch leaves no flow, hence no balance: it is no better for that.
+    leads = torch.stack([each.volumes.log_evidence() for each in corrections]) - as_is.log_evidence()
+    evidence = torch.cat([leads.new_zeros(1), leads.nansum(dim=1)])
     prior = torch.tensor([1.0 - PRIOR, *(PRIOR / len(corrections) for _ in corrections)])
     probability, order = torch.softmax(evidence + prior.log(), dim=0).sort(descending=True)
     credible = order[probability.cumsum(0) - probability < CONFIDENCE].tolist()

@@ -44,10 +44,13 @@ class Volumes:
     metered: Tensor
     by_laws: Tensor
 
-    def log_evidence(self) -> float:
-        """Log likelihood of the readings, up to a constant that all corrections of the plant share."""
+    def log_evidence(self) -> Tensor:
+        """Log likelihood of the readings of each tank (tanks), up to a constant that all corrections share.
+
+        NaN for a tank of whose balance the recording determines nothing.
+        """
         terms = torch.stack([self.stored, self.metered, self.by_laws], dim=-1)
-        return sum(_log_evidence(tank) for tank in terms.unbind(1))
+        return torch.tensor([_log_evidence(tank) for tank in terms.unbind(1)])
 
 
 def volumes_along(plant: PlantDescription, recording: Recording) -> Volumes:
@@ -110,9 +113,11 @@ def _log_evidence(terms: Tensor) -> float:
     terms = terms[torch.isfinite(terms).all(dim=-1)]
     length = len(terms) // (GROUPS * SUMS)
     if not length:
-        return 0.0
+        return math.nan
     sums = terms[: GROUPS * SUMS * length].reshape(GROUPS, SUMS, length, 3).sum(dim=2)
     information, directions, off = _regression(sums)
+    if not bool((information > 0.0).any()):
+        return math.nan
     variance = DEVIATION**2 * torch.logspace(-2, 16, 73).to(off)
     share = torch.log_softmax(-0.5 * (variance.log() + DEVIATION**2 / variance), dim=0)
     wider = 1.0 + variance[:, None] * information
