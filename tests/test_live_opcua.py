@@ -163,7 +163,11 @@ def test_a_node_or_server_that_is_missing_is_named(
 def test_ctrl_c_ends_the_command(tmp_path: Path, plc: Plc) -> None:
     file = config(tmp_path, recording=None, source=source(plc.port))
     words = [sys.executable, "-m", "fdi_torch", "monitor", "--config", file]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+
+    def listen() -> None:  # even if the tests run in the background of a shell, which ignores Ctrl-C
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True, preexec_fn=listen) as process:
         try:
             assert process.stderr is not None
             waiting = next(line for line in process.stderr if "waiting for samples" in line)

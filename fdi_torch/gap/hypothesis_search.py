@@ -96,10 +96,15 @@ class HypothesisSearch:
             return [CauseHypothesis(explanation, causes, weight + self._log_odds, at)]
         error = relative_size(self.pool.fitter, explanation.fit, at.size, here)
         law, other = _shares([self._log_odds_of_law(error)])
+        other += sum(self._log_selection(place) for _, place in here)  # they describe a part of the other law
         return [
             CauseHypothesis(explanation, causes, weight + law, at, inexact=True),
             CauseHypothesis(explanation, tuple(c for c in causes if c not in here), weight + other, at),
         ]
+
+    def _log_selection(self, place: str) -> float:
+        """Log probability of one of the effects at a place, if it is not a cause but describes a part of one."""
+        return -math.log(len({o.cause for o in self.options if o.cause[1] == place}))
 
     def _log_odds_of_law(self, error: float) -> float:
         return log_odds_of_law(error, self.pool.choices, len(self.places))
@@ -221,8 +226,7 @@ class HypothesisSearch:
                 error = relative_size(fitter, fit, influence(fitter, fit, [cause]), here)
                 reduced = self.pool.without(h.explanation, cause)
                 odds = log_prior(reduced.key, self.pool.choices) - log_prior(h.explanation.key, self.pool.choices)
-                selected = len({o.cause for o in self.options if o.cause[1] == cause[1]})
-                weight = h.weight + odds - math.log(selected) + log_law_error(error)
+                weight = h.weight + odds + self._log_selection(cause[1]) + log_law_error(error)
                 others = tuple(c for c in h.causes if c != cause)
                 law = CauseHypothesis(reduced, others, weight, h.discrepancy, h.inexact)
                 explained += [law, *self._with_inexact_laws(law)]
