@@ -7,7 +7,7 @@ from tests.test_gap import nominal_plant, recorded
 
 
 def test_two_laws_at_one_place_are_both_in_the_likeliest_explanation() -> None:
-    """It is not certain: one law that no library has would be as likely before the recording is seen."""
+    """It is not certain: before the recording is seen, one law that no library has is more likely."""
     values = {"P13.laminar_flow.transition_head": 0.1, "P13.flow_exponent.excess": -0.3}
     library = ("laminar_flow", "flow_exponent", "pump_gain", "sensor_bias", "leak")
     answer = diagnose(nominal_plant(), recorded(values, 81), settings=Settings(library))
