@@ -150,4 +150,5 @@ def test_a_lag_in_place_of_a_delay_that_the_library_lacks_is_not_certain() -> No
         recording = recorded({"Q1.pump_delay.delay": 7.0}, seed, std=2e-4)
         answer = diagnose(nominal_plant(), recording, settings=settings)
         assert answer.verdict != "named"
-        assert {c.location for h in answer.posterior[:2] for c in h.causes} == {"Q1"}
+        likeliest = answer.to_dict()["posterior"][:2]
+        assert {c["location"] for h in likeliest for c in h["causes"]} == {"Q1"}
