@@ -145,3 +145,12 @@ def test_swapped_sensors_are_no_wrong_unit(folder: Path) -> None:
     plant = load_plant(folder / "rig.yaml")
     run = recorded(plant, {})
     assert wrong_units(plant, replace(run, outputs=run.outputs.flip(-1))) == ""
+
+
+@pytest.mark.parametrize("effects", ["", "effects: [{effect: pump_cut_out, location: Q, parameters: {level: 59 cm}}]"])
+def test_open_drains_are_no_levels_above_the_rim(folder: Path, effects: str) -> None:
+    """Levels 100 times higher would explain the outflow, if the tanks could hold them; above a pump's cut-out no flow
+    is left that could contradict them."""
+    (folder / "rig.yaml").write_text(PLANT + effects)
+    plant = load_plant(folder / "rig.yaml")
+    assert wrong_units(plant, recorded(plant, {"A.leak": 1.0, "B.leak": 1.0})) == ""

@@ -179,11 +179,11 @@ class HypothesisSearch:
                     self.pool.evaluate(fit, replace(h.unknown.noise, wander=None))
                 here = [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
                 added += [law for e in here for law in self._with_discrepancies(e, [h.unknown.location], h)]
-        return [divided for h in [*hypotheses, *added] for divided in self._among_known(h, h.weight > least)]
+        return [each for h in [*hypotheses, *added] for each in (self._among_known(h) if h.weight > least else [h])]
 
-    def _among_known(self, h: CauseHypothesis, relevant: bool) -> list[CauseHypothesis]:
+    def _among_known(self, h: CauseHypothesis) -> list[CauseHypothesis]:
         """The hypothesis, and those of single effects in place of its unknown, with its weight divided among them."""
-        if h.unknown is None or not relevant:
+        if h.unknown is None:
             return [h]
         known = [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
         errors = [self._law_error(e, h.explanation, h.unknown) for e in known]

@@ -17,12 +17,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
 
 from fdi_torch.parameters import display_unit, unit_factor
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.volume_balance import Volumes, volumes_along
+from fdi_torch.recordings.volume_balance import DEVIATION, Volumes, volumes_along
 from fdi_torch.units import same_kind
 
 UNITS = {
@@ -61,7 +60,7 @@ def wrong_units(plant: PlantDescription, recording: Recording) -> str:
     if not bool((as_is.metered.nan_to_num() != 0.0).any()):
         return ""
     corrections = list(_corrections(plant, recording, as_is))
-    # A correction that puts a level above a pump's switch leaves no flow, hence no balance: it is no better for that.
+    # A correction that puts a level above a pump's cut-out leaves no flow, hence no balance: it is no better for that.
     leads = torch.stack([each.volumes.log_evidence() for each in corrections]) - as_is.log_evidence()
     evidence = torch.cat([leads.new_zeros(1), leads.nansum(dim=1)])
     prior = torch.tensor([1.0 - PRIOR, *(PRIOR / len(corrections) for _ in corrections)])
@@ -85,21 +84,16 @@ def refusal(recording: Recording, problem: str) -> str:
 
 def _corrections(plant: PlantDescription, recording: Recording, as_is: Volumes) -> Iterator[Correction]:
     area = display_unit("m^2")[0]
+    all_tanks = torch.ones(len(plant.tanks)).to(as_is.stored)
+    areas = [(f"tanks.{t.name}.area is", one, 0.0) for t, one in zip(plant.tanks, all_tanks.diag(), strict=True)]
+    areas += [("the areas of all tanks are", all_tanks, 0.0)] if len(plant.tanks) > 1 else []
+    if plant.pipes:
+        areas += [("the areas of all pipes are", 0.0 * all_tanks, 1.0)]
+        areas += [("the areas of all tanks and pipes are", all_tanks, 1.0)]
     for right, ratio in _other_units("m^2", area):
-
-        def areas(
-            names: str, tanks: float | Tensor, pipes: float, right: str = right, ratio: float = ratio
-        ) -> Correction:
-            smaller = replace(as_is, stored=as_is.stored / tanks, by_laws=as_is.by_laws / pipes)
-            return Correction(names, area, right, ratio, smaller)
-
-        for i, tank in enumerate(plant.tanks):
-            yield areas(f"tanks.{tank.name}.area is", ratio ** torch.eye(len(plant.tanks))[i].to(as_is.stored), 1.0)
-        if len(plant.tanks) > 1:
-            yield areas("the areas of all tanks are", ratio, 1.0)
-        if plant.pipes:
-            yield areas("the areas of all pipes are", 1.0, ratio)
-            yield areas("the areas of all tanks and pipes are", ratio, ratio)
+        for names, tanks, pipes in areas:
+            smaller = replace(as_is, stored=as_is.stored / ratio**tanks, by_laws=as_is.by_laws / ratio**pipes)
+            yield Correction(names, area, right, ratio, smaller)
     channels = [component.channel for component in plant.metered_flows()]
     written = _written("m^3/s", channels[0], recording)
     for right, ratio in _other_units("m^3/s", written):
@@ -108,9 +102,21 @@ def _corrections(plant: PlantDescription, recording: Recording, as_is: Volumes) 
     columns = [sensor.column for sensor in plant.sensors]
     written = _written("m", columns[0], recording)
     for right, ratio in _other_units("m", written):
-        sensors = tuple(replace(sensor, gain=ratio * sensor.gain) for sensor in plant.sensors)
-        lower = volumes_along(replace(plant, sensors=sensors), recording)
-        yield Correction(f"the levels {', '.join(columns)} are", written, right, ratio, lower)
+        corrected = replace(plant, sensors=tuple(replace(s, gain=ratio * s.gain) for s in plant.sensors))
+        if _fits_into_tanks(corrected, recording):
+            lower = volumes_along(corrected, recording)
+            yield Correction(f"the levels {', '.join(columns)} are", written, right, ratio, lower)
+
+
+def _fits_into_tanks(plant: PlantDescription, recording: Recording) -> bool:
+    """Whether no reading shows a level above the rim of its tank, whose height may deviate as other constants do."""
+    heights = {tank.name: tank.height for tank in plant.tanks}
+    for sensor in (s for s in plant.sensors if s.column in recording.output_names):
+        column = recording.output_names.index(sensor.column)
+        readings = recording.outputs[recording.mask[:, column], column]
+        if bool(((readings - sensor.offset) / sensor.gain > (1.0 + DEVIATION) * heights[sensor.tank]).any()):
+            return False
+    return True
 
 
 def _other_units(kind: str, written: str) -> list[tuple[str, float]]:
