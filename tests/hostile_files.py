@@ -6,6 +6,7 @@ behind it; `spoiled` then damages some of them.
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from typing import Any
@@ -155,7 +156,7 @@ def run_files(draw: st.DrawFn, study: bool = False) -> dict[str, Any]:
 @st.composite
 def spoiled(draw: st.DrawFn, whole: st.SearchStrategy[dict[str, Any]]) -> bytes:
     """The document as YAML (JSON is YAML); in a fifth of them one value is replaced, removed or misplaced."""
-    document = draw(whole)
+    document = copy.deepcopy(draw(whole))  # a strategy draws the same object again
     if draw(SELDOM):
         _spoil(draw, document)
     text = json.dumps(document, ensure_ascii=False).replace("NaN", ".nan").replace("Infinity", ".inf")
