@@ -9,8 +9,12 @@ import pytest
 import torch
 
 from fdi_torch.config import load_plant
+from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import RecordingCheck, check_recording
+from fdi_torch.recordings.input_sampling import inputs_not_held
+from tests.rigs import blank_recording
+from tests.test_gap_convergence import recorded
 
 PLANT = load_plant("three_tank")
 
@@ -238,6 +242,35 @@ def test_a_command_that_moves_faster_than_its_samples(levels: int, seed: int) ->
     for hold in (1.0, 2.0):
         assert undersampled(held_at_random(hold, 3.0, 400, seed, levels))
         assert not undersampled(held_at_random(hold, 0.3, 400, seed, levels))
+
+
+def of_held_commands(hold: float, seed: int, faults: dict[str, float]) -> Recording:
+    """Simulated levels under both commands at random, each held for `hold` seconds; 400 samples, one every 3 s."""
+    time = 0.1 * torch.arange(12_000, dtype=torch.float64)
+    commands = torch.stack([held_at_random(hold, 0.1, len(time), 2 * seed + i) for i in range(2)], dim=1)
+    if hold == 3.0:  # new values at the samples, as a computer that controls and logs gives them
+        commands = commands[::30].repeat_interleave(30, dim=0)
+    whole = recorded(PLANT, blank_recording(PLANT, commands, time), faults, seed)
+    return replace(whole, time=time[::30], inputs=commands[::30], outputs=whole.outputs[::30], mask=None)
+
+
+@pytest.mark.parametrize("hold", [1.0, 2.0, 2.9])
+def test_a_command_that_changes_between_its_samples_is_refused(hold: float) -> None:
+    """The unknown flow would be taken for effects of the pumps."""
+    recording = of_held_commands(hold, 1, {})
+    with pytest.raises(ValueError, match=r"Q1.*moves between its samples, one every 3 s.*log it faster"):
+        usable(PLANT, recording)
+    assert usable(PLANT, replace(recording, trusted=True)).fault is None
+
+
+@pytest.mark.parametrize(
+    "faults", [{}, {"Q1.pump_gain.factor": 0.7}, {"Q1.pump_lag.time_constant": 5.0}, {"Q1.pump_delay.delay": 4.0}]
+)
+def test_a_command_that_is_held_from_sample_to_sample_is_accepted(faults: dict[str, float]) -> None:
+    for seed in range(3):
+        recording = of_held_commands(3.0, seed, faults)
+        assert [f.kind for f in check_recording(recording, PLANT).findings].count("undersampled") == 2
+        assert inputs_not_held(recording, PLANT) == []
 
 
 def test_how_fast_a_command_moves_is_said() -> None:

@@ -52,7 +52,9 @@ def _checked(whole: Recording, plant: PlantDescription) -> RecordingCheck:
         for e in examinations
         for s in e.stuck
     ]
-    return replace(check, findings=(*problems, *check.findings))
+    refused = {channel for e in examinations if e.fault for channel in e.fault.channels}
+    doubts = [f for f in check.findings if not (f.kind == "undersampled" and f.channel in refused)]
+    return replace(check, findings=(*problems, *doubts))
 
 
 def _slip(channels: str, text: str) -> ChannelFinding:

@@ -89,7 +89,7 @@ class ScreeningResult:
 
     @property
     def size(self) -> Tensor:
-        """The factor (M,) by which each start would be multiplied."""
+        """The factor (M,) by which each option's start values are multiplied for the best linear fit."""
         return self.score / self.strength.clamp(min=1e-300)
 
     @property

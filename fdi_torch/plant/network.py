@@ -114,7 +114,7 @@ class TankNetwork(nn.Module):
     def operating_point(
         self, state: Sequence[Tensor], commands: Sequence[Tensor], clock: Clock, values: PlaceValues
     ) -> OperatingPoint:
-        """The argument of the stages: the state as in `rates`, and outputs (*batch) of the actuators."""
+        """What the terms of the equations depend on, at one state (as in `rates`) and one set of commands (*batch)."""
         levels, states = self.split(state)
         point = OperatingPoint.of(self.description, levels, self._actuator_names, commands, clock, values)
         return replace(point, states=states) if states else point

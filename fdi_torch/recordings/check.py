@@ -14,9 +14,10 @@ from torch import Tensor
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.channel_finding import ChannelFinding
+from fdi_torch.recordings.input_sampling import undersampled_inputs
 from fdi_torch.recordings.plant_limits import plant_limit_findings
 from fdi_torch.recordings.reading_checks import reading_findings
-from fdi_torch.recordings.repeated_readings import NORMAL_MEDIAN, resolution
+from fdi_torch.recordings.repeated_readings import resolution
 
 MANY_RUNS = 5
 """More segments without an input than this are reported in one sentence."""
@@ -24,10 +25,6 @@ HOUR = 3600.0  # s
 GAP_STEPS = 3.0
 """A gap is a sampling interval longer than this many usual ones."""
 JITTER_SHARE = 0.05
-TWO_SAMPLES_A_HOLD = 0.5
-"""Correlation of successive samples of a command that is held for two samples: 1 - (sampling interval) / (hold)."""
-CERTAIN = 1.96
-"""97.5 % quantile of the standard normal distribution."""
 DOUBTS = ("clock", "constant", "range", "unit", "undersampled", "on change")
 
 
@@ -74,7 +71,7 @@ def check_recording(recording: Recording, plant: PlantDescription) -> RecordingC
             *(ChannelFinding("read", "t", note) for note in recording.notes),
             *_clock_findings(time, steps, interval),
             *_missing_inputs(recording),
-            *_undersampled_inputs(recording, plant),
+            *undersampled_inputs(recording, plant),
             *_missing_readings(recording),
             *reading_findings(recording),
             *plant_limit_findings(recording, plant),
@@ -144,54 +141,6 @@ def _missing_inputs(recording: Recording) -> Iterator[ChannelFinding]:
             start, stop = float(recording.time[first]), float(recording.time[last])
             text = f"unknown from {start:g} s to {stop:g} s ({last - first + 1} samples): the recording is cut there"
             yield ChannelFinding("unknown", name, text, {"start": start, "stop": stop})
-
-
-def _undersampled_inputs(recording: Recording, plant: PlantDescription) -> Iterator[ChannelFinding]:
-    """Pump commands that change too fast for their sampling.
-
-    Such a command is, at a confidence of 97.5 %, held for less than two samples on average, or oscillates with fewer
-    than six samples per period, and is so strong that the unknown flow of one interval moves the level by more than the
-    noise of its readings.
-
-    If a command switches at random and is held for a time h, samples at intervals d <= h have the correlation 1 - d /
-    h; samples of a sine of period T have cos(2 pi d / T). The standard error of the correlation over N independent
-    samples is 1 / sqrt(N).
-    """
-    for pump in plant.metered_flows():
-        areas = [tank.area for tank in plant.tanks if tank.name == pump.near_tank]
-        if pump.channel not in recording.input_names or not areas:
-            continue
-        name, values = pump.channel, recording.inputs[:, recording.input_names.index(pump.channel)]
-        both_known = torch.isfinite(values[:-1]) & torch.isfinite(values[1:])
-        before, after = values[:-1][both_known], values[1:][both_known]
-        variance = float(torch.cat([before, after]).var(correction=0)) if len(before) else 0.0
-        unknown_change = pump.gain * variance**0.5 * recording.interval / areas[0]
-        if not unknown_change > _scatter(recording, plant, pump.near_tank):
-            continue
-        correlation = 1.0 - float((after - before).square().mean()) / (2.0 * variance)
-        if correlation + CERTAIN / len(before) ** 0.5 < TWO_SAMPLES_A_HOLD:
-            text = (
-                f"moves about as fast as it is sampled: successive samples correlate by {correlation:.2f}, those of a "
-                f"command that is held for two samples by {TWO_SAMPLES_A_HOLD:g}. What it does between samples is not "
-                "recorded; unless it is held from each sample to the next, its flow is unknown and the error looks "
-                "like an effect of the pump: log it faster, or its mean over each interval"
-            )
-            yield ChannelFinding(
-                "undersampled", name, text, {"correlation": correlation, "interval": recording.interval}
-            )
-
-
-def _scatter(recording: Recording, plant: PlantDescription, tank: str) -> float:
-    """Least noise or resolution of a tank's readings, as a level, m; infinite without a sensor."""
-    scatters = [torch.inf]
-    for sensor in plant.sensors:
-        if sensor.tank == tank and sensor.column in recording.output_names:
-            column = recording.output_names.index(sensor.column)
-            values = recording.outputs[recording.mask[:, column], column] / sensor.gain
-            if len(values) > 2:  # second differences of white noise of unit size are normal, with a variance of 6
-                scatter = float(torch.diff(values, n=2).abs().median()) / (NORMAL_MEDIAN * 6.0**0.5)
-                scatters.append(max(scatter, resolution(values)))
-    return min(scatters)
 
 
 def _usual_step(time: Tensor) -> float:

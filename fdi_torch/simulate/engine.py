@@ -87,7 +87,7 @@ class Engine(Protocol):
     def moments(self, theta: Tensor, data: Readings) -> Tensor:
         """theta (problems, N, P) -> weighted sums of r, r^2 and r y' over the samples, (problems, N, C, 3).
 
-        r = y - prediction, y' = y - mean(y). With the sums of y alone they give likelihood and correlation.
+        r = y - prediction, y' = y - mean(y). Likelihood and correlation follow from them and the sums of y.
         """
         ...
 

@@ -203,7 +203,7 @@ class _Builder:
         return stages, advance, tuple(substituted(graph, law, uniform, {}))
 
     def _law(self, act: Section) -> tuple[Section, tuple[tuple[int, int], ...]]:
-        """The rates, their slopes by the levels, and the pattern of these slopes."""
+        """The rates of the levels, their derivatives by the levels, and which of these derivatives are not zero."""
         levels = self._inputs("level", self.network.order)
         held = self._inputs("action", len(self.network.actuators()))
         rates = self._network_rates(levels, held, self._step_clock() if self.adaptive else self.clock)

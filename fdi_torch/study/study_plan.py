@@ -47,7 +47,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Block:
-    """Trials first..last-1 of one setting; `offset` is the number of the setting's trial 0 in the whole study."""
+    """Trials first..last-1 of one setting; `offset`: how many trials of the study precede the setting's first."""
 
     setting: int
     first: int

@@ -73,7 +73,7 @@ def relays(x: Tensor, ends: tuple[float, float], count: int) -> list[tuple[float
 
 
 def fatigues(x: Tensor, step: Tensor, ends: tuple[float, float], scale: float) -> list[Tensor]:
-    """x times its own recent mean, over the largest |x|."""
+    """Efficiency that falls with recent use: x times its own recent mean, over the largest |x|."""
     largest = max(abs(ends[0]), abs(ends[1]), 1e-12)
     return [x * lagged(x, step, scale * tau) / largest for tau in FATIGUE_TIMES]
 

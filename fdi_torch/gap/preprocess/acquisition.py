@@ -23,10 +23,11 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
     thinned,
 )
 from fdi_torch.gap.preprocess.recording_fault_decision import SURE, log_odds, recording_fault
-from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault
+from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, not_held
 from fdi_torch.parameters import quantity_text
 from fdi_torch.plant.description import PlantDescription, Sensor, with_tolerances
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.input_sampling import inputs_not_held
 from fdi_torch.recordings.plant_units import refusal, wrong_units
 from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs
 
@@ -84,6 +85,8 @@ def examined(plant: PlantDescription, recording: Recording) -> CheckedRecording:
             break
         stuck += _all_readings(remaining, silent)
         remaining, constant = without(recording, stuck), [s for s in constant if s not in silent]
+    if not recording.trusted and fault is None and (channels := inputs_not_held(remaining, plant)):
+        fault = not_held(channels, recording.interval)
     return CheckedRecording(_with_notes(remaining, stuck), tuple(stuck), fault)
 
 

@@ -49,6 +49,16 @@ def clock_offset(columns: tuple[str, ...], delay: float, everything: bool) -> Re
     return RecordingFault(("all",) if everything else columns, text, physical=delay > 0 and not everything)
 
 
+def not_held(channels: Sequence[str], interval: float) -> RecordingFault:
+    """Commands whose values between samples, `interval` seconds apart, are unknown."""
+    text = (
+        f"{', '.join(channels)}: moves between its samples, one every {interval:g} s: the level of its tank changes "
+        "before the command that changes it is read, so that the flow between samples is unknown; log it faster, or "
+        "its mean over each interval"
+    )
+    return RecordingFault(tuple(channels), text)
+
+
 def unrelated(sensor: Sensor) -> RecordingFault:
     """The readings of a sensor scatter about a mean and do not depend on the level."""
     text = (

@@ -4,6 +4,8 @@
     clock offset                   `clock_offset.py`
     silent sensor                  `silent_sensors.py`
 
+Another, commands that move faster than their samples, shows in the readings alone (`recordings/input_sampling.py`).
+
 A hypothesis undoes its fault in the recording; only the clock offset has a parameter to fit. Its weight is the
 log-likelihood of the corrected recording (`blockwise_likelihood.py`) plus the log prior. A hypothesis is fitted only if
 its gain in log-likelihood, to first order in the constants, exceeds the cost of its prior.
