@@ -164,3 +164,24 @@ def test_the_diff_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     told = capsys.readouterr().out
     assert "-    height: 24 in   # rim\n+    height: 25 in   # rim\n" in told
     assert "--- rig.yaml\n+++ new.yaml\n" in told
+
+
+@pytest.mark.parametrize(("style", "shown"), [("3 %", "0.056 %"), ("0.03", "0.00056")])
+def test_tolerances_are_added_in_the_style_of_the_file(style: str, shown: str) -> None:
+    text = TEXT.replace("3 %  #", f"{style}  #").replace("    gain: 98.1 mbar/m ", "    gain: 2 %/cm ")
+    before = read(text)
+    narrow = {"link.discharge_coefficient": 0.00056, "drain.discharge_coefficient": 0.00043, "pB.offset": 0.0056}
+    changed, kept = patched_plant(text, before, replace(before, tolerances=before.tolerances | narrow))
+    _, new = lines_changed(text, changed)
+    assert kept and new[0] == f"  link.discharge_coefficient: {shown}" and new[-1] == "  pB.offset: 0.56 %"
+    assert ("%" in new[1]) == ("%" in style)
+
+
+def test_what_a_sensor_in_percent_gets_is_written_in_percent() -> None:
+    text = TEXT.replace("    gain: 98.1 mbar/m ", "    gain: 2 %/cm ")
+    before = read(text)
+    after = with_constants(before, {"pB.offset": -0.0021})
+    biased = replace(after, effects=(*after.effects, PlacedEffect("sensor_bias", "pB", {"bias": 0.01})))
+    changed, kept = patched_plant(text, before, biased)
+    _, new = lines_changed(text, changed)
+    assert kept and new == ["    offset: -0.21 %", "- {effect: sensor_bias, location: pB, parameters: {bias: 1 %}}"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Sequence
+from functools import partial
 
 from fdi_torch.cli import DONE, NOT_CONVERGED
 from fdi_torch.cli.explained import exit_code, say_first
@@ -48,7 +49,7 @@ def show(done: TrainResult, screen: Screen) -> None:
     say_first(diagnosis.misfit, screen, *hints)
     rows = []
     for i, p in enumerate(done.fitting.space):
-        unit, scale = display_unit(p.unit)
+        unit, scale = display_unit(p.unit, p.name)
         truth = done.truth.get(p.name)
         numbers = estimate_cells(float(final.value[i]), float(final.std[i]), p.nominal, scale)
         simulated = [f"{scale * truth:.5g}" if truth is not None else ""] if done.truth else []
@@ -94,7 +95,7 @@ def show_uncertainty(done: TrainResult, screen: Screen) -> None:
         screen.say(f"- {line}")
     rows = []
     for profile in done.profiles:
-        unit, scale = display_unit(profile.unit)
+        unit, scale = display_unit(profile.unit, profile.name)
         limits = f"{scale * profile.low:.5g} .. {scale * profile.high:.5g}"
         note = " and ".join(f"{end} end is not determined" for end in profile.ends)
         rows.append([profile.name, unit or "1", f"{100 * profile.confidence:g} %", limits, note])
@@ -105,7 +106,7 @@ def show_uncertainty(done: TrainResult, screen: Screen) -> None:
     if draws is not None:
         rows = []
         for p, median, low, high in zip(done.fitting.space, draws.median(), *draws.interval(0.95), strict=True):
-            unit, scale = display_unit(p.unit)
+            unit, scale = display_unit(p.unit, p.name)
             limits = f"{scale * float(low):.5g} .. {scale * float(high):.5g}"
             rows.append([p.name, unit or "1", f"{scale * float(median):.6g}", limits])
         screen.table("draws from the posterior", ("parameter", "unit", "median", "95 % interval"), rows, left=2)
@@ -123,7 +124,8 @@ def in_words(done: TrainResult) -> list[str]:
     if diagnosis.faults:
         lines.append(f"{diagnosis.kind}: {diagnosis.names or 'no suspected fault differs significantly from nominal'}")
     for fault in diagnosis.present:
-        parts = [f"{quantity_text(fault.value, fault.unit)} instead of {quantity_text(fault.nominal, fault.unit)}"]
+        shown = partial(quantity_text, si_unit=fault.unit, name=fault.name)
+        parts = [f"{shown(fault.value)} instead of {shown(fault.nominal)}"]
         if fault.flow is not None:
             parts.append(f"{quantity_text(fault.flow, 'm^3/s', 3)} at the mean levels")
         if fault.hole is not None:

@@ -192,7 +192,7 @@ def percent_text(mass: float) -> str:
 
 def amount_text(p: Parameter, size: float, std: float, at_end: bool = False) -> str:
     """'Q1.pump_offset.offset = 23.1 ± 0.4 cm^3/s', in a practical unit."""
-    unit, scale = display_unit(p.unit)
+    unit, scale = display_unit(p.unit, p.name)
     error = f" ± {scale * std:.2g}" if std > 0.0 and not at_end else ""
     end = ", the end of its range" if at_end else ""
     return f"{p.name} = {scale * size:.4g}{error} {unit}".rstrip() + end
@@ -200,7 +200,7 @@ def amount_text(p: Parameter, size: float, std: float, at_end: bool = False) -> 
 
 def rate_text(p: Parameter, rate: float) -> str:
     """'1.2 cm per hour', or per day for slow changes."""
-    unit, scale = display_unit(p.unit)
+    unit, scale = display_unit(p.unit, p.name)
     span, name = (3600.0, "hour") if abs(rate) * 86400.0 > abs(p.high - p.low) * 0.01 else (86400.0, "day")
     return f"{scale * rate * span:.3g} {unit} per {name}".replace("  ", " ")
 

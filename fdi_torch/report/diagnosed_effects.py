@@ -46,7 +46,7 @@ class DiagnosedEffect:
     @property
     def sized(self) -> str:
         """'leak at T1 (size 0.3000 ± 0.0020, 33.1 cm³/s)': the effect with its size and, if it has one, its flow."""
-        unit, scale = shown_unit(self.unit)
+        unit, scale = shown_unit(self.unit, f"{self.location}.{self.effect}.{self.quantity}")
         value = with_error(scale * self.size, scale * self.std)
         size = f"{self.quantity.replace('_', ' ')} {value}" if unit in ("", "1") else f"{value} {unit}"
         sizes = [size] if math.isfinite(self.size) else []

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import orjson
 
+from fdi_torch.effects import units_for_display
 from fdi_torch.gap.verdict_words import FORMAT_1
 from fdi_torch.logbook import Inspection, LogError, Run, Signals, arrays, inspect_log, own_signals, series
 from fdi_torch.parameters import displayed_in
@@ -124,7 +125,7 @@ class Material:
         """Context within which quantities are displayed in the units of the run's plant and of its recordings."""
         written = (key.partition(".unit.") for key in self.about("data"))
         channels = {name: self.about("data")[f"{k}.unit.{name}"] for k, divided, name in written if divided}
-        return displayed_in({**(self.plant.units if self.plant else {}), **channels})
+        return displayed_in({**(units_for_display(self.plant) if self.plant else {}), **channels})
 
     @property
     def meaning_of_shares(self) -> str:

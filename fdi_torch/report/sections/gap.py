@@ -141,7 +141,8 @@ def _cause_rows(cause: Mapping[str, Any]) -> list[list[str]]:
     effect, location = str(cause["effect"]).replace("_", " "), str(cause["location"])
     rows = []
     for name, amount in (cause.get("parameters") or {}).items():
-        unit, scale = shown_unit(str(amount.get("unit", "")))
+        full = f"{location}.{cause['effect']}.{name}"
+        unit, scale = shown_unit(str(amount.get("unit", "")), full)
         value, std = scale * as_float(amount.get("value")), scale * as_float(amount.get("std"))
         rows.append([effect, location, str(name).replace("_", " "), with_error(value, std), unit])
     return rows or [[effect, location, "", "", ""]]
