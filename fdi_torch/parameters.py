@@ -22,7 +22,6 @@ from fdi_torch.units import UnitError, factor, in_unit, number_and_unit, same_ki
 
 SI_UNITS = ("m", "s", "V", "Pa", "A", "1/s", "m^2", "m^3", "m^3/s", "m/s", "1")
 
-
 Value = TypeVar("Value")
 
 

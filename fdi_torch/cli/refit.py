@@ -52,7 +52,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         _show_run_specific(fitted, screen)
         if arguments.adopt:
             adopted = fitted.narrowed() if arguments.narrow else fitted.plant
-            write_adopted(arguments.plant, plant, adopted, Path(arguments.adopt), screen)
+            for line in write_adopted(arguments.plant, plant, adopted, Path(arguments.adopt), screen):
+                screen.say(line)
             screen.note(f"plant file with the fitted values: {arguments.adopt}")
             if plant.tolerances and not arguments.narrow:
                 screen.say(

@@ -14,8 +14,8 @@ from fdi_torch.config.plant_in_code import Plant, effect_in_si, effect_parameter
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Acceleration, Amount, Area, Length, Strict, quantity
 from fdi_torch.config.written_units import written_units
-from fdi_torch.effects import units_for_display
 from fdi_torch.config.yaml_files import find_plant, read_yaml
+from fdi_torch.effects import units_for_display
 from fdi_torch.names import unknown
 from fdi_torch.parameters import SI_UNITS, ParameterName, display_in, unit_factor
 from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, READING_UNITS, FaultPriority, PlacedEffect, Sensor, Tank

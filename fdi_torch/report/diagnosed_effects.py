@@ -9,7 +9,7 @@ from typing import Any
 
 from fdi_torch.effects import effect
 from fdi_torch.estimate.combinations import Combination
-from fdi_torch.gap.verdict_words import cause_words, equivalents_words
+from fdi_torch.gap.verdict_words import apart_from_rounding, cause_words, equivalents_words
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import fits
@@ -60,9 +60,10 @@ def readable(cause: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def diagnosed_effects(material: Material) -> list[DiagnosedEffect]:
-    """Faults of a diagnosis (the last message about each), then the causes of a gap."""
+    """Faults of a diagnosis (the last message about each), then the causes of a gap, rounded readings excepted."""
     faults = {(m.get("fault"), m.get("location")): _fault(m) for m in material.of("/diagnosis/fault")}
-    return [*faults.values(), *(_cause(cause, material.plant) for cause in material.answer.get("causes", []))]
+    causes = apart_from_rounding(material.answer.get("causes", []))
+    return [*faults.values(), *(_cause(cause, material.plant) for cause in causes)]
 
 
 def _fault(message: Mapping[str, Any]) -> DiagnosedEffect:
