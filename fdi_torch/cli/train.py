@@ -12,10 +12,11 @@ from fdi_torch.cli.explained import exit_code, say_first
 from fdi_torch.cli.options import live, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.cli.windows import show_windows
+from fdi_torch.clock import clock_unit, show_clock
 from fdi_torch.config.run_file import load_run
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.jobs.windowed_fit import fit_windows
-from fdi_torch.parameters import display_unit, quantity_text
+from fdi_torch.parameters import ParameterName, display_unit, quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import data_warnings
 
@@ -42,6 +43,7 @@ def show(done: TrainResult, screen: Screen) -> None:
     If the model does not explain the recording, that comes first.
     """
     final, diagnosis = done.result.estimate, done.result.diagnosis
+    show_clock(r.clock_zero for r in done.fitting.recordings)
     network, space = done.fitting.networks[0], done.fitting.space
     onsets = [f"{place.prefix}.onset" for place in network.placements]
     onsets = [name for name in onsets if name in network.constants and name not in space][:1]
@@ -53,7 +55,8 @@ def show(done: TrainResult, screen: Screen) -> None:
         truth = done.truth.get(p.name)
         numbers = estimate_cells(float(final.value[i]), float(final.std[i]), p.nominal, scale)
         simulated = [f"{scale * truth:.5g}" if truth is not None else ""] if done.truth else []
-        rows.append([p.name, unit or "1", *numbers, *simulated])
+        shown_unit = clock_unit(unit, ParameterName.parse(p.name).field, float(final.value[i]))
+        rows.append([p.name, shown_unit or "1", *numbers, *simulated])
     header = ("parameter", "unit", "estimate", "std error", "95 % interval", "nominal", "simulated")
     screen.table("", header if done.truth else header[:-1], rows, left=2)
     if final.combinations:

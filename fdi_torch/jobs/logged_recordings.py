@@ -41,5 +41,7 @@ def logged_recording(log: LoggedRun, group: str, number: int) -> Recording:
         hold=signals.hold,  # type: ignore[arg-type]
         source=about.get(f"{number}.path", str(log.path)),
         sha256=about.get(f"{number}.sha256", ""),
+        began=float(about[f"{number}.began"]) if f"{number}.began" in about else None,
+        zone=float(about.get(f"{number}.zone", 0.0)),
         written={name: about[f"{number}.unit.{name}"] for name in names if f"{number}.unit.{name}" in about},
     )

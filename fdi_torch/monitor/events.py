@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from fdi_torch.clock import clock_text
 from fdi_torch.monitor.alarm_state import State
 from fdi_torch.parameters import Parameter, display_unit
 
@@ -122,7 +123,10 @@ class Event:
 
     @property
     def line(self) -> str:
-        return f"{self.time:10.1f} s  {self.kind:<11} {self.text}"
+        """Time, clock time if the recording has one, kind and text."""
+        moment = f"{clock}  " if (clock := clock_text(self.time)) else ""
+        onset = "" if self.onset is None or self.kind == "followed" else clock_text(self.onset)
+        return f"{self.time:10.1f} s  {moment}{self.kind:<11} {self.text}{f' (began {onset})' if onset else ''}"
 
     @property
     def best(self) -> Explanation | None:
