@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta, timezone
 
 MOMENTS = ("onset", "begin")
 """Names of effect parameters that are times of the recording."""
@@ -45,6 +45,23 @@ def clock_unit(unit: str, field: str, seconds: float) -> str:
     """The unit of a parameter, with the clock time if it is a time of the recording: 's (2026-11-20 08:41:40)'."""
     moment = clock_text(seconds) if field in MOMENTS else ""
     return f"{unit} ({moment})" if moment else unit
+
+
+def stamp(began: float, zone: float) -> str:
+    """'2026-11-20T08:30:00+01:00': a time in s since 1970, in a zone that many seconds ahead of UTC; empty for a time
+    that has no date.
+    """
+    try:
+        return datetime.fromtimestamp(began, timezone(timedelta(seconds=zone))).isoformat()
+    except (OverflowError, ValueError, OSError):
+        return ""
+
+
+def of_stamp(text: str) -> tuple[float, float]:
+    """Time in s since 1970 and zone in s of a stamp; the inverse of `stamp`. Raises ValueError."""
+    moment = datetime.fromisoformat(text)
+    offset = moment.utcoffset()
+    return moment.timestamp(), offset.total_seconds() if offset else 0.0
 
 
 def _common(zeros: Iterable[float | None]) -> float | None:

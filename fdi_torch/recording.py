@@ -10,6 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from fdi_torch.clock import stamp
 from fdi_torch.names import unknown
 from fdi_torch.tables import Shown, Table, needed
 
@@ -164,7 +165,8 @@ class Recording(Shown):
     @property
     def origin(self) -> dict[str, str]:
         """What a log says of the recording's file: path, hash, time 0, and the unit of each channel in it."""
-        clock = {} if self.began is None else {"began": repr(self.began), "zone": repr(self.zone)}
+        began = "" if self.began is None else stamp(self.began, self.zone)
+        clock = {"began": began} if began else {}
         return {"path": self.source, "sha256": self.sha256} | clock | {f"unit.{n}": u for n, u in self.written.items()}
 
     @property

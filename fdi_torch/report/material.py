@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import orjson
 
-from fdi_torch.clock import clock_shown
+from fdi_torch.clock import clock_shown, of_stamp
 from fdi_torch.effects import units_for_display
 from fdi_torch.gap.verdict_words import FORMAT_1
 from fdi_torch.logbook import Inspection, LogError, Run, Signals, arrays, inspect_log, own_signals, series
@@ -139,7 +139,7 @@ class Material:
         """Time 0 of each recording as its clock showed it, s since 1970; None for a clock without dates."""
         about = self.about("data")
         numbers = [key.removesuffix(".path") for key in about if key.endswith(".path")]
-        zeros = [_sum_of_texts(about.get(f"{k}.began"), about.get(f"{k}.zone", "0")) for k in numbers]
+        zeros = [_clock_zero(about.get(f"{k}.began")) for k in numbers]
         origins = [message.get("origin") for message in self.of(CLOCK)]
         return zeros or [float(zero) for zero in origins if isinstance(zero, int | float)]
 
@@ -151,10 +151,10 @@ class Material:
         return "probability that something is wrong there"
 
 
-def _sum_of_texts(began: str | None, zone: str) -> float | None:
-    """The sum of two numbers of a log's metadata; None without the first, or if it is no number."""
+def _clock_zero(began: str | None) -> float | None:
+    """The stamp of a log's metadata as its own clock shows it, s since 1970; None without one."""
     try:
-        return None if began is None else float(began) + float(zone)
+        return None if began is None else sum(of_stamp(began))
     except ValueError:
         return None
 
