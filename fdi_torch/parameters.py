@@ -22,7 +22,6 @@ from fdi_torch.units import UnitError, factor, in_unit, number_and_unit, same_ki
 
 SI_UNITS = ("m", "s", "V", "Pa", "A", "1/s", "m^2", "m^3", "m^3/s", "m/s", "1")
 
-
 Value = TypeVar("Value")
 
 
@@ -244,11 +243,12 @@ def si_unit_of(unit: str) -> str:
 def display_unit(si_unit: str, name: str = "") -> tuple[str, float]:
     """The unit for display, and the value of one SI unit in it: 'm' -> ('cm', 100.0).
 
-    It is the unit set by `display_in` for that kind of quantity; name: a channel or sensor, which may have its own. A
-    quotient without a unit of its own is displayed in the units of its parts.
+    It is the unit set by `display_in` for that kind of quantity; name: a channel or a parameter, which may have its
+    own. A quotient without a unit of its own is displayed in the units of its parts.
     """
     chosen = _DISPLAYED.get()
     unit = _in_chosen_unit(si_unit, chosen)
+    name = common_name(name) if "@" in name else name
     if name in chosen:
         with suppress(ValueError):  # the channel of that name may be of another recording
             return chosen[name], 1.0 / unit_factor(chosen[name], si_unit)
@@ -268,7 +268,7 @@ def quantity_text(value: float, si_unit: str, digits: int = 4, name: str = "") -
 
 
 def display_in(units: Mapping[str, str]) -> None:
-    """Set the units for display in this context: SI unit, or name of a channel or sensor -> unit."""
+    """Set the units for display in this context: SI unit, or name of a channel or parameter -> unit."""
     _DISPLAYED.set(dict(units))
 
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from fdi_torch.clock import stamp
 from fdi_torch.names import unknown
 from fdi_torch.tables import Shown, Table, needed
 
@@ -25,9 +26,10 @@ class Recording(Shown):
     time (T,), s: strictly increasing. inputs (T, M) and outputs (T, N): in the SI units `input_units`, `output_units`.
     mask (T, N): True for valid readings; a missing reading is NaN in outputs and False here. An unknown input is NaN;
     `known_segments` cuts the recording there. hold: course of the inputs between samples. began: time 0 as seconds
-    since 1970, if known. notes: corrections by the reader, as sentences. ran: inputs that were, or may have been, on
-    before the first sample, according to the recording from which this one was cut. trusted: whether checks for wrong
-    units, swapped channels and clock errors are skipped. written: the unit of each channel in its file.
+    since 1970, if known. zone: of the file's clock, s ahead of UTC. notes: corrections by the reader, as sentences.
+    ran: inputs that were, or may have been, on before the first sample, according to the recording from which this one
+    was cut. trusted: whether checks for wrong units, swapped channels and clock errors are skipped. written: the unit
+    of each channel in its file.
     """
 
     time: Tensor
@@ -44,6 +46,7 @@ class Recording(Shown):
     ran: frozenset[str] = frozenset()
     notes: tuple[str, ...] = ()
     began: float | None = None
+    zone: float = 0.0
     trusted: bool = False
     written: Mapping[str, str] = field(default_factory=dict, hash=False)
 
@@ -161,8 +164,15 @@ class Recording(Shown):
 
     @property
     def origin(self) -> dict[str, str]:
-        """What a log says of the recording's file: path, hash, and the unit of each channel in it."""
-        return {"path": self.source, "sha256": self.sha256} | {f"unit.{n}": u for n, u in self.written.items()}
+        """What a log says of the recording's file: path, hash, time 0, and the unit of each channel in it."""
+        began = "" if self.began is None else stamp(self.began, self.zone)
+        clock = {"began": began} if began else {}
+        return {"path": self.source, "sha256": self.sha256} | clock | {f"unit.{n}": u for n, u in self.written.items()}
+
+    @property
+    def clock_zero(self) -> float | None:
+        """Time 0 as the file's clock showed it, s since 1970; None if it has no dates."""
+        return None if self.began is None else self.began + self.zone
 
     def selected(self, inputs: Sequence[str], outputs: Sequence[str]) -> Recording:
         """The recording with these channels only, in this order. Raises ValueError for a missing one."""

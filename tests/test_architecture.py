@@ -14,7 +14,18 @@ ROOT = Path(__file__).parents[1] / "fdi_torch"
 
 # Lowest first. A room imports from rooms further down, and sideways only where that closes no circle.
 LAYERS = (
-    {"capacity", "disk", "interruption", "names", "untrusted_input", "parameters", "recording", "tables", "units"},
+    {
+        "capacity",
+        "clock",
+        "disk",
+        "interruption",
+        "names",
+        "untrusted_input",
+        "parameters",
+        "recording",
+        "tables",
+        "units",
+    },
     {"plant"},
     {"effects", "simulate"},
     {"estimate", "logbook", "recordings"},

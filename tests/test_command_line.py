@@ -123,13 +123,20 @@ def test_a_file_with_other_names_is_refused_with_the_lines_that_map_it(
     refused = capsys.readouterr().err
     assert "expected a column for Q1, h2, got t_s, FIC-1 (cm^3/s), " in refused
     lines = refused[refused.index("recordings:") :]
-    Path("runs.yaml").write_text(
-        lines.replace("Q1: {column: ..., unit: ...}", "Q1: {column: FIC-1}").replace(
-            "h2: {column: ..., unit: ...}", "h2: {column: LT-2, unit: cm}"
-        )
-    )
+    assert 'Q1: {column: "FIC-1 (cm^3/s)"}' in lines
+    Path("runs.yaml").write_text(lines.replace("h2: {column: ..., unit: ...}", "h2: {column: LT-2, unit: cm}"))
     assert cli.main(["check", "runs.yaml", "--plant", "three_tank"]) == cli.DONE
     assert "50 samples, 49 s" in capsys.readouterr().out
+
+
+def test_a_file_with_a_title_and_no_header_is_refused_with_lines_that_number_its_columns(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "run7.txt"
+    path.write_text("Versuch 7, 20.11.2026\n" + "".join(f"{k}\t50,5\t40\t30,1\t20\t20\n" for k in range(9)))
+    assert cli.main(["check", str(path), "--plant", "three_tank"]) == cli.MISUSE
+    lines = capsys.readouterr().err
+    assert "    header: false\n    columns:    # by number, 1 to 6\n      t: {column: 1, unit: s}\n      Q1: {" in lines
 
 
 def test_a_file_without_its_option_is_told_the_option(capsys: pytest.CaptureFixture[str]) -> None:

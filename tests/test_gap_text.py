@@ -10,10 +10,12 @@ from fdi_torch.cli.gap_text import next_steps, show
 from fdi_torch.cli.screen import Screen
 from fdi_torch.gap.answer import Amount, Answer, Cause, ProbableExplanation, adopted
 from fdi_torch.gap.verdict_words import causes_of, probability_words, verdict_sentence
+from fdi_torch.parameters import displayed_in
 from tests.test_gap import nominal_plant
 
 LEAK = Cause("leak", "T1", {"size": Amount(0.2, 0.01, "1")})
 ODD = ("unknown", "Q1")
+ROUNDS = "sensor_quantization"
 FLOWS = {
     "T1": {"std": 2.5e-6, "unit": "m^3/s", "correlation_time": 15.0},
     "T2": {"std": 1e-6, "unit": "m^3/s", "correlation_time": 0.0},
@@ -33,7 +35,7 @@ BOTH = Answer(
 
 
 def test_the_terminal_prints_the_unknown_and_the_named_causes(capsys: pytest.CaptureFixture[str]) -> None:
-    show(BOTH, Screen())
+    show(BOTH, [], Screen())
     said = capsys.readouterr().out
     assert said.startswith(
         "The gap comes from leak at T1 and something unknown at Q1, probability 97.0 %; no effect of the library "
@@ -101,3 +103,26 @@ def test_an_unknown_of_either_format_is_read_once() -> None:
     assert causes_of({"causes": [], "unknown_at": "Q1"}) == [odd]
     assert causes_of({"causes": [odd], "unknown_at": "Q1"}) == [odd]
     assert verdict_sentence({}) == ""
+
+
+def test_rounded_readings_are_no_fault_and_are_told_in_the_unit_of_the_sensor(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    step = {"step": Amount(0.01, 0.0, "1")}
+    posterior = [ProbableExplanation((("leak", "T1"), (ROUNDS, "h1")), 0.99)]
+    both = replace(BOTH, verdict="named", causes=[LEAK, Cause(ROUNDS, "h1", step)], posterior=posterior, unexamined=0.0)
+    with displayed_in({f"h1.{ROUNDS}.step": "%"}):
+        show(both, ["do this"], Screen())
+        said = capsys.readouterr().out
+        assert said.startswith(
+            "The gap comes from leak at T1, probability 99.0 %. Readings are rounded, which is no fault: h1 to 1 %.\n"
+            "- next: do this\n"
+        )
+        assert ROUNDS not in said
+        alone = replace(
+            both, causes=[Cause(ROUNDS, "h1", step)], posterior=[ProbableExplanation(((ROUNDS, "h1"),), 0.99)]
+        )
+        assert verdict_sentence(alone.to_dict()) == (
+            "No gap: the plant file explains the recording within rounding, noise and tolerances, probability 99.0 %. "
+            "Readings are rounded, which is no fault: h1 to 1 %."
+        )

@@ -118,3 +118,29 @@ def test_effects_of_a_plant_are_told_with_places_and_in_full(capsys: pytest.Capt
     assert "got 'leek'; the nearest is 'leak'" in capsys.readouterr().err
     assert cli.main(["effects", "valve_lag", "--plant", "three_tank"]) == cli.MISUSE
     assert "valve_lag: expected a plant with a valve, got three_tank" in capsys.readouterr().err
+
+
+def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    rows = [f"{k},{3 + k % 2},{40 + k / 10},{1 + k / 100},2,{4 + k / 50},0.{k}" for k in range(10)]
+    header = "time_s,FIC-101 PV (l/min),LT-101 (%),PT 7 [kPa],operator,level_mA,valve (%)"
+    Path("trend.csv").write_text("\n".join([header, *rows]) + "\n")
+    fdi("new", "plant", "--recording", "trend.csv", "--out", "rig.yaml")
+    assert "rig.yaml; next: fdi check trend.csv --plant rig.yaml" in capsys.readouterr().out
+    assert "# Left out, as their header has no unit: operator\n" in Path("rig.yaml").read_text()
+    plant = load_plant(Path("rig.yaml"))
+    assert [sensor.column for sensor in plant.sensors] == ["LT-101", "PT 7", "level"]
+    assert list(plant.channels()) == ["FIC-101 PV", "valve"] and [p.target for p in plant.pipes] == [
+        "B",
+        "C",
+        "outside",
+    ]
+    assert plant.pumps[0].max_flow == pytest.approx(4e-3 / 60)
+    fdi("check", "trend.csv", "--plant", "rig.yaml")
+    assert "next: fdi gap --plant rig.yaml --recording trend.csv" in capsys.readouterr().out
+    Path("none.csv").write_text("t_s,a,b\n0,1,2\n1,1,2\n")
+    assert cli.main(["new", "plant", "--recording", "none.csv", "--out", "none.yaml"]) != cli.DONE
+    assert "expected a column of a level with its unit in the header" in capsys.readouterr().err
+    assert cli.main(["new", "run", "--recording", "trend.csv"]) != cli.DONE

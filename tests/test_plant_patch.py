@@ -157,10 +157,31 @@ def test_a_file_whose_components_share_a_value_is_written_anew_and_that_is_said(
     assert [tank.area for tank in found.tanks] == [pytest.approx(0.021), 0.02]
 
 
-def test_the_diff_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_diff_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("rig.yaml").write_text(TEXT)
-    write_adopted("rig.yaml", BEFORE, with_constants(BEFORE, {"B.height": 0.635}), Path("new.yaml"), Screen())
-    told = capsys.readouterr().out
+    diff = write_adopted("rig.yaml", BEFORE, with_constants(BEFORE, {"B.height": 0.635}), Path("new.yaml"), Screen())
+    told = "\n".join(diff)
     assert "-    height: 24 in   # rim\n+    height: 25 in   # rim\n" in told
-    assert "--- rig.yaml\n+++ new.yaml\n" in told
+    assert told.startswith("--- rig.yaml\n+++ new.yaml\n")
+
+
+@pytest.mark.parametrize(("style", "shown"), [("3 %", "0.056 %"), ("0.03", "0.00056")])
+def test_tolerances_are_added_in_the_style_of_the_file(style: str, shown: str) -> None:
+    text = TEXT.replace("3 %  #", f"{style}  #").replace("    gain: 98.1 mbar/m ", "    gain: 2 %/cm ")
+    before = read(text)
+    narrow = {"link.discharge_coefficient": 0.00056, "drain.discharge_coefficient": 0.00043, "pB.offset": 0.0056}
+    changed, kept = patched_plant(text, before, replace(before, tolerances=before.tolerances | narrow))
+    _, new = lines_changed(text, changed)
+    assert kept and new[0] == f"  link.discharge_coefficient: {shown}" and new[-1] == "  pB.offset: 0.56 %"
+    assert ("%" in new[1]) == ("%" in style)
+
+
+def test_what_a_sensor_in_percent_gets_is_written_in_percent() -> None:
+    text = TEXT.replace("    gain: 98.1 mbar/m ", "    gain: 2 %/cm ")
+    before = read(text)
+    after = with_constants(before, {"pB.offset": -0.0021})
+    biased = replace(after, effects=(*after.effects, PlacedEffect("sensor_bias", "pB", {"bias": 0.01})))
+    changed, kept = patched_plant(text, before, biased)
+    _, new = lines_changed(text, changed)
+    assert kept and new == ["    offset: -0.21 %", "- {effect: sensor_bias, location: pB, parameters: {bias: 1 %}}"]

@@ -12,14 +12,15 @@ from fdi_torch.disk import write_text
 from fdi_torch.plant.description import PlantDescription
 
 
-def write_adopted(name: str, before: PlantDescription, after: PlantDescription, target: Path, screen: Screen) -> None:
-    """Write the plant file `name` (a file or a shipped plant, read as `before`) changed to `after`, and
-    print the diff.
+def write_adopted(
+    name: str, before: PlantDescription, after: PlantDescription, target: Path, screen: Screen
+) -> list[str]:
+    """Write the plant file `name` (a file or a shipped plant, read as `before`) changed to `after`. Returns the diff,
+    line by line.
     """
     text = find_plant(name, Path.cwd()).read_text(encoding="utf-8")
     changed, kept = patched_plant(text, before, after)
     write_text(target, changed)
     if not kept:
         screen.note(f"{target}: rewritten without the comments of {name}, because components share values in it")
-    for line in unified_diff(text.splitlines(), changed.splitlines(), name, str(target), lineterm="", n=1):
-        screen.say(line)
+    return [*unified_diff(text.splitlines(), changed.splitlines(), name, str(target), lineterm="", n=1)]

@@ -38,6 +38,9 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         if len(stretches) > 1 or len(stretches[0].recording) < len(recording):
             spans = ", ".join(f"{p.recording.time[0]:g} to {p.recording.time[-1]:g} s" for p in stretches)
             screen.say(f"usable with all inputs known: {spans}")
+    if checks and arguments.config is None:
+        named = f"--plant {arguments.plant} --recording {arguments.recording}"
+        screen.say(f"next: fdi gap {named} says whether the plant file explains it")
     screen.result({"format": "fdi_torch.check/1", "plant": plant, "recordings": checks})
     return 0
 
@@ -68,7 +71,10 @@ def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[Recor
             raise ValueError("expected recordings in the run file, got a simulation; fdi simulate writes its recording")
         return run_file.plant, run_file.config.recordings, run_file.base
     if arguments.plant is None:
-        raise ValueError("expected --plant, a recording and --plant, or --config; see fdi check --help")
+        raise ValueError(
+            "expected --plant, a recording and --plant, or --config; without a plant file, "
+            "fdi new plant --recording FILE writes one from the columns of a recording"
+        )
     plant, folder = chosen_plant(arguments.plant), Path.cwd()
     return plant, *(
         ([], folder) if arguments.recording is None else listed_recordings(arguments.recording, plant, folder)

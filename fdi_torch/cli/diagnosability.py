@@ -67,7 +67,7 @@ def _show(report: Diagnosability, screen: Screen) -> None:
     columns = (report.std, report.std_by_correlation, report.smallest_detectable, report.smallest_isolable)
     rows = []
     for name, si_unit, *values in zip(report.faults, report.units, *columns, strict=True):
-        unit, scale = display_unit(si_unit)
+        unit, scale = display_unit(si_unit, name)
         rows.append([name, unit or "1", *(f"{scale * value:.3g}" for value in values)])
     screen.table("", header, rows, left=2)
     screen.say()

@@ -13,6 +13,7 @@ from fdi_torch.cli.adoption import write_adopted
 from fdi_torch.cli.gap_text import next_steps, show
 from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
+from fdi_torch.clock import show_clock
 from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.disk import write_text
@@ -38,6 +39,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     holdouts = [r for name in arguments.holdout for r in named_recordings(name, plant, Path.cwd())]
     for note in dict.fromkeys(note for r in (*recordings, *holdouts) for note in r.notes):
         screen.note(note)
+    show_clock(r.clock_zero for r in recordings)
     library = names(arguments.library) or None
     if arguments.step is not None and not arguments.step > 0.0:
         raise ValueError(f"--step: expected a positive number of seconds, got {arguments.step:g}")
@@ -51,28 +53,25 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         settings = Settings(library, left_out, arguments.step, arguments.most, arguments.named_only)
         answer = run_gap(log, plant, recordings, holdouts, settings, advance)
         advance(1.0, "done")
-    show(answer, screen)
-    written = _keep(arguments, plant, recordings, answer, screen)
-    for sentence in next_steps(answer, bool(holdouts), library, written, arguments.adopt):
-        screen.say(f"- {sentence}")
+    diff = _adopt(arguments, plant, recordings, answer, screen)
+    planned = _written(plant, answer, folder)
+    adopted_file = arguments.adopt if diff else None
+    show(answer, next_steps(answer, bool(holdouts), library, planned, adopted_file), screen)
+    for line in diff:
+        screen.say(line)
     screen.say(f"log: {log} (fdi report {log} makes the page)")
     screen.result(answer.to_dict())
     return DONE
 
 
-def _keep(
+def _adopt(
     arguments: argparse.Namespace,
     plant: PlantDescription,
     recordings: Sequence[Recording],
     answer: Answer,
     screen: Screen,
-) -> Path | None:
-    """Write gap.json, next_input.csv if several explanations are plausible, and the adopted plant if requested.
-
-    Returns the path of the next input, if any.
-    """
-    folder = Path(arguments.out)
-    write_text(folder / "gap.json", json.dumps(answer.to_dict(), indent=1) + "\n")
+) -> list[str]:
+    """Write the adopted plant if requested. Returns the lines of the diff, none if nothing was adopted."""
     named = any(cause.effect != UNKNOWN for cause in answer.causes)
     if arguments.adopt and named and not answer.converged:
         screen.complain("fdi gap: nothing adopted: the fit of the likeliest explanation has not converged")
@@ -84,18 +83,20 @@ def _keep(
                 "fdi gap: nothing adopted: the plant with the causes has a larger free-run error than the plant file; "
                 "--with-constants also writes the constants that were fitted together with the causes"
             )
-            return _next_input(plant, answer, folder)
-        write_adopted(arguments.plant, plant, better, target, screen)
+            return []
+        diff = write_adopted(arguments.plant, plant, better, target, screen)
         constants = (
             "as fitted with them" if arguments.with_constants else "unchanged (--with-constants writes the fitted ones)"
         )
         screen.note(f"plant file with the causes, its constants {constants}: {target}")
-    elif arguments.adopt and arguments.with_constants and answer.verdict == "no_gap":
-        write_adopted(arguments.plant, plant, _adopted(plant, answer, arguments), Path(arguments.adopt), screen)
+        return diff
+    if arguments.adopt and arguments.with_constants and answer.verdict == "no_gap":
+        diff = write_adopted(arguments.plant, plant, _adopted(plant, answer, arguments), Path(arguments.adopt), screen)
         screen.note(f"plant file with its fitted constants; no cause was found: {arguments.adopt}")
-    elif arguments.adopt:
+        return diff
+    if arguments.adopt and not named:
         screen.complain(f"fdi gap: nothing to adopt: the verdict is {answer.verdict.replace('_', ' ')}")
-    return _next_input(plant, answer, folder)
+    return []
 
 
 def _adopted(plant: PlantDescription, answer: Answer, arguments: argparse.Namespace) -> PlantDescription:
@@ -105,7 +106,9 @@ def _adopted(plant: PlantDescription, answer: Answer, arguments: argparse.Namesp
     return narrowed(better, {name: float(constant["std"]) for name, constant in answer.constants.items()})
 
 
-def _next_input(plant: PlantDescription, answer: Answer, folder: Path) -> Path | None:
+def _written(plant: PlantDescription, answer: Answer, folder: Path) -> Path | None:
+    """Write gap.json, and next_input.csv if several explanations are plausible. Returns the path of the latter."""
+    write_text(folder / "gap.json", json.dumps(answer.to_dict(), indent=1) + "\n")
     if not answer.next_input:
         return None
     return write_csv(planned_recording(answer.next_input["input"], plant), folder / "next_input.csv")

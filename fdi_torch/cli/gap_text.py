@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.cli.screen import Screen
+from fdi_torch.clock import clock_unit
 from fdi_torch.gap.answer import UNKNOWN, Answer
-from fdi_torch.gap.verdict_words import causes_of, explanation_words, probability_words, verdict_sentence
-from fdi_torch.parameters import display_unit
+from fdi_torch.gap.verdict_words import causes_of, explanation_words, probability_words, rounds, verdict_sentence
+from fdi_torch.parameters import ParameterName, display_unit
 
 MOST_ROWS = 5
 SMALLEST_SHOWN = 1e-4  # probability
@@ -23,10 +24,12 @@ STAGES = {
 }
 
 
-def show(answer: Answer, screen: Screen) -> None:
-    """Print the answer, except for the next steps."""
+def show(answer: Answer, steps: Sequence[str], screen: Screen) -> None:
+    """Print the verdict, what to do next, doubts, and the tables."""
     as_json = answer.to_dict()
     screen.say(verdict_sentence(as_json))
+    for sentence in [*(f"next: {step}" for step in steps), *answer.remarks]:
+        screen.say(f"- {sentence}")
     _causes(answer, screen)
     _explanations(as_json, screen)
     rows = [[place, probability_words(p)] for place, p in answer.where[:MOST_ROWS] if p >= SMALLEST_SHOWN]
@@ -36,7 +39,7 @@ def show(answer: Answer, screen: Screen) -> None:
     if answer.closure:
         _closure(answer.closure, screen)
     _constants(answer.constants, screen)
-    for remark in [*answer.remarks, *_confusability(answer.impostors)]:
+    for remark in [*_confusability(answer.impostors), *_limits(answer)]:
         screen.say(f"- {remark}")
 
 
@@ -50,47 +53,54 @@ def next_steps(
     moved = [name for name, c in answer.constants.items() if _tolerances_off(c, "augmented") > MOVED]
     if moved:
         steps.append(
-            f"next: with the causes too, {', '.join(moved)} is more than {MOVED:g} tolerances off: calibrate the plant "
+            f"with the causes too, {', '.join(moved)} is more than {MOVED:g} tolerances off: calibrate the plant "
             "file with a fault-free recording (fdi refit --adopt), then repeat the diagnosis with the calibrated file"
         )
     if planned and answer.next_input:
         samples = answer.next_input.get("parted_after_samples")
         when = f"after some {samples} samples" if samples else "in a longer run"
-        steps.append(f"next: record the input {planned}; it should distinguish the two likeliest explanations {when}")
+        steps.append(f"record the input {planned}; it should distinguish the two likeliest explanations {when}")
     elif answer.verdict == "ambiguous":
-        steps.append("next: no input within the limits of pumps and levels soon distinguishes the two explanations")
+        steps.append("no input within the limits of pumps and levels soon distinguishes the two explanations")
     if answer.verdict == "unknown" and library is None:
-        steps.append("next: --library all also searches the other effects; the report draws the discrepancy's shape")
+        steps.append("--library all also searches the other effects; the report draws the discrepancy's shape")
     if answer.verdict == "unknown":
         steps.append(
-            "next: --named-only reports the best named effect instead of `unknown`, which helps if several things are "
+            "--named-only reports the best named effect instead of `unknown`, which helps if several things are "
             "wrong at once; --adopt can then write it, and the next diagnosis continues from there"
         )
-    if any(c.effect != UNKNOWN for c in answer.causes):
+    if any(c.effect != UNKNOWN and not rounds(c.effect) for c in answer.causes):
         benefit = "train and monitor no longer take the gap for a fault"
         written = f"with {adopted} as their plant, {benefit}" if adopted else ""
-        steps.append(f"next: {written or f'--adopt FILE writes the plant file with the causes; with it {benefit}'}")
+        steps.append(f"{written or f'--adopt FILE writes the plant file with the causes; with it {benefit}'}")
     if not has_holdout and answer.verdict != "no_gap":
-        steps.append("next: --holdout FILE, another recording of the same rig, measures how far the gap closes")
+        steps.append("--holdout FILE, another recording of the same rig, measures how far the gap closes")
+    return steps
+
+
+def _limits(answer: Answer) -> list[str]:
+    """What the inputs of the recording cannot show."""
+    sentences = []
     hidden, inseparable = answer.excitation.get("hidden", []), answer.excitation.get("inseparable", [])
     if hidden:
         shown = ", ".join(f"{c['effect']} at {c['location']}" for c in hidden[:3])
         more = f" and {len(hidden) - 3} more" if len(hidden) > 3 else ""
-        steps.append(f"these inputs cannot show at their typical size: {shown}{more}")
+        sentences.append(f"these inputs cannot show at their typical size: {shown}{more}")
     if inseparable:
         first = " and ".join(f"{c['effect']} at {c['location']}" for c in inseparable[0]["between"])
         many = f"{len(inseparable)} pairs of effects, such as {first}" if len(inseparable) > 1 else first
-        steps.append(f"these inputs cannot distinguish {many}")
-    return steps
+        sentences.append(f"these inputs cannot distinguish {many}")
+    return sentences
 
 
 def _causes(answer: Answer, screen: Screen) -> None:
     rows = []
     for cause in answer.causes:
         for name, amount in cause.parameters.items():
-            unit, scale = display_unit(amount.unit)
+            unit, scale = display_unit(amount.unit, str(ParameterName(cause.location, cause.effect, name)))
             numbers = [f"{scale * amount.value:.4g}", f"{scale * amount.std:.2g}"]
-            rows.append([cause.effect, cause.location, name, *numbers, unit])
+            row = [cause.effect, cause.location, name, *numbers, clock_unit(unit, name, amount.value)]
+            rows += [] if rounds(cause.effect) else [row]
     if rows:
         screen.table("causes", ("effect", "at", "parameter", "value", "std error", "unit"), rows, left=3)
 
@@ -151,7 +161,7 @@ def _constants(constants: Mapping[str, Any], screen: Screen) -> None:
     rows = []
     for name, c in constants.items():
         if max(_tolerances_off(c, stage) for stage in ("recalibrated", "augmented")) > MOVED:
-            unit, scale = display_unit(c["unit"])
+            unit, scale = display_unit(c["unit"], name)
             numbers = [c["nominal"], c["tolerance"], c["recalibrated"], c["augmented"], c["std"]]
             rows.append([name, *(f"{scale * v:.4g}" for v in numbers[:4]), f"{scale * numbers[4]:.2g}", unit])
     if rows:

@@ -11,6 +11,7 @@ import orjson
 
 from fdi_torch.cli.options import access_text, host_and_port, live
 from fdi_torch.cli.screen import Screen
+from fdi_torch.clock import clock_text
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
@@ -46,9 +47,11 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 
 def _show_event(event: Event, screen: Screen, publish: Publish) -> None:
+    moment, onset = (clock_text(t) if t is not None else "" for t in (event.time, event.onset))
     if event.announced:
         screen.say(event.line)
     data = {"format": FORMAT, **event.to_dict()}
+    data |= {"clock": moment, "onset_clock": onset or None} if moment else {}
     screen.line(orjson.dumps(data).decode())
     publish(data)
     if screen.unread:  # whoever reads events one by one, from a source that may never end, has read enough

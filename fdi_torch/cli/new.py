@@ -9,10 +9,12 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.file_templates import template
 from fdi_torch.config.plant_file import chosen_plant
+from fdi_torch.config.plant_from_recording import plant_from_recording
+from fdi_torch.config.yaml_files import find_data
 from fdi_torch.disk import named_errors
 
 NEXT = {
-    "plant": "fdi check --plant {}",
+    "plant": "fdi check {recording}--plant {}",
     "run": "fdi train --config {}",
     "monitor": "fdi monitor --config {}",
     "study": "fdi study --config {}",
@@ -23,11 +25,17 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     path = Path(arguments.out or f"{arguments.kind}.yaml")
     if path.suffix not in (".yaml", ".yml"):
         raise ValueError(f"--out: expected a file that ends in .yaml, got {path}; rename it")
-    text = template(arguments.kind, chosen_plant(arguments.plant), arguments.plant, path.stem)
+    if arguments.recording and arguments.kind != "plant":
+        raise ValueError(f"--recording: expected it for a plant only, not for a {arguments.kind}; leave it out")
+    if arguments.recording:
+        text = plant_from_recording(find_data(arguments.recording, Path.cwd()), path.stem)
+    else:
+        text = template(arguments.kind, chosen_plant(arguments.plant), arguments.plant, path.stem)
     if path.exists():
         raise ValueError(f"{path}: expected a new file, but it exists; choose another name with --out")
     with named_errors(path), path.open("x", encoding="utf-8") as file:
         file.write(text)
-    screen.say(f"{path}; next: {NEXT[arguments.kind].format(path)}")
+    recording = f"{arguments.recording} " if arguments.recording else ""
+    screen.say(f"{path}; next: {NEXT[arguments.kind].format(path, recording=recording)}")
     screen.result({"format": "fdi_torch.new/1", "file": str(path), "kind": arguments.kind})
     return DONE

@@ -52,7 +52,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         _show_run_specific(fitted, screen)
         if arguments.adopt:
             adopted = fitted.narrowed() if arguments.narrow else fitted.plant
-            write_adopted(arguments.plant, plant, adopted, Path(arguments.adopt), screen)
+            for line in write_adopted(arguments.plant, plant, adopted, Path(arguments.adopt), screen):
+                screen.say(line)
             screen.note(f"plant file with the fitted values: {arguments.adopt}")
             if plant.tolerances and not arguments.narrow:
                 screen.say(
@@ -99,7 +100,7 @@ def _show(result: Refit, before: PlantDescription, screen: Screen) -> None:
     constants = build_network(before).constants
     rows, remarks = [], []
     for name, (value, error) in result.fitted.items():
-        unit, scale = display_unit(constants[name].unit)
+        unit, scale = display_unit(constants[name].unit, name)
         numbers = [f"{scale * constants[name].nominal:.4g}", f"{scale * value:.4g}", f"{scale * error:.2g}"]
         rows.append([name, *numbers, "" if unit == "1" else unit])
         far = abs(value - constants[name].nominal) / constants[name].std
@@ -118,7 +119,7 @@ def _show_run_specific(result: Refit, screen: Screen) -> None:
     constants = build_network(result.plant).constants
     rows = []
     for name in dict.fromkeys(own.name for own in result.own):
-        unit, scale = display_unit(constants[name].unit)
+        unit, scale = display_unit(constants[name].unit, name)
         each = [own for own in result.own if own.name == name]
         for own in each:
             numbers = [f"{scale * own.value:.4g}", f"{scale * own.std:.2g}", unit]

@@ -5,16 +5,18 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Sequence
+from functools import partial
 
 from fdi_torch.cli import DONE, NOT_CONVERGED
 from fdi_torch.cli.explained import exit_code, say_first
 from fdi_torch.cli.options import live, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.cli.windows import show_windows
+from fdi_torch.clock import clock_unit, show_clock
 from fdi_torch.config.run_file import load_run
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.jobs.windowed_fit import fit_windows
-from fdi_torch.parameters import display_unit, quantity_text
+from fdi_torch.parameters import ParameterName, display_unit, quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import data_warnings
 
@@ -41,6 +43,7 @@ def show(done: TrainResult, screen: Screen) -> None:
     If the model does not explain the recording, that comes first.
     """
     final, diagnosis = done.result.estimate, done.result.diagnosis
+    show_clock(r.clock_zero for r in done.fitting.recordings)
     network, space = done.fitting.networks[0], done.fitting.space
     onsets = [f"{place.prefix}.onset" for place in network.placements]
     onsets = [name for name in onsets if name in network.constants and name not in space][:1]
@@ -48,11 +51,12 @@ def show(done: TrainResult, screen: Screen) -> None:
     say_first(diagnosis.misfit, screen, *hints)
     rows = []
     for i, p in enumerate(done.fitting.space):
-        unit, scale = display_unit(p.unit)
+        unit, scale = display_unit(p.unit, p.name)
         truth = done.truth.get(p.name)
         numbers = estimate_cells(float(final.value[i]), float(final.std[i]), p.nominal, scale)
         simulated = [f"{scale * truth:.5g}" if truth is not None else ""] if done.truth else []
-        rows.append([p.name, unit or "1", *numbers, *simulated])
+        shown_unit = clock_unit(unit, ParameterName.parse(p.name).field, float(final.value[i]))
+        rows.append([p.name, shown_unit or "1", *numbers, *simulated])
     header = ("parameter", "unit", "estimate", "std error", "95 % interval", "nominal", "simulated")
     screen.table("", header if done.truth else header[:-1], rows, left=2)
     if final.combinations:
@@ -94,7 +98,7 @@ def show_uncertainty(done: TrainResult, screen: Screen) -> None:
         screen.say(f"- {line}")
     rows = []
     for profile in done.profiles:
-        unit, scale = display_unit(profile.unit)
+        unit, scale = display_unit(profile.unit, profile.name)
         limits = f"{scale * profile.low:.5g} .. {scale * profile.high:.5g}"
         note = " and ".join(f"{end} end is not determined" for end in profile.ends)
         rows.append([profile.name, unit or "1", f"{100 * profile.confidence:g} %", limits, note])
@@ -105,7 +109,7 @@ def show_uncertainty(done: TrainResult, screen: Screen) -> None:
     if draws is not None:
         rows = []
         for p, median, low, high in zip(done.fitting.space, draws.median(), *draws.interval(0.95), strict=True):
-            unit, scale = display_unit(p.unit)
+            unit, scale = display_unit(p.unit, p.name)
             limits = f"{scale * float(low):.5g} .. {scale * float(high):.5g}"
             rows.append([p.name, unit or "1", f"{scale * float(median):.6g}", limits])
         screen.table("draws from the posterior", ("parameter", "unit", "median", "95 % interval"), rows, left=2)
@@ -123,7 +127,8 @@ def in_words(done: TrainResult) -> list[str]:
     if diagnosis.faults:
         lines.append(f"{diagnosis.kind}: {diagnosis.names or 'no suspected fault differs significantly from nominal'}")
     for fault in diagnosis.present:
-        parts = [f"{quantity_text(fault.value, fault.unit)} instead of {quantity_text(fault.nominal, fault.unit)}"]
+        shown = partial(quantity_text, si_unit=fault.unit, name=fault.name)
+        parts = [f"{shown(fault.value)} instead of {shown(fault.nominal)}"]
         if fault.flow is not None:
             parts.append(f"{quantity_text(fault.flow, 'm^3/s', 3)} at the mean levels")
         if fault.hole is not None:

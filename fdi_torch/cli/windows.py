@@ -40,14 +40,14 @@ def show_windows(fit: WindowedFit, screen: Screen) -> None:
 
 def _size(fault: WindowFault | Stretch, beyond: str) -> tuple[str, str]:
     """Size and standard error in a practical unit; `beyond` and the size without an error if that is too large."""
-    _, scale = display_unit(fault.unit)
+    _, scale = display_unit(fault.unit, fault.name)
     size, std = scale * fault.size, scale * fault.std
     shown = f"{size:.3f}" if fault.unit == "1" else f"{size:.4g}"
     return (shown, f"{std:.2g}") if std < LARGEST_RELATIVE_ERROR * max(abs(size), 1.0) else (f"{beyond}{shown}", "")
 
 
 def _name(fault: WindowFault | Stretch) -> str:
-    unit, _ = display_unit(fault.unit)
+    unit, _ = display_unit(fault.unit, fault.name)
     return f"{fault.name}, {unit}" if unit else fault.name
 
 

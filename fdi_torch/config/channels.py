@@ -8,6 +8,7 @@ from pathlib import Path
 from fdi_torch.config.recording_config import ColumnConfig, FileConfig
 from fdi_torch.config.strict import Amount, quantity
 from fdi_torch.names import shortened, unknown
+from fdi_torch.parameters import si_unit_of
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recordings.csv_files import read_header
 from fdi_torch.recordings.header import header_unit
@@ -122,13 +123,31 @@ def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[s
         return
     inputs = [name for name in missing if name in plant.channels()]
     found = ", ".join(map(shortened, read_header(path)))
-    columns = "".join(f"\n      {name}: {{column: ..., unit: ...}}" for name in missing)
     raise ValueError(
         f"{path}: expected a column for {', '.join(missing)}, got {found}; "
         f"{other_fix.format(inputs=inputs[0]) if other_fix and inputs else ''}if columns have other names, save these "
-        "lines as runs.yaml with the names completed (units only where the header has none), and name runs.yaml "
-        f"instead:\nrecordings:\n  - file: {path.name}\n    columns:{columns}"
+        "lines as runs.yaml, completed and checked, and name runs.yaml instead:\n"
+        + "\n".join(_lines_to_complete(path, plant, missing))
     )
+
+
+def _lines_to_complete(path: Path, plant: PlantDescription, missing: Sequence[str]) -> list[str]:
+    """A file that maps the missing channels, each to the next column with a unit of its kind, if there is one.
+
+    A file whose rows have more cells than its first line has no header: its columns are numbered.
+    """
+    header, width = read_header(path), len(read_header(path, header=False))
+    kinds, lines = _units(plant), ["recordings:", f"  - file: {path.name}"]
+    if width > len(header):
+        lines += ["    header: false", f"    columns:    # by number, 1 to {width}", "      t: {column: 1, unit: s}"]
+        return [*lines, *(f"      {name}: {{column: ..., unit: ...}}" for name in missing)]
+    found = {column: si_unit_of(pair[1]) for column in header if (pair := header_unit(column)) and pair[0] not in kinds}
+    lines.append("    columns:    # units only where the header has none")
+    for name in missing:
+        column = next((c for c, kind in found.items() if kind == kinds[name]), None)
+        found.pop(column or "", None)
+        lines.append(f"      {name}: {{column: " + (f'"{column}"}}' if column else "..., unit: ...}"))
+    return lines
 
 
 def _without_column(path: Path, names: Collection[str], config: FileConfig | None = None) -> list[str]:

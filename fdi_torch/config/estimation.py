@@ -204,7 +204,7 @@ def parameter_values(values: dict[str, Amount], constants: ParameterSpace, plant
             raise ConfigError([f"simulate.faults.{given}: {error}"]) from error
         low, high = constants[name].low, constants[name].high
         if not low <= si[name] <= high:
-            unit, scale = display_unit(constants[name].unit)
+            unit, scale = display_unit(constants[name].unit, name)
             raise ConfigError(
                 [
                     f"simulate.faults.{given}: expected a size from {scale * low:g} to {scale * high:g} {unit}".rstrip()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 
@@ -26,10 +26,17 @@ Row = tuple[float, list[float], list[float]]
 """Time, s, the plant's inputs and its readings, SI; NaN for missing values."""
 
 
-def growing_rows(config: RecordingConfig, plant: PlantDescription, base: Path, idle: float) -> Iterator[Row | str]:
+def growing_rows(
+    config: RecordingConfig,
+    plant: PlantDescription,
+    base: Path,
+    idle: float,
+    began: Callable[[float], None] | None = None,
+) -> Iterator[Row | str]:
     """Samples in the order of writing, and a sentence for each row that cannot be read.
 
     Ends when the file is finished, or when nothing has arrived for `idle` s. Raises ConfigError for an unusable file.
+    began: called with time 0 as the file's clock shows it, s since 1970, if it has dates.
     """
     if config.mask or config.every != 1:
         raise ConfigError([f"{config.file}: expected neither mask nor every for a file that is followed; remove them"])
@@ -43,13 +50,15 @@ def growing_rows(config: RecordingConfig, plant: PlantDescription, base: Path, i
     if clock.zone or clock.sort or clock.period:
         raise ConfigError([f"{config.file}: expected neither zone, sort nor period to follow a file; remove them"])
     path = _find(config.file, base)
-    rows = _mcap_rows if ".mcap" in path.suffixes else _csv_rows
     if isinstance(config.start, datetime) or isinstance(config.stop, datetime):
         raise ConfigError([f"{config.file}: expected start and stop in s for a file that is followed, got a stamp"])
     start = -np.inf if config.start is None else config.start
     stop = np.inf if config.stop is None else config.stop
     try:
-        for row in rows(path, plant, channel_mapping(config, plant), idle):
+        mapping = channel_mapping(config, plant)
+        is_log = ".mcap" in path.suffixes
+        rows = _mcap_rows(path, plant, mapping, idle) if is_log else _csv_rows(path, plant, mapping, idle, began)
+        for row in rows:
             if isinstance(row, str) or start <= row[0] <= stop:
                 yield row
     except (ValueError, LogError) as error:
@@ -67,7 +76,11 @@ def _find(name: str, base: Path) -> Path:
 
 
 def _csv_rows(
-    path: Path, plant: PlantDescription, mapping: Mapping[str, ChannelSource], idle: float
+    path: Path,
+    plant: PlantDescription,
+    mapping: Mapping[str, ChannelSource],
+    idle: float,
+    began: Callable[[float], None] | None,
 ) -> Iterator[Row | str]:
     inputs, outputs = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
     file = GrowingCsv(path, inputs, outputs, mapping)
@@ -75,6 +88,8 @@ def _csv_rows(
     quiet_since = time.monotonic()
     while time.monotonic() - quiet_since <= idle:
         seconds, commands, readings, troubles = file.new()
+        if began is not None and len(seconds) and (zero := file.clock_zero) is not None:
+            began(zero)
         yield from (f"{trouble}; the row is left out" for trouble in troubles)
         yield from zip(seconds.tolist(), commands.tolist(), readings.tolist(), strict=True)
         if len(seconds):

@@ -15,6 +15,7 @@ from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Acceleration, Amount, Area, Length, Strict, quantity
 from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import find_plant, read_yaml
+from fdi_torch.effects import units_for_display
 from fdi_torch.names import unknown
 from fdi_torch.parameters import SI_UNITS, ParameterName, display_in, unit_factor
 from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, READING_UNITS, FaultPriority, PlacedEffect, Sensor, Tank
@@ -92,7 +93,7 @@ def load_plant(name: str | Path, base: Path | None = None) -> Plant:
 def chosen_plant(name: str | Path) -> Plant:
     """The plant that a command is about; from now on quantities are displayed in its units. Raises ConfigError."""
     plant = load_plant(name)
-    display_in(plant.units)
+    display_in(units_for_display(plant))
     return plant
 
 

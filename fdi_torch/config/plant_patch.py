@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
+from fnmatch import fnmatchcase
 from typing import Any
 
 import yaml
 
 from fdi_torch.config.plant_file import build_plant
+from fdi_torch.config.plant_in_code import absolute_units
 from fdi_torch.config.plant_writer import dump_plant, plant_mapping
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.yaml_files import compose_yaml, parse_yaml
+from fdi_torch.effects import units_for_display
 from fdi_torch.parameters import display_unit, displayed_in, si_unit_of
 from fdi_torch.plant.description import FLOW_KINDS, PlacedEffect, PlantDescription
 from fdi_torch.units import UnitError, in_unit, number_and_unit
@@ -31,9 +34,9 @@ def patched_plant(text: str, before: PlantDescription, after: PlantDescription) 
     the changes cannot be located in the text (anchors shared by several components), the file is written anew.
     """
     edits = _Edits(text)
-    with displayed_in(after.units):
+    with displayed_in(units_for_display(after)):
         for path, value in _changes(before, after):
-            edits.set(path, value)
+            edits.set(path, value, _unit_of(path, after))
         for placed in _new_effects(before, after):
             edits.append(("effects",), _rounded(placed, after))
     changed = edits.applied()
@@ -64,6 +67,16 @@ def _changes(before: PlantDescription, after: PlantDescription) -> Iterator[tupl
             yield ("tolerances", name), value
 
 
+def _unit_of(path: Path, plant: PlantDescription) -> str:
+    """The unit in which a value without a unit is written, where the file does not have it yet: relative tolerances
+    and readings in % have none.
+    """
+    name = ".".join(map(str, path[-2:])) if path[0] == "sensors" else str(path[-1])
+    if path[0] == "tolerances" and name not in absolute_units(plant):
+        return "%"
+    return display_unit("1", name)[0] or "1"
+
+
 def _new_effects(before: PlantDescription, after: PlantDescription) -> list[PlacedEffect]:
     known = {(e.effect, e.location) for e in before.effects}
     return [e for e in after.effects if (e.effect, e.location) not in known]
@@ -72,7 +85,8 @@ def _new_effects(before: PlantDescription, after: PlantDescription) -> list[Plac
 def _rounded(placed: PlacedEffect, plant: PlantDescription) -> dict[str, Any]:
     """The mapping of the effect in a plant file."""
     mapping: dict[str, Any] = plant_mapping(plant)["effects"][plant.effects.index(placed)]
-    return mapping | {"parameters": {n: _in_display_unit(v) for n, v in mapping["parameters"].items()}}
+    units = {n: display_unit("1", placed.full_name(n))[0] or "1" for n in mapping["parameters"]}
+    return mapping | {"parameters": {n: _in_display_unit(v, units[n]) for n, v in mapping["parameters"].items()}}
 
 
 class _Edits:
@@ -84,15 +98,19 @@ class _Edits:
         self._replaced: list[tuple[int, int, str]] = []
         self._added: dict[Path, list[str]] = {}
 
-    def set(self, path: Path, value: str | float) -> None:
-        """Write a value in the unit of the present one, or add the key to its mapping."""
+    def set(self, path: Path, value: str | float, unit: str) -> None:
+        """Write a value in the unit of the present one, or of the pattern that stands for it, or add the key to its
+        mapping. unit: of a value without a unit.
+        """
         node = self._at(path)
         if isinstance(node, yaml.ScalarNode):
             quote = node.style if node.style in ("'", '"') else ""
             new = f"{quote}{_in_unit_of(value, node.value)}{quote}"
             self._replaced.append((node.start_mark.index, node.end_mark.index, new))
         else:
-            self._added.setdefault(path[:-1], []).append(_flow({path[-1]: _in_display_unit(value)})[1:-1])
+            pattern = self._pattern_of(path)
+            new = _in_display_unit(value, unit) if pattern is None else _in_unit_of(value, pattern)
+            self._added.setdefault(path[:-1], []).append(_flow({path[-1]: new})[1:-1])
 
     def append(self, path: Path, item: Mapping[str, Any]) -> None:
         """Add an item to a list."""
@@ -117,6 +135,12 @@ class _Edits:
             else:
                 return None
         return node
+
+    def _pattern_of(self, path: Path) -> str | None:
+        """The value of the last pattern in the mapping that matches the key."""
+        node = self._at(path[:-1]) if path[0] == "tolerances" else None
+        known = node.value if isinstance(node, yaml.MappingNode) else []
+        return next((str(v.value) for k, v in reversed(known) if fnmatchcase(str(path[-1]), k.value)), None)
 
     def _inserted(self, path: Path, items: list[str]) -> tuple[int, int, str]:
         """The edit (start, end, text) that adds items to the collection at that path."""
@@ -150,11 +174,10 @@ def _flow(value: Any) -> str:
     return str(yaml.safe_dump(value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10**6)).strip()
 
 
-def _in_display_unit(value: str | float) -> Any:
-    """A quantity with `DIGITS` digits, in the unit for display if it has one."""
-    unit = number_and_unit(str(value))[1]
-    shown = display_unit(si_unit_of(unit))[0] if unit != "1" else ""
-    return _in_unit_of(value, f"1 {shown}" if shown else None)
+def _in_display_unit(value: str | float, unit: str) -> Any:
+    """A quantity with `DIGITS` digits, in the unit for display if it has one, else in `unit`."""
+    si_unit = si_unit_of(number_and_unit(str(value))[1])
+    return _in_unit_of(value, f"1 {unit if si_unit == '1' else display_unit(si_unit)[0] or si_unit}")
 
 
 def _in_unit_of(value: str | float, written: str | None) -> Any:

@@ -15,6 +15,7 @@ from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Config, Strict, scaled_to_plant
 from fdi_torch.config.yaml_files import find_file, read_extended, with_overrides, write_yaml
+from fdi_torch.effects import units_for_display
 from fdi_torch.parameters import display_in
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
@@ -92,7 +93,7 @@ def resolve(
     except ConfigError as error:  # errors within a plant file already name that file
         raise ConfigError([f"{source}: {p}" if p.startswith("plant: ") else p for p in error.problems]) from error
     config = scaled_to_plant(config, time_scale(plant))
-    display_in(plant.units)
+    display_in(units_for_display(plant))
     return config, plant, write_yaml({**data, "plant": plant_mapping(plant)})
 
 

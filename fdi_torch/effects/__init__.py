@@ -135,6 +135,27 @@ def build_network(plant: PlantDescription, placements: Iterable[Placement] = ())
     return TankNetwork(plant, [*known, *(p for p in placements if p.prefix not in prefixes)])
 
 
+def units_for_display(plant: PlantDescription) -> dict[str, str]:
+    """The plant's units, and by full name those of parameters that are readings of a sensor with a unit of its own.
+
+    Readings in % have no dimension, as factors have none: a parameter is a reading if its unit follows the sensor's.
+    """
+    units = dict(plant.units)
+    for sensor in plant.sensors:
+        if (own := plant.units.get(sensor.column)) is None:
+            continue
+        units[f"{sensor.name}.offset"] = own
+        other = replace(sensor, unit="V" if sensor.unit != "V" else "A")
+        changed = replace(plant, sensors=tuple(other if s == sensor else s for s in plant.sensors))
+        for each in (e for e in EFFECTS if fits(e, plant, sensor.name)):
+            pairs = zip(each.parameters(sensor.name, plant), each.parameters(sensor.name, changed), strict=True)
+            for here, there in pairs:
+                if here.unit != there.unit and there.unit.startswith(other.unit):
+                    full = str(ParameterName(sensor.name, each.name, here.name))
+                    units[full] = own + there.unit.removeprefix(other.unit)
+    return units
+
+
 def without_startup_effects(plant: PlantDescription, channels: Collection[str]) -> PlantDescription:
     """The plant without its start-up effects, for data from the middle of a run in which the pumps of `channels` have
     run.

@@ -40,10 +40,10 @@ class Combination:
     @property
     def formula(self) -> str:
         """The combination as text, such as 'a + 0.8 b - 2 cm/% c', with coefficients in the units for display."""
-        own_unit, own_scale = display_unit(self.unit)
+        own_unit, own_scale = display_unit(self.unit, self.parameters[0])
         text = ""
         for name, si_unit, c in zip(self.parameters, self.units, self.coefficients, strict=True):
-            unit, scale = display_unit(si_unit)
+            unit, scale = display_unit(si_unit, name)
             sign = ("- " if c < 0 else "+ ") if text else ("-" if c < 0 else "")
             factor = f"{abs(c) * own_scale / scale:.3g}"
             if unit != own_unit:
@@ -54,7 +54,7 @@ class Combination:
     @property
     def words(self) -> str:
         """'a + 0.8 b = 0.0994 ± 0.0023', in the units for display."""
-        return value_text(self.formula, self.value, self.std, self.unit)
+        return value_text(self.formula, self.value, self.std, self.unit, self.parameters[0])
 
     def interval(self, confidence: float = 0.95) -> tuple[float, float]:
         """Confidence interval, from the normal distribution."""
@@ -119,10 +119,10 @@ def undetermined_groups(space: ParameterSpace, theta: Tensor, sure: Certainty) -
     return tuple(groups)
 
 
-def value_text(name: str, value: float, std: float, si_unit: str) -> str:
-    """'T1.leak.size = 0.3 ± 0.002', in the unit for display."""
-    unit, scale = display_unit(si_unit)
-    return f"{name} = {scale * value:.4g} ± {scale * std:.2g} {unit}".rstrip()
+def value_text(text: str, value: float, std: float, si_unit: str, name: str) -> str:
+    """'T1.leak.size = 0.3 ± 0.002', in the unit for display of the parameter `name`."""
+    unit, scale = display_unit(si_unit, name)
+    return f"{text} = {scale * value:.4g} ± {scale * std:.2g} {unit}".rstrip()
 
 
 def _verb(subjects: Sequence[str]) -> str:

@@ -80,7 +80,7 @@ class Diagnosis:
 
         It begins with a warning if the model does not explain the recording.
         """
-        sizes = [value_text(f.name, f.value, f.std, f.unit) for f in self.present]
+        sizes = [value_text(f.name, f.value, f.std, f.unit, f.name) for f in self.present]
         sizes += [f"{listed(c.parameters, 'or')} ({c.words})" for c in self.not_isolated]
         return self.misfit.headline(f"{self.kind}: {'; '.join(sizes)}" if sizes else self.kind)
 

@@ -149,8 +149,8 @@ def _refitted(placed: PlacedEffect, values: Mapping[str, float]) -> PlacedEffect
 def _tolerances_of_causes(answer: Answer) -> dict[str, float]:
     """Tolerances of the causes' parameters, within which a later diagnosis may refit them."""
     return {
-        str(ParameterName(cause.location, cause.effect, name)): max(
-            TOLERANCE_SHARE * abs(amount.value), TOLERANCE_ERRORS * amount.std
+        str(ParameterName(cause.location, cause.effect, name)): float(
+            f"{max(TOLERANCE_SHARE * abs(amount.value), TOLERANCE_ERRORS * amount.std):.2g}"
         )
         for cause in answer.causes
         for name, amount in cause.parameters.items()

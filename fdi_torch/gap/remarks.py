@@ -109,9 +109,10 @@ def _nominal_values_out_of_range(plant: PlantDescription) -> list[str]:
     remarks = []
     for placed in plant.effects:
         for p in effect(placed.effect).parameters(placed.location, plant):
-            value, (unit, scale) = placed.parameters.get(p.name, p.nominal), display_unit(p.unit)
+            name = placed.full_name(p.name)
+            value, (unit, scale) = placed.parameters.get(p.name, p.nominal), display_unit(p.unit, name)
             if not p.low <= value <= p.high:
-                name, ends = placed.full_name(p.name), f"{scale * p.low:.4g} to {scale * p.high:.4g}"
+                ends = f"{scale * p.low:.4g} to {scale * p.high:.4g}"
                 remarks.append(
                     f"the plant file has {name} at {scale * value:.4g} {unit}".rstrip()
                     + f", outside its sensible range ({ends} {unit}".rstrip()
@@ -124,7 +125,7 @@ def _values_at_bounds(result: DiagnosisResult) -> list[str]:
     """Fitted parameters that reached a bound of their sensible range."""
     remarks, fit = [], result.effects_fit
     for name, value in fit.effect_values.items():
-        parameter, (unit, scale) = fit.space[name], display_unit(fit.space[name].unit)
+        parameter, (unit, scale) = fit.space[name], display_unit(fit.space[name].unit, name)
         width = parameter.high - parameter.low
         ends = [e for e in (parameter.low, parameter.high) if math.isfinite(e) and e != parameter.nominal]
         reached = [e for e in ends if abs(value - e) < AT_END * (width if math.isfinite(width) else abs(e))]
@@ -187,5 +188,5 @@ def _changed(result: DiagnosisResult, fitter: Fitter, refit: Fit) -> list[str]:
 
 
 def _shown(value: float, fit: Fit, name: str) -> str:
-    unit, scale = display_unit(fit.space[name].unit)
+    unit, scale = display_unit(fit.space[name].unit, name)
     return f"{scale * value:.4g} {unit}".rstrip()

@@ -8,7 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from fdi_torch.effects import effect
 from fdi_torch.gap.answer import UNKNOWN
+from fdi_torch.parameters import quantity_text
 
 FORMAT_1 = "fdi_torch.gap/1"
 Named = Mapping[str, Any]
@@ -23,6 +25,31 @@ def causes_of(explanation: Named) -> list[Named]:
     return causes
 
 
+def rounds(name: str) -> bool:
+    """Whether an effect, its name with '_' or spaces, is the rounding of a sensor's readings, which is no fault."""
+    try:
+        return effect(name.replace(" ", "_")).quantizes
+    except ValueError:
+        return False
+
+
+def apart_from_rounding(causes: Sequence[Named]) -> list[Named]:
+    """The causes without the rounding of readings."""
+    return [cause for cause in causes if not rounds(str(cause.get("effect", "")))]
+
+
+def rounding_words(causes: Sequence[Named]) -> str:
+    """'Readings are rounded, which is no fault: hA to 1 %.'; empty if none are."""
+    steps = [
+        f"{c['location']} to {quantity_text(float(step['value']), str(step.get('unit', '1')), 4, name)}"
+        for c in causes
+        if rounds(str(c.get("effect", "")))
+        for field, step in (c.get("parameters") or {}).items()
+        for name in [f"{c['location']}.{c['effect']}.{field}"]
+    ]
+    return f"Readings are rounded, which is no fault: {', '.join(steps)}." if steps else ""
+
+
 def cause_words(cause: Named) -> str:
     """'leak at T1', 'something unknown at Q1'."""
     effect = "something unknown" if cause.get("effect") == UNKNOWN else cause.get("effect", "")
@@ -30,8 +57,8 @@ def cause_words(cause: Named) -> str:
 
 
 def explanation_words(causes: Sequence[Named]) -> str:
-    """'leak at T1 and pump_lag at Q1', or that nothing lies beyond tolerances."""
-    return " and ".join(cause_words(c) for c in causes) or "nothing beyond tolerances"
+    """'leak at T1 and pump_lag at Q1', or that nothing lies beyond tolerances; without the rounding of readings."""
+    return " and ".join(map(cause_words, apart_from_rounding(causes))) or "nothing beyond tolerances"
 
 
 def probability_words(probability: float) -> str:
@@ -42,10 +69,14 @@ def probability_words(probability: float) -> str:
 
 
 def verdict_sentence(answer: Named, best: str = "") -> str:
-    """What causes the gap, and how sure that is. Empty without a verdict.
+    """What causes the gap, how sure that is, and which readings are rounded. Empty without a verdict.
 
     best: the likeliest explanation in words, for example with sizes; by default without.
     """
+    return f"{_verdict(answer, best)} {rounding_words(answer.get('causes') or [])}".strip()
+
+
+def _verdict(answer: Named, best: str) -> str:
     verdict = answer.get("verdict", "")
     first: Named = next(iter(answer.get("posterior") or []), {})
     probability = first.get("probability")
@@ -53,6 +84,8 @@ def verdict_sentence(answer: Named, best: str = "") -> str:
     best = best or _with_equivalents(causes_of(first), answer.get("causes") or [])
     if verdict == "no_gap":
         return "No gap: the plant file explains the recording within noise and tolerances."
+    if verdict == "named" and not apart_from_rounding(causes_of(first)):
+        return f"No gap: the plant file explains the recording within rounding, noise and tolerances{chance}."
     if verdict == "named":
         return f"The gap comes from {best}{chance}."
     if verdict == "ambiguous":
@@ -60,7 +93,7 @@ def verdict_sentence(answer: Named, best: str = "") -> str:
         count, whether = len(explanations), "is" if all(explanations) else "may be"
         plausible = f"{count} explanations are plausible at 95 %, " if count > 1 else ""
         rest = "" if count > 1 else _unfitted(answer)
-        certain = answer.get("certain") or []
+        certain = apart_from_rounding(answer.get("certain") or [])
         surely = f" Present with at least 95 %: {explanation_words(certain)}." if certain else ""
         return f"There {whether} a gap; {plausible}the likeliest is {best}{chance}.{rest}{surely}"
     if verdict != "unknown":
@@ -74,7 +107,8 @@ def verdict_sentence(answer: Named, best: str = "") -> str:
 def _with_equivalents(explanation: Sequence[Named], fitted: Sequence[Named]) -> str:
     """'plugging at drain, or equivalently leak at B'. fitted: the causes with their equivalents."""
     words = {cause_words(c): equivalents_words(c) for c in fitted}
-    return " and ".join(name + words.get(name, "") for name in map(cause_words, explanation)) or explanation_words([])
+    names = [cause_words(cause) for cause in apart_from_rounding(explanation)]
+    return " and ".join(name + words.get(name, "") for name in names) or explanation_words([])
 
 
 def equivalents_words(cause: Named) -> str:

@@ -129,7 +129,7 @@ class LoggedMonitor:
         return any(event.kind == "notice" for event in events)
 
     def log_origin(self, origin: float) -> None:
-        """Log time 0 of a live source, s since 1970, with which a resumed run goes on."""
+        """Log time 0 of a live source or growing file, s since 1970, with which a resumed run goes on."""
         self.log.write(CLOCK, {"origin": origin}, self._now)
 
     def close(self) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from fdi_torch.clock import of_stamp
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook import RunLog, own_signals
 from fdi_torch.recording import Recording
@@ -29,6 +30,8 @@ def logged_recording(log: LoggedRun, group: str, number: int) -> Recording:
     signals, about = own_signals(log, group), log.metadata.get("fdi_torch.data", {})
     time, inputs, outputs = (torch.as_tensor(a) for a in (signals.time, signals.inputs, signals.outputs))
     names = (*signals.input_names, *signals.output_names)
+    stamped = about.get(f"{number}.began")
+    began, zone = of_stamp(stamped) if stamped else (None, 0.0)
     return Recording(
         time=time,
         inputs=inputs,
@@ -41,5 +44,7 @@ def logged_recording(log: LoggedRun, group: str, number: int) -> Recording:
         hold=signals.hold,  # type: ignore[arg-type]
         source=about.get(f"{number}.path", str(log.path)),
         sha256=about.get(f"{number}.sha256", ""),
+        began=began,
+        zone=zone,
         written={name: about[f"{number}.unit.{name}"] for name in names if f"{number}.unit.{name}" in about},
     )

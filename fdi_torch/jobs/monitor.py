@@ -15,6 +15,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from fdi_torch.clock import show_clock
 from fdi_torch.config.growing_recordings import Row, growing_rows
 from fdi_torch.config.live_source import LiveRows
 from fdi_torch.config.loaded_recordings import read_recording
@@ -72,8 +73,10 @@ def run_monitor(
         monitor = LoggedMonitor(run, log, callbacks, reported)
         try:
             if whole is None:
-                _follow(monitor, callbacks, _source(run, idle, origin, earlier_rows), earlier_rows)
+                zeros: list[float] = []
+                _follow(monitor, callbacks, _source(run, idle, origin, earlier_rows, zeros), earlier_rows, zeros)
             else:
+                show_clock([whole.clock_zero])
                 monitor.process_recording(whole)
             monitor.close()
         finally:
@@ -103,25 +106,31 @@ def _log_to_write(run: MonitorRun, resume: bool) -> tuple[Path, LoggedRun | None
 
 
 def _source(
-    run: MonitorRun, idle: float | None, origin: float | None, earlier_rows: Sequence[Row]
+    run: MonitorRun, idle: float | None, origin: float | None, earlier_rows: Sequence[Row], zeros: list[float]
 ) -> Iterator[Row | str]:
-    """The rows of the live source, or else of the growing file."""
+    """The rows of the live source, or else of the growing file, whose time 0 is appended to `zeros`."""
     if run.config.source is not None:
         return LiveRows(run.config.source, run.plant, math.inf if idle is None else idle, origin, earlier_rows)
-    return growing_rows(run.config.recording, run.plant, run.base, IDLE if idle is None else idle)
+    return growing_rows(run.config.recording, run.plant, run.base, IDLE if idle is None else idle, zeros.append)
 
 
 def _follow(
-    monitor: LoggedMonitor, callbacks: MonitorCallbacks, source: Iterator[Row | str], earlier_rows: Sequence[Row]
+    monitor: LoggedMonitor,
+    callbacks: MonitorCallbacks,
+    source: Iterator[Row | str],
+    earlier_rows: Sequence[Row],
+    zeros: list[float],
 ) -> None:
     """Process samples as they come, after waiting for the end of the fault-free part."""
     run = monitor.run
     batches = LiveBatches(resumed_rows(earlier_rows, source) if earlier_rows else source)
     callbacks.tell(0.0, "waiting for samples")
     rows, notices = _wait_for_fault_free_part(run, callbacks, batches)
+    zero = source.origin if isinstance(source, LiveRows) else next(iter(zeros), None)
+    show_clock([zero])
     monitor.learn(recording_of_rows(rows_until(rows, run.config.fault_free[1]) or rows, run))
-    if isinstance(source, LiveRows) and source.origin is not None:
-        monitor.log_origin(source.origin)
+    if zero is not None:
+        monitor.log_origin(zero)
     delay_watch = DelayWatch(time.monotonic)
     first: list[Row | str] = [*notices, *rows]
     every_batch: Iterable[list[Row | str]] = chain([first], batches)

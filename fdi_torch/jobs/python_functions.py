@@ -16,6 +16,7 @@ from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monito
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.study_file import Study, build_study, load_study
+from fdi_torch.effects import units_for_display
 from fdi_torch.estimate.misfit import misfit_of
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.free_runs.prediction import START_SAMPLES
@@ -202,7 +203,7 @@ def plant_of(plant: AnyPlant) -> PlantDescription:
         return chosen_plant(plant)
     if not isinstance(plant, PlantDescription):
         raise TypeError(f"plant: expected a Plant or the name of a plant file, got a {type(plant).__name__}")
-    display_in(plant.units)
+    display_in(units_for_display(plant))
     return plant
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from fdi_torch.clock import clock_text
 from fdi_torch.monitor.alarm_state import State
 from fdi_torch.parameters import Parameter, display_unit
 
@@ -122,7 +123,10 @@ class Event:
 
     @property
     def line(self) -> str:
-        return f"{self.time:10.1f} s  {self.kind:<11} {self.text}"
+        """Time, clock time if the recording has one, kind and text."""
+        moment = f"{clock}  " if (clock := clock_text(self.time)) else ""
+        onset = "" if self.onset is None or self.kind == "followed" else clock_text(self.onset)
+        return f"{self.time:10.1f} s  {moment}{self.kind:<11} {self.text}{f' (began {onset})' if onset else ''}"
 
     @property
     def best(self) -> Explanation | None:
@@ -192,7 +196,7 @@ def percent_text(mass: float) -> str:
 
 def amount_text(p: Parameter, size: float, std: float, at_end: bool = False) -> str:
     """'Q1.pump_offset.offset = 23.1 ± 0.4 cm^3/s', in a practical unit."""
-    unit, scale = display_unit(p.unit)
+    unit, scale = display_unit(p.unit, p.name)
     error = f" ± {scale * std:.2g}" if std > 0.0 and not at_end else ""
     end = ", the end of its range" if at_end else ""
     return f"{p.name} = {scale * size:.4g}{error} {unit}".rstrip() + end
@@ -200,7 +204,7 @@ def amount_text(p: Parameter, size: float, std: float, at_end: bool = False) -> 
 
 def rate_text(p: Parameter, rate: float) -> str:
     """'1.2 cm per hour', or per day for slow changes."""
-    unit, scale = display_unit(p.unit)
+    unit, scale = display_unit(p.unit, p.name)
     span, name = (3600.0, "hour") if abs(rate) * 86400.0 > abs(p.high - p.low) * 0.01 else (86400.0, "day")
     return f"{scale * rate * span:.3g} {unit} per {name}".replace("  ", " ")
 

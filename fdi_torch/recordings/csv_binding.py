@@ -16,7 +16,7 @@ from fdi_torch.recordings.csv_cells import BAD, GOOD_WORDS, Columns, Rule
 from fdi_torch.recordings.csv_text import Heading
 from fdi_torch.recordings.header import header_unit
 from fdi_torch.recordings.source import ChannelSource, ClockSource
-from fdi_torch.recordings.time_stamps import stamp_reader
+from fdi_torch.recordings.time_stamps import StampReader
 from fdi_torch.units import spelled
 
 TIME_NAMES = (
@@ -167,5 +167,5 @@ def columns_of(
     positions = list(dict.fromkeys(b.position for b in bounds if b.position is not None))
     rules = {b.position: b.rule for b in bounds if b.position is not None and b.rule is not None}
     stamps = next((b.position for b in bounds if b.stamps), None)
-    read = stamp_reader(clock.stamps, clock.zone) if isinstance(clock, ClockSource) else stamp_reader(None, None)
+    read = StampReader(clock.stamps, clock.zone) if isinstance(clock, ClockSource) else StampReader()
     return Columns(path, heading, positions, stamps, read, rules, sparse)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.recordings.csv_text import Heading, rows_of
-from fdi_torch.recordings.time_stamps import seconds_of
+from fdi_torch.recordings.time_stamps import StampReader, seconds_of
 
 BAD = float("inf")
 """The value of a cell that reports a bad reading; an empty cell, where nothing was logged, is NaN."""
@@ -49,7 +49,7 @@ class Columns:
     heading: Heading
     positions: list[int]
     stamps: int | None = None
-    read_stamp: Callable[[str], float] = seconds_of
+    read_stamp: StampReader = seconds_of
     rules: Mapping[int, Rule] = field(default_factory=dict)
     sparse: bool = False
 

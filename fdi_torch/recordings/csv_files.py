@@ -27,7 +27,7 @@ from fdi_torch.recordings.csv_text import heading_of, open_csv
 from fdi_torch.recordings.header import header_unit
 from fdi_torch.recordings.sheets import Sheet, in_order, informative_rows, merge_sheets
 from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource, file_sha256
-from fdi_torch.recordings.time_stamps import from_zone
+from fdi_torch.recordings.time_stamps import StampReader, from_zone, offset_of_zone
 from fdi_torch.units import spelled
 
 LINES_PER_BLOCK = 1 << 16
@@ -43,6 +43,7 @@ class Read:
     written: Mapping[str, str]
     constants: Mapping[str, float]
     stamps: bool
+    zone: float
     notes: Sequence[str]
 
 
@@ -96,6 +97,7 @@ def read_csv_files(
         source=str(files[0].path),
         sha256=_sha256([file.path for file in files]),
         began=float(seconds[0]) if since_1970 else None,
+        zone=next((p.zone for p in parts if p.stamps), 0.0),
         notes=tuple(note for p in parts for note in p.notes),
         written={name: unit for p in parts for name, unit in p.written.items()},
     )
@@ -142,7 +144,8 @@ def _read_rows(file: FileSource, names: Sequence[str]) -> Read:
     order = in_order(seconds, values, _sorted(clock_source), place, first, _summer_time_hint(clock, clock_source))
     sheet = Sheet(str(path), order.seconds, tuple(b.name for b in in_file), order.values)
     notes = [f"{path.name}: {note}" for note in (*unit_notes(bounds), *notes, *order.notes)]
-    return Read([sheet], *_units_and_constants(bounds), clock.stamps, notes)
+    zone = _zone(clock_source, columns.read_stamp, order.seconds)
+    return Read([sheet], *_units_and_constants(bounds), clock.stamps, zone, notes)
 
 
 def _read_tagged(file: FileSource, names: Sequence[str]) -> Read:
@@ -159,7 +162,14 @@ def _read_tagged(file: FileSource, names: Sequence[str]) -> Read:
         sheets.append(Sheet(f"{path} ({bound.header})", order.seconds, (bound.name,), order.values))
         notes += [f"{path.name}: {bound.header}: {note}" for note in order.notes]
     bounds = [bound for bound, *_ in tagged] + [bind(path, (), name, file.columns[name]) for name in constant]
-    return Read(sheets, *_units_and_constants(bounds), clock.stamps, notes)
+    zone = _zone(clock_source, StampReader(), sheets[0].seconds) if sheets else 0.0
+    return Read(sheets, *_units_and_constants(bounds), clock.stamps, zone, notes)
+
+
+def _zone(source: ChannelSource | None, read: StampReader, seconds: np.ndarray) -> float:
+    """How far the file's clock is ahead of UTC, s: by the zone of its column of time, or else by its stamps."""
+    named = source.zone if isinstance(source, ClockSource) else None
+    return offset_of_zone(float(seconds[0]), named) if named else read.offset
 
 
 def _units_and_constants(bounds: Sequence[Bound]) -> tuple[dict[str, str], dict[str, str], dict[str, float]]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from fdi_torch.recordings.csv_binding import bind, bind_clock, columns_of
 from fdi_torch.recordings.csv_cells import parse_carefully
-from fdi_torch.recordings.csv_files import channels_in_si, from_first
+from fdi_torch.recordings.csv_files import SINCE_1970, channels_in_si, from_first
 from fdi_torch.recordings.csv_text import heading_of, open_csv
 from fdi_torch.recordings.sheets import fill_held
 from fdi_torch.recordings.source import ChannelSource
@@ -53,6 +53,12 @@ class GrowingCsv:
         self.output_units = tuple(b.si_unit for b in self._outputs)
         with path.open("rb") as raw:
             self._place = sum(len(line) for line in islice(raw, self._line))
+
+    @property
+    def clock_zero(self) -> float | None:
+        """Time 0 as the file's clock shows it, s since 1970; None before the first row, and without dates."""
+        dated = self._first is not None and (self._clock.stamps or self._first > SINCE_1970)
+        return self._first + self._columns.read_stamp.offset if dated and self._first is not None else None
 
     def new(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
         """The rows completed since the last call: times (R,) s, inputs (R, M), outputs (R, N), SI.

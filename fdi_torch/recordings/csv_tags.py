@@ -14,7 +14,7 @@ from fdi_torch.recordings.csv_binding import Bound, bind_clock, column_of, rule_
 from fdi_torch.recordings.csv_cells import apply_rule, number_in
 from fdi_torch.recordings.csv_text import heading_of, open_csv, rows_of
 from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource
-from fdi_torch.recordings.time_stamps import stamp_reader
+from fdi_torch.recordings.time_stamps import StampReader
 
 Tagged = tuple[Bound, np.ndarray, np.ndarray, np.ndarray]
 """A channel, and for each of its rows the row number, the time in the clock's unit, and the value."""
@@ -50,11 +50,9 @@ def read_tags(file: FileSource, names: Sequence[str]) -> tuple[Bound, list[Tagge
         tag, value = (heading.names.index(column_of(path, heading.names, c)) for c in (tags.tag, tags.value))
         quality = None if tags.quality is None else heading.names.index(column_of(path, heading.names, tags.quality))
         rules = {name: rule_of(source, quality) for name, source in sources.items()}
-        read = (
-            stamp_reader(clock_source.stamps, clock_source.zone)
-            if isinstance(clock_source, ClockSource)
-            else stamp_reader(None, None)
-        )
+        read = StampReader()
+        if isinstance(clock_source, ClockSource):
+            read = StampReader(clock_source.stamps, clock_source.zone)
         for number, cells in rows_of(path, lines, heading.delimiter, heading.lines):
             if len(cells) != len(heading.names):
                 if not any(cell.strip() for cell in cells):

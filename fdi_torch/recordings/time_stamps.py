@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
@@ -17,27 +16,31 @@ _DOTTED = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})[ T](\d{1,2}):(\d{2})(?::(\
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-def stamp_reader(form: str | None, zone: str | None) -> Callable[[str], float]:
+class StampReader:
     """A function from a stamp's text to seconds since 1970, NaN for an empty cell. A stamp without offset is UTC.
 
-    The function raises ValueError for a stamp in another format, and for one with an offset if a zone is given.
+    It raises ValueError for a stamp in another format, and for one with an offset if a zone is given. offset: of the
+    last stamp, s.
     """
 
-    def seconds(text: str) -> float:
+    def __init__(self, form: str | None = None, zone: str | None = None) -> None:
+        self._form, self._zone, self.offset = form, zone, 0.0
+
+    def __call__(self, text: str) -> float:
         stamp = text.strip().strip('"')
         if not stamp:
             return float("nan")
-        moment = _with_format(stamp, form) if form else _plain(stamp)
-        if moment.tzinfo is None:
+        moment = _with_format(stamp, self._form) if self._form else _plain(stamp)
+        offset = moment.utcoffset()
+        if offset is None:
             return (moment.replace(tzinfo=UTC) - _EPOCH).total_seconds()
-        if zone:
-            raise ValueError(f"expected local time of {zone}, got '{stamp}' with its offset; leave the zone out")
+        if self._zone:
+            raise ValueError(f"expected local time of {self._zone}, got '{stamp}' with its offset; leave the zone out")
+        self.offset = offset.total_seconds()
         return moment.timestamp()
 
-    return seconds
 
-
-seconds_of = stamp_reader(None, None)
+seconds_of = StampReader()
 """Seconds since 1970 of an ISO 8601 time stamp, or of one such as 29.3.2026 08:30:00."""
 
 
@@ -85,6 +88,12 @@ def from_zone(local: np.ndarray, zone: str) -> np.ndarray:
     back = np.zeros(len(local), dtype=bool)
     back[1:] = (np.diff(local) < -BACK) & twice[1:]
     return local - np.where(twice & np.logical_or.accumulate(back), second, first)
+
+
+def offset_of_zone(seconds: float, zone: str) -> float:
+    """How far a zone is ahead of UTC at a time (s since 1970), s."""
+    offset = datetime.fromtimestamp(seconds, ZoneInfo(zone)).utcoffset()
+    return offset.total_seconds() if offset else 0.0
 
 
 def _offset(moment: datetime, zone: str, fold: int) -> float:

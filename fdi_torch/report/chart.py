@@ -11,12 +11,14 @@ import numpy as np
 import orjson
 from matplotlib.figure import Figure
 
+from fdi_torch.clock import clock_text, clock_zero
 from fdi_torch.report.downsampling import extremes, thinned
 from fdi_torch.report.html import clean, short
 from fdi_torch.report.style import HEIGHT, MARK, SOFT, VARIABLES, label_lines, logarithmic, panel, styled
 
 MOST_SAMPLES = 6000  # of a line; longer ones keep the extremes of half as many segments
 MOST_EVENTS = 50
+TIME, PLANNED = "time, s", "next"  # label of an axis of time; clock of an experiment to come
 ONE_ROW = 44  # letters of title and names of lines that fit one row above the picture
 
 
@@ -56,6 +58,16 @@ class Chart:
     height: float = HEIGHT
 
     @property
+    def zero(self) -> float | None:
+        """Time 0 as the recording's clock showed it, s since 1970; None for another axis, or a clock without dates."""
+        return clock_zero() if self.x_label == TIME and self.clock != PLANNED else None
+
+    @property
+    def axis(self) -> str:
+        """The label of the horizontal axis."""
+        return self.x_label if self.zero is None else f"{self.x_label} after {clock_text(0.0)}"
+
+    @property
     def scale(self) -> tuple[str, float]:
         """Kind of the vertical axis, "linear", "log" or "asinh", and the width of the linear part of the last."""
         values = np.concatenate([np.asarray(line.y, dtype=float) for line in self.lines] or [np.zeros(0)])
@@ -70,7 +82,7 @@ class Chart:
 
 def draw(chart: Chart) -> Figure:
     """The picture, with its lines labelled in their colours if there are several."""
-    figure, axes = panel(short(chart.title), short(chart.x_label), short(chart.y_label, 60), height=chart.height)
+    figure, axes = panel(short(chart.title), short(chart.axis), short(chart.y_label, 60), height=chart.height)
     if chart.level is not None:
         axes.axhline(chart.level, color=SOFT, lw=0.8, ls="-" if chart.level == 0.0 else ":")
     for line in chart.lines:
@@ -113,6 +125,8 @@ def chart_json(chart: Chart) -> str:
     described: dict[str, Any] = {
         "title": clean(chart.title),
         "x": clean(chart.x_label),
+        "axis": clean(chart.axis),
+        "zero": chart.zero,
         "y": clean(chart.y_label),
         "clocks": [_base64(clock, "<f8") for clock in clocks],
         "lines": lines,

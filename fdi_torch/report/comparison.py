@@ -62,7 +62,7 @@ def result_rows(compared: Comparison) -> list[list[str]]:
     verdicts = {True: "yes", False: "no", None: ""}
     rows = []
     for result in compared.results:
-        unit, scale = shown_unit(result.unit)
+        unit, scale = shown_unit(result.unit, result.name)
         values = [with_error(scale * v, scale * s) for v, s in zip(result.values, result.std, strict=True)]
         rows.append([result.name, unit or "1", *values, number(result.p_value, 2), verdicts[result.agree]])
     return rows

@@ -9,7 +9,7 @@ from typing import Any
 
 from fdi_torch.effects import effect
 from fdi_torch.estimate.combinations import Combination
-from fdi_torch.gap.verdict_words import cause_words, equivalents_words
+from fdi_torch.gap.verdict_words import apart_from_rounding, cause_words, equivalents_words
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import fits
@@ -46,7 +46,7 @@ class DiagnosedEffect:
     @property
     def sized(self) -> str:
         """'leak at T1 (size 0.3000 ± 0.0020, 33.1 cm³/s)': the effect with its size and, if it has one, its flow."""
-        unit, scale = shown_unit(self.unit)
+        unit, scale = shown_unit(self.unit, f"{self.location}.{self.effect}.{self.quantity}")
         value = with_error(scale * self.size, scale * self.std)
         size = f"{self.quantity.replace('_', ' ')} {value}" if unit in ("", "1") else f"{value} {unit}"
         sizes = [size] if math.isfinite(self.size) else []
@@ -60,9 +60,10 @@ def readable(cause: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def diagnosed_effects(material: Material) -> list[DiagnosedEffect]:
-    """Faults of a diagnosis (the last message about each), then the causes of a gap."""
+    """Faults of a diagnosis (the last message about each), then the causes of a gap, rounded readings excepted."""
     faults = {(m.get("fault"), m.get("location")): _fault(m) for m in material.of("/diagnosis/fault")}
-    return [*faults.values(), *(_cause(cause, material.plant) for cause in material.answer.get("causes", []))]
+    causes = apart_from_rounding(material.answer.get("causes", []))
+    return [*faults.values(), *(_cause(cause, material.plant) for cause in causes)]
 
 
 def _fault(message: Mapping[str, Any]) -> DiagnosedEffect:

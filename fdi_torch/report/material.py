@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -10,11 +11,14 @@ from typing import Any
 import numpy as np
 import orjson
 
+from fdi_torch.clock import clock_shown, of_stamp
+from fdi_torch.effects import units_for_display
 from fdi_torch.gap.verdict_words import FORMAT_1
 from fdi_torch.logbook import Inspection, LogError, Run, Signals, arrays, inspect_log, own_signals, series
 from fdi_torch.parameters import displayed_in
 from fdi_torch.plant.description import PlantDescription
 
+CLOCK = "/source/clock"
 # Only these topics are kept as messages; signals and search populations are read as arrays when needed.
 EVENTS = (
     "/plant/truth",
@@ -27,6 +31,7 @@ EVENTS = (
     "/gap/verdict",
     "/study/trial",
     "/study/summary",
+    CLOCK,
     "/log",
 )
 MOST_EVENTS = 100_000
@@ -120,11 +125,23 @@ class Material:
             return {}
         return answer
 
-    def in_its_units(self) -> AbstractContextManager[None]:
-        """Context within which quantities are displayed in the units of the run's plant and of its recordings."""
+    @contextmanager
+    def in_its_units(self) -> Iterator[None]:
+        """Context of display: the units of the run's plant and of its recordings, and the recordings' clock."""
         written = (key.partition(".unit.") for key in self.about("data"))
         channels = {name: self.about("data")[f"{k}.unit.{name}"] for k, divided, name in written if divided}
-        return displayed_in({**(self.plant.units if self.plant else {}), **channels})
+        units = {**(units_for_display(self.plant) if self.plant else {}), **channels}
+        with clock_shown(self.clock_zeros), displayed_in(units):
+            yield
+
+    @property
+    def clock_zeros(self) -> list[float | None]:
+        """Time 0 of each recording as its clock showed it, s since 1970; None for a clock without dates."""
+        about = self.about("data")
+        numbers = [key.removesuffix(".path") for key in about if key.endswith(".path")]
+        zeros = [_clock_zero(about.get(f"{k}.began")) for k in numbers]
+        origins = [message.get("origin") for message in self.of(CLOCK)]
+        return zeros or [float(zero) for zero in origins if isinstance(zero, int | float)]
 
     @property
     def meaning_of_shares(self) -> str:
@@ -132,6 +149,14 @@ class Material:
         if self.answer.get("format") == FORMAT_1:
             return "share of the gap that a free discrepancy there alone closes"
         return "probability that something is wrong there"
+
+
+def _clock_zero(began: str | None) -> float | None:
+    """The stamp of a log's metadata as its own clock shows it, s since 1970; None without one."""
+    try:
+        return None if began is None else sum(of_stamp(began))
+    except ValueError:
+        return None
 
 
 def gather(run: Run, plant: PlantDescription | None = None) -> Material:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from fdi_torch.clock import clock_text
 from fdi_torch.estimate.combinations import Combination
 from fdi_torch.estimate.misfit import UNRELIABLE, Misfit
 from fdi_torch.gap.verdict_words import verdict_sentence
@@ -110,7 +111,10 @@ def _latest(what: str, items: list[str]) -> str:
 
 def _since(event: Mapping[str, Any]) -> str:
     onset = event.get("onset")
-    return f", since {number(float(onset), 4)} s" if isinstance(onset, int | float) else ""
+    if not isinstance(onset, int | float):
+        return ""
+    moment = clock_text(float(onset))
+    return f", since {number(float(onset), 4)} s" + (f", {moment}" if moment else "")
 
 
 def alarm_words(material: Material) -> str:

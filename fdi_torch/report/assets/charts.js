@@ -110,7 +110,7 @@ class Chart {
     return {
       ...this.size(), legend: { show: false }, padding: [6, 20, 0, 0],
       scales: { x: { time: false, range: (plot, low, high) => this.clock.span || [low, high] }, y: this.range() },
-      axes: [{ ...axis(this.about.x, 26), values: plain },
+      axes: [{ ...axis(this.about.axis, 26), values: plain },
              { ...axis(this.about.y, 50), values: plain, splits: kind === "linear" ? undefined : decades,
                filter: (plot, splits) => splits, size: (plot, values) =>
                16 + 7.6 * Math.max(3, ...(values || []).map(value => (value || "").length)) }],
@@ -175,7 +175,9 @@ class Chart {
 
   read(index) {
     const inside = index !== null && index !== undefined;
-    this.place.textContent = inside ? `at ${text(this.data[0][index], 7)}${unit(this.about.x)}` : "";
+    const at = this.data[0][index], zero = this.about.zero;
+    const date = inside && zero !== null ? new Date(1000 * (zero + at)).toISOString().slice(0, 19).replace("T", " ") : "";
+    this.place.textContent = inside ? `at ${text(at, 7)}${unit(this.about.x)}${date && ", " + date}` : "";
     this.cells.forEach((cell, i) => {
       const value = inside ? this.data[i + 1][index] : null;
       cell.textContent = value === null || value === undefined ? "" : text(value) + unit(this.about.y);

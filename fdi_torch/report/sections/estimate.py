@@ -74,7 +74,7 @@ def _row(material: Material, final: Payload, i: int) -> list[Any]:
     name = str(final["names"][i])
     unit = str(final["units"][i]) if final.get("units") else ""
     cells: list[Any] = [name, _finding(material, name)] if material.of("/diagnosis/fault") else [name]
-    cells += _numbers(float(final["values"][i]), float(final["std"][i]), unit)
+    cells += _numbers(float(final["values"][i]), float(final["std"][i]), unit, name)
     return [*cells, *_simulated(material, unit, (name,), (1.0,))]
 
 
@@ -85,7 +85,11 @@ def _combination_row(material: Material, combination: Combination) -> list[Any]:
     if material.of("/diagnosis/fault"):
         deviates = c in combinations_of(material, "not_isolated")
         cells.append(tag("span", "present", class_="bad") if deviates else "")
-    return [*cells, *_numbers(c.value, c.std, c.unit), *_simulated(material, c.unit, c.parameters, c.coefficients)]
+    return [
+        *cells,
+        *_numbers(c.value, c.std, c.unit, c.parameters[0]),
+        *_simulated(material, c.unit, c.parameters, c.coefficients),
+    ]
 
 
 def _simulated(material: Material, unit: str, names: Sequence[str], coefficients: Sequence[float]) -> list[str]:
@@ -93,12 +97,12 @@ def _simulated(material: Material, unit: str, names: Sequence[str], coefficients
     if not material.truth:
         return []
     value = sum(c * material.truth.get(name, np.nan) for c, name in zip(coefficients, names, strict=True))
-    return [number(shown_unit(unit)[1] * value) if np.isfinite(value) else ""]
+    return [number(shown_unit(unit, names[0])[1] * value) if np.isfinite(value) else ""]
 
 
-def _numbers(value: float, std: float, si_unit: str) -> list[str]:
+def _numbers(value: float, std: float, si_unit: str, name: str) -> list[str]:
     """Unit, value with standard error, and 95 % interval, in the unit for display."""
-    unit, scale = shown_unit(si_unit)
+    unit, scale = shown_unit(si_unit, name)
     value, std = scale * value, scale * std
     reach = 1.96 * std
     if not np.isfinite(reach):
@@ -136,8 +140,9 @@ def _water(material: Material) -> list[Any]:
 
 def _ellipse(material: Material, final: Payload, covariance: np.ndarray, pair: tuple[int, int], k: int) -> Picture:
     i, j = pair
-    units, scales = zip(*(shown_unit(final["units"][n] if final.get("units") else "") for n in pair), strict=True)
     names = (str(final["names"][i]), str(final["names"][j]))
+    known = [final["units"][n] if final.get("units") else "" for n in pair]
+    units, scales = zip(*map(shown_unit, known, names), strict=True)
     scale = np.array(scales)
     centre = scale * np.array([final["values"][i], final["values"][j]], dtype=float)
     part = covariance[np.ix_(pair, pair)] * np.outer(scale, scale)

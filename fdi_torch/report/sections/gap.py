@@ -7,7 +7,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from fdi_torch.gap.verdict_words import FORMAT_1, causes_of
+from fdi_torch.clock import clock_unit
+from fdi_torch.gap.verdict_words import FORMAT_1, apart_from_rounding, causes_of, rounding_words
 from fdi_torch.gap.verdict_words import explanation_words as in_words
 from fdi_torch.report.diagnosed_effects import readable
 from fdi_torch.report.html import table, tag
@@ -34,9 +35,8 @@ def where_section(material: Material) -> Section | None:
     ranked = shown[:MOST_BARS]
     shares = [100.0 * float(place["share"]) for _, place in ranked]
     texts = [probability_text(float(place["share"])) + _chance(place) for _, place in ranked]
-    guilty = {str(cause["location"]) for cause in material.answer.get("causes", [])}
-    for item in material.answer.get("posterior", [])[:1]:
-        guilty |= {str(cause["location"]) for cause in causes_of(item)}
+    likeliest = [cause for item in material.answer.get("posterior", [])[:1] for cause in causes_of(item)]
+    guilty = {str(c["location"]) for c in apart_from_rounding([*material.answer.get("causes", []), *likeliest])}
     names = [name for name, _ in ranked]
     meaning = material.meaning_of_shares
     label = "share of the gap, %" if material.answer.get("format") == FORMAT_1 else "probability, %"
@@ -52,9 +52,11 @@ def causes_section(material: Material) -> Section | None:
     if not answer:
         return None
     header = ("effect", "at", "parameter", "value", "unit")
-    rows = [row for cause in answer.get("causes", []) for row in _cause_rows(cause)]
+    causes = answer.get("causes", [])
+    rows = [row for cause in apart_from_rounding(causes) for row in _cause_rows(cause)]
     blocks: list[Any] = [table(header, rows, left=3)] if rows else []
-    certain = answer.get("certain") or []
+    blocks += [words] if (words := rounding_words(causes)) else []
+    certain = apart_from_rounding(answer.get("certain") or [])
     if certain and answer.get("verdict") != "named":
         blocks.append(f"With 95 % probability, whichever explanation is true: {explanation_words(certain)}.")
     bars = _posterior(answer)
@@ -103,7 +105,7 @@ def _posterior(answer: Mapping[str, Any]) -> list[Any]:
     """Bars of the explanations' probabilities, and of that of unexamined ones."""
     weighted = [item for item in answer.get("posterior", []) if as_float(item.get("probability")) >= LEAST_SHOWN]
     explanations = [causes_of(item) for item in weighted[:MOST_BARS]]
-    first = explanations[0] if len(explanations) > 1 else []
+    first = apart_from_rounding(explanations[0]) if len(explanations) > 1 else []
     shared = [cause for cause in first if all(cause in each for each in explanations)]
     names = [_beside(shared, each) for each in explanations]
     chances = [as_float(item["probability"]) for item in weighted[:MOST_BARS]]
@@ -122,8 +124,8 @@ def _posterior(answer: Mapping[str, Any]) -> list[Any]:
 
 def _beside(shared: Sequence[Mapping[str, Any]], causes: Sequence[Mapping[str, Any]]) -> str:
     """The causes other than those that all explanations contain, which would not fit beside a bar."""
-    others = [cause for cause in causes if cause not in shared]
-    return explanation_words(others) if others or not causes else "nothing else"
+    others = [cause for cause in apart_from_rounding(causes) if cause not in shared]
+    return explanation_words(others) if others or not shared else "nothing else"
 
 
 def _up_to_all(figure: Figure) -> None:
@@ -141,9 +143,11 @@ def _cause_rows(cause: Mapping[str, Any]) -> list[list[str]]:
     effect, location = str(cause["effect"]).replace("_", " "), str(cause["location"])
     rows = []
     for name, amount in (cause.get("parameters") or {}).items():
-        unit, scale = shown_unit(str(amount.get("unit", "")))
+        full = f"{location}.{cause['effect']}.{name}"
+        unit, scale = shown_unit(str(amount.get("unit", "")), full)
         value, std = scale * as_float(amount.get("value")), scale * as_float(amount.get("std"))
-        rows.append([effect, location, str(name).replace("_", " "), with_error(value, std), unit])
+        rows.append([effect, location, str(name).replace("_", " "), with_error(value, std)])
+        rows[-1].append(clock_unit(unit, name, value))
     return rows or [[effect, location, "", "", ""]]
 
 

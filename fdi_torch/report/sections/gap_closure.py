@@ -73,7 +73,7 @@ def constants_section(material: Material) -> Section | None:
     constants = material.answer.get("constants") or {}
     rows = []
     for name, c in constants.items():
-        unit, scale = shown_unit(str(c.get("unit", "1")))
+        unit, scale = shown_unit(str(c.get("unit", "1")), str(name))
         values = {key: scale * as_float(c.get(key)) for key in ("nominal", "tolerance", "recalibrated", "augmented")}
         off = [(values[m] - values["nominal"]) / values["tolerance"] for m in ("recalibrated", "augmented")]
         fitted = with_error(values["augmented"], scale * as_float(c.get("std")))

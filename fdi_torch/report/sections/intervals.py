@@ -32,7 +32,7 @@ def intervals_section(material: Material) -> Section | None:
     for i, name in enumerate(map(str, final["names"])):
         if name not in profiles and name not in draws:
             continue
-        unit, scale = shown_unit(final["units"][i] if final.get("units") else "")
+        unit, scale = shown_unit(final["units"][i] if final.get("units") else "", name)
         rows.append([name, unit or "1", *_limits(final, i, profiles.get(name), draws.get(name), scale)])
         pictures.append(_column(name, unit, scale, profiles.get(name), draws.get(name), len(pictures)))
     words = (

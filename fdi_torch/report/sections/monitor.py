@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from fdi_torch.clock import clock_text
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import table
 from fdi_torch.report.material import Material
@@ -55,15 +58,25 @@ def event_section(material: Material) -> Section | None:
     events = material.of(ALARM)
     if not events:
         return None
+    dated = bool(clock_text(0.0))
     rows = [
         [
             number(float(m["t"]), 6),
+            *([clock_text(float(m["t"]))] if dated else []),
             str(m.get("event", "")),
             str(m.get("channel", "")),
             raised(str(m.get("message", ""))),
-            number(float(m["onset"]), 6) if isinstance(m.get("onset"), int | float) else "",
+            *_onset(m.get("onset"), dated),
         ]
         for m in events
     ]
-    listed = table(("time, s", "event", "at", "description", "onset, s"), rows, left=4)
+    clock = ["clock time"] if dated else []
+    header = ("time, s", *clock, "event", "at", "description", "onset, s", *(["onset, clock time"] if dated else []))
+    listed = table(header, rows, left=len(header) - 1 - len(clock))
     return Section("Events", [listed])
+
+
+def _onset(onset: Any, dated: bool) -> list[str]:
+    """The onset of an event's fault in s, and by the clock of a dated recording; empty cells without an onset."""
+    known = isinstance(onset, int | float)
+    return [number(float(onset), 6) if known else "", *([clock_text(float(onset)) if known else ""] if dated else [])]

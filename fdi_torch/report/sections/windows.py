@@ -35,7 +35,7 @@ def windows_section(material: Material) -> Section | None:
 
 def _row(stretch: dict[str, Any]) -> list[str]:
     """Sizes in a practical unit; a size beyond its range has no error."""
-    unit, scale = shown_unit(str(stretch.get("unit", "1")))
+    unit, scale = shown_unit(str(stretch.get("unit", "1")), str(stretch["name"]))
     size, std = (as_float(stretch.get(name)) * scale for name in ("size", "std"))
     shown = with_error(size, std) if math.isfinite(std) else f"> {number(size)}"
     flow, flow_scale = shown_unit("m^3/s")
