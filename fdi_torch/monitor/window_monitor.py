@@ -84,7 +84,7 @@ class WindowMonitor:
                 events.append(
                     Event(float(segment.time[0]), "notice", notice, believed=self._off_nominal(state.believed))
                 )
-                state = replace(self.start(segment, state.believed), number=state.number)
+                state = replace(self.start(segment.segment(0, 1), state.believed), number=state.number)
                 segment = segment.segment(1, len(segment))
             while len(segment):
                 due = segment.time >= state.next_end
@@ -110,10 +110,10 @@ class WindowMonitor:
         if not state.alarmed and bool(above.any()):
             when = float(samples.time[int(above.to(torch.int8).argmax())])
             events.append(self._event(moved, when, "alarm", "the residual leaves its fault-free range"))
-        alarmed = state.alarmed or bool(above.any())
+        alarmed, fewest = state.alarmed or bool(above.any()), self._observer.whitening.order + 1
         state = replace(
             state,
-            observer=drop_old_samples(replace(moved, earliest_start=moved.now - 2.0 * self.length)),
+            observer=drop_old_samples(replace(moved, earliest_start=moved.now - 2.0 * self.length), fewest),
             alarmed=alarmed,
         )
         if moved.now < state.next_end:
