@@ -15,7 +15,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     told = "how long the slow test draws files that a person or an attacker could write"
     parser.addoption("--fuzz-minutes", type=float, default=0.5, help=told)
     parser.addoption("--fuzz-seed", type=int, default=2, help="the seed of the first round of these files")
-    parser.addoption("--kills", type=int, default=6, help="how often the slow test kills each of four jobs")
+    parser.addoption("--kills", type=int, default=6, help="how often the slow test kills each of five jobs")
 
 
 @pytest.fixture(autouse=True)

@@ -11,8 +11,11 @@ import pytest
 import torch
 
 from fdi_torch.estimate.evidence import ODDS, log_volume
+from fdi_torch.estimate.uncertainty import end_reached
+from fdi_torch.monitor.events import size_of
 from fdi_torch.monitor.hypothesis import NO_CHANGE, Hypothesis, HypothesisFit, credible_set, merged, with_posterior
 from fdi_torch.monitor.isolation import Prior
+from fdi_torch.parameters import Parameter
 
 READINGS = 600
 LIMIT = READINGS + 4.0 * (2.0 * READINGS) ** 0.5
@@ -76,3 +79,28 @@ def test_the_credible_set_has_95_percent_and_every_indistinguishable_fit() -> No
 
 def test_an_estimate_at_its_bound_never_fits() -> None:
     assert found((0,), 0.0).fits and not replace(found((0,), 0.0), at_bound=(0,)).fits
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+def test_the_volume_at_an_end_of_a_range_is_that_of_a_truncated_posterior(correlation: float) -> None:
+    """Against sums over a grid: one parameter that the end holds back, one inside its range; widths 2 and 5."""
+    curvature = torch.tensor([[400.0, 40.0 * correlation], [40.0 * correlation, 4.0]], dtype=torch.float64)
+    width = torch.tensor([2.0, 5.0], dtype=torch.float64)
+    for slope in (4.0, 60.0):
+        x = torch.linspace(0.0, 2.0, 4001, dtype=torch.float64)
+        y = torch.linspace(-10.0, 10.0, 2001, dtype=torch.float64)
+        point = torch.stack(torch.meshgrid(x, y, indexing="ij"), dim=-1)
+        cost = slope * point[..., 0] + 0.5 * torch.einsum("...i,ij,...j", point, curvature, point)
+        volume = torch.trapezoid(torch.trapezoid(torch.exp(-cost), y), x) / 10.0
+        held = torch.tensor([slope, 0.0], dtype=torch.float64)
+        assert log_volume(curvature, width, held) == pytest.approx(float(volume.log()), abs=1e-3)
+    assert log_volume(1e-12 * curvature, width, 1e-9 * width) == 0.0, "what the data do not show costs nothing"
+
+
+def test_an_end_of_a_range_is_reached_except_the_nominal_value_and_a_physical_limit() -> None:
+    gain = Parameter("Q1.pump_gain.factor", "1", 1.0, 0.0, 2.0, extremes=(0.0,))
+    assert [end_reached(gain, value) for value in (0.0, 1.0, 1.99, 1.9995, 2.4)] == [None, None, None, 2.0, 2.0]
+    bias = Parameter("h1.sensor_bias.bias", "m", 0.0, -0.1, 0.1)
+    assert end_reached(bias, -0.1) == -0.1 and size_of(bias, -0.12, 0.01).std == math.inf
+    assert size_of(bias, -0.12, 0.01).shown == "h1.sensor_bias.bias at most -10 cm, the end of its range"
+    assert end_reached(replace(gain, low=1.0, extremes=(), high=math.inf), 1.0) is None

@@ -25,6 +25,7 @@ WORDS = {
     "study": ["study", "--config", "configs/studies/table3_noise.yaml"],
     "gap": ["gap", "--plant", "three_tank", "--recording", "RIG", "--library", "pump_gain"],
     "monitor": ["monitor", "--config", "WATCH"],
+    "follow": ["monitor", "--config", "WATCH", "--follow", "--idle", "0.5"],
 }
 CHANGES = {
     "train": ["simulate.duration=200 s", "estimate.search.evaluations=1500"],
@@ -33,7 +34,7 @@ CHANGES = {
         *("study.trials=6", "study.block=2", "study.snr_db=[30]"),
     ],
 }
-RESUMED = ("train", "study", "monitor")
+RESUMED = ("train", "study", "monitor", "follow")
 
 
 @dataclass(frozen=True)
@@ -198,7 +199,7 @@ def test_what_is_said_of_an_interrupted_job_is_true(
     word = "interrupted" if number == signal.SIGINT else "terminated"
     kept = f"what was computed until now is in {log}"
     assert (
-        complaints == f"fdi {job.name}: {word}; {kept}; the same command {'with ' * (job.name in RESUMED)}{going_on}\n"
+        complaints == f"fdi {job.words[0]}: {word}; {kept}; the same command {'with ' * (job.name in RESUMED)}{going_on}\n"
     )
     assert read_run(log).metadata["fdi_torch.status"]["status"] == "interrupted"
     expect_whole(folder)

@@ -185,6 +185,26 @@ def test_a_fault_that_ends_is_reported_as_recovered() -> None:
     assert last.faults == ("T1.leak.size",) and last.onset is not None and abs(last.onset - 329.5) < 3.0
 
 
+@pytest.mark.parametrize(
+    ("name", "truth"),
+    [
+        ("T1.leak.size", step_to("T1.leak.size", 1.6, 200.0)),
+        ("Q2.pump_gain.factor", step_to("Q2.pump_gain.factor", 2.5, 200.0)),
+        ("Q2.pump_gain.factor", lambda t: SPACE.vector({"Q2.pump_gain.factor": 1.0 + 0.003 * max(t - 200.0, 0.0)})),
+    ],
+)
+def test_a_size_beyond_its_range_is_told_as_at_least_its_end_and_causes_no_other_fault(name: str, truth: Truth) -> None:
+    watch = monitor(longest=200.0, incipient=True)
+    state, events = followed(watch, recorded(truth, 700), 100)
+    events += watch.close(state)
+    end = SPACE[name].high
+    ended = [e for e in events if e.best is not None and e.best.sizes[0].at_end]
+    assert ended and {e.faults for e in events if e.faults} == {(name,)}
+    assert all(f"{name} at least {end:g}, the end of its range" in e.text for e in ended)
+    assert {(e.sizes, e.stds) for e in ended} == {((end,), (float("inf"),))}
+    assert [e.sizes for e in events if e.kind == "summary" and e.sizes] == [(end,)]
+
+
 def test_a_fault_with_an_inexact_law_is_one_event_until_it_ends() -> None:
     """A hole 25 cm above the floor, modelled as a hole in the floor: its estimated size decreases."""
     space = ParameterSpace([NETWORK.constants["T1.leak.size"], NETWORK.constants["T1.leak.height"]])

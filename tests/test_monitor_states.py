@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,10 +17,11 @@ from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
-from fdi_torch.monitor.samples import Samples, samples_of_recording
+from fdi_torch.monitor.samples import ABSENT, ClockState, Samples, samples_of_recording, split_at_gaps
 from fdi_torch.monitor.state_update import normalized_residuals
+from fdi_torch.monitor.window_monitor import WindowMonitor
 from fdi_torch.recording import Recording
-from tests.test_monitor import SPACE, followed, monitor, recorded
+from tests.test_monitor import SPACE, monitor, recorded
 
 
 def test_an_alarm_allows_only_valid_transitions() -> None:
@@ -36,58 +38,90 @@ def test_an_alarm_allows_only_valid_transitions() -> None:
 
 
 def troubled() -> Samples:
-    """A leak that opens and closes, a bias that grows; gaps, repetitions, unknown inputs and missing readings."""
+    """A leak that opens and closes, a bias that grows; gaps, repetitions, unknown inputs and missing readings, also
+    right after a gap and where an input is known again. At last only each ninth sample is left.
+    """
 
     def truth(time: float) -> Tensor:
         leak = 0.08 if 150.0 <= time < 330.0 else 0.0
         return SPACE.vector({"T1.leak.size": leak, "h3.sensor_bias.bias": 1e-4 * max(time - 520.0, 0.0)})
 
-    samples = recorded(truth, 700, seed=12)
+    samples = recorded(truth, 1600, seed=12)
     time, inputs, readings = samples.time.clone(), samples.inputs.clone(), samples.readings.clone()
     time[60] = time[59]
     time[440:] += 30.0
     inputs[455:459] = torch.nan
     readings[100:103, 1] = torch.nan
-    return replace(samples, time=time, inputs=inputs, readings=readings)
+    readings[440:446, 0] = torch.nan
+    readings[459:470, 2] = torch.nan
+    rows = torch.cat([torch.arange(700), torch.arange(700, 1600, 9)])
+    return replace(samples, time=time[rows], inputs=inputs[rows], readings=readings[rows])
 
 
-def in_pieces(watch: Monitor, samples: Samples, cuts: list[int]) -> list[Event]:
-    state, events = watch.start(samples), []
+Watch = Monitor | WindowMonitor
+
+
+def in_pieces(watch: Watch, samples: Samples, cuts: Sequence[int]) -> tuple[list[Event], Tensor]:
+    """Events, and residuals and statistic of each sample."""
+    state, events, traces = watch.start(samples), [], []
     for first, last in zip([1, *cuts], [*cuts, len(samples)], strict=True):
-        state, news = watch.advance(state, samples.segment(first, last))
+        state, news = watch.advance(state, samples.segment(first, last), traces.append)
         events += news
-    return events
+    columns = [torch.cat([t.residual.nan_to_num(nan=-1e9), t.statistic[:, None]], dim=1) for t in traces]
+    return events, torch.cat(columns)
 
 
-@pytest.fixture(scope="module")
-def whole() -> tuple[Monitor, Samples, list[Event]]:
+def windows(watch: Monitor) -> WindowMonitor:
+    return WindowMonitor(watch.observer, watch.detector, watch.watched, "least_squares", 150.0, 70.0)
+
+
+Run = tuple[Watch, Samples, list[Event], Tensor]
+
+
+@pytest.fixture(scope="module", params=["changes", "windows"])
+def whole(request: pytest.FixtureRequest) -> Run:
     watch, samples = monitor(incipient=True), troubled()
-    return watch, samples, followed(watch, samples, len(samples))[1]
+    chosen = windows(watch) if request.param == "windows" else watch
+    return chosen, samples, *in_pieces(chosen, samples, [])
 
 
-def test_every_state_except_learning_occurs(whole: tuple[Monitor, Samples, list[Event]]) -> None:
-    kinds = {event.kind for event in whole[2]}
+def test_every_state_except_learning_occurs() -> None:
+    kinds = {event.kind for event in in_pieces(monitor(incipient=True), troubled(), [])[0]}
     assert {"alarm", "isolated", "revised", "recovered", "notice"} <= kinds
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_events_are_identical_for_any_batching_of_samples(
-    seed: int, whole: tuple[Monitor, Samples, list[Event]]
-) -> None:
-    watch, samples, expected = whole
-    generator = torch.Generator().manual_seed(seed)
-    count = (3, 40, 400)[seed]
-    cuts = sorted(set((1 + torch.randperm(len(samples) - 1, generator=generator)[:count]).tolist()))
-    assert in_pieces(watch, samples, cuts) == expected
+@pytest.mark.parametrize("chunk", [1, 7, 100, "random"])
+def test_events_and_residuals_are_identical_for_any_batching_of_samples(chunk: int | str, whole: Run) -> None:
+    watch, samples, events, trace = whole
+    count = len(samples)
+    drawn = torch.randperm(count - 2, generator=torch.Generator().manual_seed(1))[:40] + 2
+    cuts = sorted(drawn.tolist()) if isinstance(chunk, str) else list(range(1 + chunk, count, chunk))
+    again, same = in_pieces(watch, samples, cuts)
+    assert again == events and torch.equal(same, trace)
 
 
-@pytest.mark.parametrize("cut", [120, 158, 200, 341, 400, 452, 458, 600])
-def test_no_event_depends_on_a_later_reading(cut: int, whole: tuple[Monitor, Samples, list[Event]]) -> None:
+@pytest.mark.parametrize("cut", [120, 158, 200, 341, 400, 441, 452, 460, 600, 750])
+def test_no_event_depends_on_a_later_reading(cut: int, whole: Run) -> None:
     """The events of a truncated recording are the first events of the complete one, byte for byte."""
-    watch, samples, expected = whole
-    events = in_pieces(watch, samples.segment(0, cut), [])
-    assert events == expected[: len(events)]
+    watch, samples, expected, trace = whole
+    events, early = in_pieces(watch, samples.segment(0, cut), [])
+    assert events == expected[: len(events)] and torch.equal(early, trace[: len(early)])
     assert all(event.time > float(samples.time[cut - 1]) for event in expected[len(events) :])
+
+
+def test_after_a_gap_the_observer_waits_for_each_sensor_that_was_not_silent_for_long() -> None:
+    time, readings = torch.arange(200.0), torch.arange(600.0).reshape(200, 3)
+    readings[50:, 2] = torch.nan
+    readings[121:123, 0] = torch.nan
+    time[121:] += 20.0
+    time[122:] += 20.0
+    samples = Samples(time, torch.zeros(200, 2), readings)
+    for first, unread, begins in ((1, 0, 49 + ABSENT), (50, 40, 123)):
+        clock = ClockState(0.0, unread=torch.tensor([0, 0, unread]))
+        [(before, _), (after, notice)], moved = split_at_gaps(clock, samples.segment(first, 200), 1.0)
+        assert float(before.time[-1]) == 120.0 and moved.restart is None
+        assert after.time[0] == time[begins] and after.readings[0, 0] == readings[begins, 0]
+        assert notice == "; ".join(["no samples for 21 s; the observer restarts"] * 2)
 
 
 @pytest.mark.parametrize("chart", CHARTS)

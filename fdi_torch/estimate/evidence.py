@@ -71,14 +71,27 @@ def log_det(curvature: Float[Tensor, "P P"]) -> float:
     return float(torch.log(torch.clamp(torch.linalg.eigvalsh(curvature), min=1.0)).sum())
 
 
-def log_volume(curvature: Float[Tensor, "P P"], width: Float[Tensor, " P"]) -> float:
+def log_volume(
+    curvature: Float[Tensor, "P P"], width: Float[Tensor, " P"], slope: Float[Tensor, " P"] | None = None
+) -> float:
     """Log of the Occam factor, the ratio of posterior volume to uniform prior volume: -log det(W H W / 2 pi) / 2 <= 0.
 
     curvature (P, P): Hessian H of the cost, half a chi-square. width (P,): widths of the prior, the diagonal of W. A
-    direction without information in the data contributes 0.
+    direction without information in the data contributes 0. slope (P,): magnitude g of the cost's gradient for
+    parameters that an end of their range holds back, 0 for the others. Such a parameter contributes the integral of
+    exp(-g x - s x^2 / 2) over its distance x from that end; s is its curvature with all others integrated out.
     """
-    scaled = curvature * width[:, None] * width[None, :] / (2.0 * math.pi)
-    return -0.5 * log_det(0.5 * (scaled + scaled.mT))
+    scaled = curvature * width[:, None] * width[None, :]
+    scaled = 0.5 * (scaled + scaled.mT)
+    held = torch.zeros_like(width, dtype=torch.bool) if slope is None else slope > 0.0
+    inside, across = scaled[~held][:, ~held], scaled[held][:, ~held]
+    volume = -0.5 * log_det(inside / (2.0 * math.pi))
+    if slope is None or not bool(held.any()):
+        return volume
+    left = scaled[held][:, held].diagonal() - (across @ torch.linalg.pinv(inside, hermitian=True) * across).sum(-1)
+    root = (2.0 * left.clamp(min=1e-12)).sqrt()
+    integral = math.sqrt(math.pi) / root * torch.special.erfcx(slope[held] * width[held] / root)
+    return volume + float(integral.clamp(max=1.0).log().sum())
 
 
 def posterior(log_weights: Sequence[float]) -> list[float]:

@@ -13,13 +13,14 @@ from torch import Tensor
 
 from fdi_torch.estimate.combinations import Combination, undetermined_groups
 from fdi_torch.estimate.information import RELATIVE_EIGENVALUE, certainty
-from fdi_torch.parameters import ParameterSpace, quantity_text
+from fdi_torch.parameters import Parameter, ParameterSpace, quantity_text
 
 if TYPE_CHECKING:
     from fdi_torch.estimate.posterior_draws import Draws
 
 # A value within this fraction of the range of a bound counts as at the bound.
 _AT_BOUND = 1e-9
+AT_END = 1e-3  # of a parameter's range: distance from an end that an estimate has reached
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,19 @@ def parameters_at_bounds(space: ParameterSpace, theta: Tensor) -> dict[str, str]
         elif value >= p.high - margin:
             at_bounds[p.name] = "high"
     return at_bounds
+
+
+def end_reached(p: Parameter, value: float) -> float | None:
+    """The end of a parameter's range that a value has reached or passed; None inside the range.
+
+    The nominal value and physical limits are no ends in this sense: they are valid estimates.
+    """
+    width = p.high - p.low
+    for end, beyond in ((p.low, p.low - value), (p.high, value - p.high)):
+        margin = AT_END * (width if math.isfinite(width) else abs(end))
+        if math.isfinite(end) and end not in (p.nominal, *p.extremes) and beyond > -margin:
+            return end
+    return None
 
 
 def wider_than_range(space: ParameterSpace, std: Float[Tensor, " P"]) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from fdi_torch.effects import effect
+from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.channel_noise import low_frequency_excess
@@ -22,7 +23,6 @@ from fdi_torch.parameters import ParameterName, display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recordings.check import data_warnings
 
-AT_END = 1e-3  # of a parameter's range: distance from a bound
 SHOWN_TIMES = 5  # outliers whose times are listed
 WORSE = 1.1  # error of the free form over that of the recalibrated plant
 SWINGS = 0.03  # smallest amplitude of an oscillation, as a share of the free form's scale
@@ -125,12 +125,9 @@ def _values_at_bounds(result: DiagnosisResult) -> list[str]:
     """Fitted parameters that reached a bound of their sensible range."""
     remarks, fit = [], result.effects_fit
     for name, value in fit.effect_values.items():
-        parameter, (unit, scale) = fit.space[name], display_unit(fit.space[name].unit, name)
-        width = parameter.high - parameter.low
-        ends = [e for e in (parameter.low, parameter.high) if math.isfinite(e) and e != parameter.nominal]
-        reached = [e for e in ends if abs(value - e) < AT_END * (width if math.isfinite(width) else abs(e))]
-        if reached:
-            end = f"{scale * reached[0]:.4g} {unit}".rstrip()
+        (unit, scale), reached = display_unit(fit.space[name].unit, name), end_reached(fit.space[name], value)
+        if reached is not None:
+            end = f"{scale * reached:.4g} {unit}".rstrip()
             remarks.append(
                 f"{name} is at the bound of its sensible range ({end}): that effect alone is probably not the cause"
             )

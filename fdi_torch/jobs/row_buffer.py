@@ -77,6 +77,8 @@ def logged_rows(log: Log, run: MonitorRun) -> list[Row]:
     """The samples in a monitor's log, in their original order."""
     inputs, outputs = series(log, "/plant/input"), series(log, "/plant/output")
     count = min(len(inputs["t"]), len(outputs["t"]))  # a run may have been killed between the two messages
+    if not count:  # it may also have been killed before its first sample, when no channel is named yet
+        return []
     commands = [inputs[name][:count] for name in run.plant.channels()]
     readings = [outputs[sensor.column][:count] for sensor in run.plant.sensors]
     times = inputs["t"][:count].tolist()

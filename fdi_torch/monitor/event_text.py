@@ -17,6 +17,7 @@ from fdi_torch.monitor.events import (
     headline,
     rate_text,
     shares_text,
+    size_of,
 )
 from fdi_torch.monitor.hypothesis import HypothesisFit
 from fdi_torch.monitor.level_forecast import forecast_limits
@@ -148,10 +149,9 @@ class EventWriter:
             if change is not None and c in [f.track.column for f in state.hidden]:
                 sizes.append(Size(p.name, size, float("inf"), p.unit, f"{p.name} unknown"))
                 continue
-            at_bound = c in fit.at_bound
             grows = change is not None and h.incipient and c in h.sizes and now > fit.onset
             rate = (size - float(change.before[c])) / (now - fit.onset) if grows and change else None
-            sizes.append(Size(p.name, size, std, p.unit, amount_text(p, size, std, at_bound), at_bound, rate))
+            sizes.append(size_of(p, size, std, rate))
         if not sizes:
             return Explanation(fit.probability, ())
         recovered = set(h.recovered) >= set(h.sizes)
@@ -177,14 +177,18 @@ class EventWriter:
         return ", ".join(dict.fromkeys(urgencies)), any(announced)
 
     def _track_explanation(self, track: FaultTrack) -> Explanation:
-        p, (_, size, std) = self.space.parameters[track.column], track.last
-        shown = Size(p.name, size, std, p.unit, amount_text(p, size, std), rate=track.rate)
-        return Explanation(1.0, (shown,), track.onset, None, track.rate is not None)
+        size = self._track_size(track)
+        return Explanation(1.0, (size,), track.onset, None, size.rate is not None)
+
+    def _track_size(self, track: FaultTrack) -> Size:
+        _, size, std = track.last
+        return size_of(self.space.parameters[track.column], size, std, track.rate)
 
     def _track_text(self, track: FaultTrack) -> str:
-        p, (_, size, std) = self.space.parameters[track.column], track.last
-        growth = f", changes by {rate_text(p, track.rate)}" if track.rate is not None else ""
-        return amount_text(p, size, std) + growth
+        size = self._track_size(track)
+        return size.shown + (
+            f", changes by {rate_text(self.space[size.name], size.rate)}" if size.rate is not None else ""
+        )
 
     def _event(self, state: MonitorState, kind: Kind, text: str, alarm: Alarm | None = None, **more: object) -> Event:
         off = (state.believed != state.healthy).nonzero().flatten().tolist()

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from fdi_torch.clock import clock_text
+from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.monitor.alarm_state import State
 from fdi_torch.parameters import Parameter, display_unit
 
@@ -33,8 +34,8 @@ SMALLEST_SHARE = 0.05  # headlines name explanations with at least this probabil
 class Size:
     """One parameter that an explanation changes. size, std: in `unit`, SI; shown: text in a practical unit.
 
-    at_end: whether the estimate stopped at an end of its range, so that the true value may lie beyond it. rate: growth
-    of an incipient fault, in `unit` per s.
+    at_end: whether the estimate reached an end of its range. Then `size` is that end, the true value lies there or
+    beyond, and std is infinite. rate: growth of an incipient fault, in `unit` per s.
     """
 
     name: str
@@ -194,12 +195,21 @@ def percent_text(mass: float) -> str:
     return "over 99 %" if mass > 0.99 else f"{100.0 * mass:.0f} %" if mass >= 0.01 else "under 1 %"
 
 
-def amount_text(p: Parameter, size: float, std: float, at_end: bool = False) -> str:
+def size_of(p: Parameter, size: float, std: float, rate: float | None = None) -> Size:
+    """A parameter's estimate as events report it."""
+    end = end_reached(p, size)
+    if end is None:
+        return Size(p.name, size, std, p.unit, amount_text(p, size, std), rate=rate)
+    unit, scale = display_unit(p.unit, p.name)
+    most = f"{p.name} at {'least' if end == p.high else 'most'} {scale * end:.4g} {unit}".rstrip()
+    return Size(p.name, end, math.inf, p.unit, f"{most}, the end of its range", at_end=True)
+
+
+def amount_text(p: Parameter, size: float, std: float) -> str:
     """'Q1.pump_offset.offset = 23.1 ± 0.4 cm^3/s', in a practical unit."""
     unit, scale = display_unit(p.unit, p.name)
-    error = f" ± {scale * std:.2g}" if std > 0.0 and not at_end else ""
-    end = ", the end of its range" if at_end else ""
-    return f"{p.name} = {scale * size:.4g}{error} {unit}".rstrip() + end
+    error = f" ± {scale * std:.2g}" if std > 0.0 else ""
+    return f"{p.name} = {scale * size:.4g}{error} {unit}".rstrip()
 
 
 def rate_text(p: Parameter, rate: float) -> str:

@@ -96,7 +96,8 @@ def signature_guesses(
     rows, nearest, shift = torch.arange(len(hypotheses)), best // (2 * reach + 1), best % (2 * reach + 1) - reach
     scale = (match / power)[rows, best].unsqueeze(-1)
     value = believed + (theta[rows, nearest] - believed) * scale
-    low, high = observer.space.low(believed), observer.space.high(believed)
+    space = observer.search_space(believed)
+    low, high = space.low(believed), space.high(believed)
     interval = (window.samples.time[-1] - window.samples.time[0]) / len(window)
     onset = (onsets[nearest] + shift * interval).clamp(window.samples.time[0], window.samples.time[-2])
     return torch.cat([value.clamp(low, high), onset.unsqueeze(-1)], dim=-1)

@@ -16,6 +16,8 @@ from fdi_torch.estimate.evidence import log_prior, log_volume
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.linearisation import Linearisation
+from fdi_torch.estimate.refined import held_back
+from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.monitor.hypothesis import NO_CHANGE, Fault, Hypothesis, HypothesisFit, with_posterior
 from fdi_torch.monitor.initial_guess import oscillation_guess, recovery_guesses, recovery_hypotheses, signature_guesses
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
@@ -158,8 +160,9 @@ def fit(
     fixed[:, -1] = starts[:, -1]
     for i, hypothesis in enumerate(hypotheses):
         fixed[i, list(hypothesis.recovered)] = starts[i, list(hypothesis.recovered)]
-    low = torch.where(free, torch.cat([observer.space.low(believed), first[None]]), fixed)
-    high = torch.where(free, torch.cat([observer.space.high(believed), last[None]]), fixed)
+    space = observer.search_space(believed)
+    low = torch.where(free, torch.cat([space.low(believed), first[None]]), fixed)
+    high = torch.where(free, torch.cat([space.high(believed), last[None]]), fixed)
     starts = with_phases_at(torch.where(free, starts.clamp(low, high), fixed), oscillations, free, middle)
     for _, phase in oscillations:  # a full turn either way, so that no fit stops at +-pi
         low[:, phase] = torch.where(free[:, phase], starts[:, phase] - 2.0 * math.pi, low[:, phase])
@@ -170,12 +173,9 @@ def fit(
     theta = with_wrapped_phases(with_phases_at(refined.theta, oscillations, free, -middle), oscillations, free)
     std = std_with_phases_at_zero(certainty(final.curvature, held=~free), theta, oscillations, free, middle)
     width = torch.cat([observer.space_width(), (last - first)[None]])
-    tolerance, limit = SIZE_STEP * (high - low), _noise_limit(observer, window)
-    level = float(window.readings)
-    at_bound = free & ((refined.theta <= low + tolerance) | (refined.theta >= high - tolerance))
-    for column, p in enumerate(observer.space):
-        for physical in (p.nominal, *p.extremes):  # a physical limit is a valid estimate, not a limit of the search
-            at_bound[:, column] &= (refined.theta[:, column] - physical).abs() > tolerance[:, column]
+    level, limit = float(window.readings), _noise_limit(observer, window)
+    held = free & held_back(refined.theta, final.gradient, low, high)
+    slope = torch.where(held, final.gradient.abs(), 0.0)
     return [
         HypothesisFit(
             hypothesis,
@@ -186,24 +186,28 @@ def fit(
             base
             - float(final.cost[i])
             + prior(hypothesis)
-            + _log_occam_factor(final.curvature[i], width, free[i], hypothesis),
+            + _log_occam_factor(final.curvature[i], slope[i], width, free[i], hypothesis),
             float(final.cost[i]),
             level,
             limit,
-            tuple(c for c in hypothesis.sizes if bool(at_bound[i, c])),
+            tuple(
+                c
+                for c in hypothesis.sizes
+                if free[i, c] and end_reached(space.parameters[c], float(theta[i, c])) is not None
+            ),
         )
         for i, hypothesis in enumerate(hypotheses)
     ]
 
 
-def _log_occam_factor(curvature: Tensor, width: Tensor, free: Tensor, hypothesis: Hypothesis) -> float:
+def _log_occam_factor(curvature: Tensor, slope: Tensor, width: Tensor, free: Tensor, hypothesis: Hypothesis) -> float:
     """Log of the posterior's volume over the prior's, of the free columns.
 
     Independent faults have independent onsets; each further fault therefore costs as much as an onset of its own.
     """
     chosen, further = free.nonzero().flatten(), len(set(hypothesis.sizes) - set(hypothesis.recovered)) - 1
     onset = log_volume(curvature[-1:, -1:], width[-1:])
-    return log_volume(curvature[chosen][:, chosen], width[chosen]) + max(further, 0) * onset
+    return log_volume(curvature[chosen][:, chosen], width[chosen], slope[chosen]) + max(further, 0) * onset
 
 
 def _expansion(

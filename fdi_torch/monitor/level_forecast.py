@@ -54,7 +54,7 @@ def forecast_limits(
 
     fits: the explanations with their probabilities. recent: s over which the inputs are averaged.
     """
-    now, order = state.now, observer.network.order
+    now, order, tanks = state.now, observer.network.order, len(observer.network.description.tanks)
     latest = state.samples.time > now - recent
     inputs = state.samples.inputs[latest].mean(dim=0)
     time = now + torch.linspace(0.0, horizon, POINTS + 1, dtype=torch.float64)
@@ -62,7 +62,9 @@ def forecast_limits(
     before, changes = _drawn_parameters(observer, change, [fits[k] for k in chosen], now, horizon, generator)
     start, memory = _present_states(observer, state, change, fits)
     deviation, shocks = _random_flows(observer.whitening.flows, memory[chosen], horizon / POINTS, generator)
-    start = torch.cat([(start[chosen, :order] + deviation).clamp(min=0.0), start[chosen, order:]], dim=1)
+    start = start[chosen]
+    start[:, :order] += deviation
+    start[:, :tanks].clamp_(min=0.0)  # states of effects, such as flows, may be negative
     future = Samples(time, inputs.expand(POINTS + 1, -1), state.samples.readings.new_full((POINTS + 1, 1), torch.nan))
     levels = torch.cat([start.unsqueeze(1), observer.simulate(future, start, before, changes, shocks)], dim=1)
     limits = []
@@ -104,7 +106,8 @@ def _drawn_parameters(
     generator: torch.Generator,
 ) -> tuple[Tensor, _ContinuedRamps]:
     """Parameters now (DRAWS, P), and their change over the horizon. drawn: the explanation of each draw."""
-    low, high = observer.space.low(change.before), observer.space.high(change.before)
+    space = observer.search_space(change.before)
+    low, high = space.low(change.before), space.high(change.before)
     values, after = [], []
     for f in drawn:
         error = torch.randn(len(f.value), generator=generator, dtype=torch.float64)

@@ -71,6 +71,7 @@ class Monitor:
         self.writer = EventWriter(self.observer, self.settings, self.watched)
         explainer = Explainer(self.observer, self.faults, self.watched, self.settings)
         self.alarms = AlarmHandler(explainer, detector, self.writer)
+        self.fewest = self.alarms.reach + noise.whitening.order + 1
 
     def start(
         self,
@@ -115,7 +116,7 @@ class Monitor:
 
     def _restart(self, state: MonitorState, samples: Samples, notice: str) -> tuple[MonitorState, list[Event]]:
         """Restart the observer after a gap. Isolated faults stay in its parameters; a pending alarm is retired."""
-        fresh = initial_state(self.observer, samples, state.believed, state.healthy)
+        fresh = initial_state(self.observer, samples.segment(0, 1), state.believed, state.healthy)
         fresh = replace(
             fresh,
             alarms=state.alarms,
@@ -148,15 +149,15 @@ class Monitor:
             moved, statistic = self._observed(state, samples.segment(0, count))
         if show is not None:
             show(ResidualTrace(moved.samples.time[-count:], moved.residual[-count:], statistic))
-        moved = replace(moved, earliest_start=max(moved.earliest_start, self.alarms.earliest_start(moved)))
+        earliest = max(moved.earliest_start, self.alarms.earliest_start(moved))
+        moved = drop_old_samples(replace(moved, earliest_start=earliest), self.fewest)
         if learning:
             ended = moved.now >= state.learning_until
-            moved = replace(moved, learning_until=LONG_AGO, detector_memory=None) if ended else moved
-            return drop_old_samples(moved), count, []
+            return (replace(moved, learning_until=LONG_AGO, detector_memory=None) if ended else moved), count, []
         state, events = self.alarms.on_threshold(moved) if raised else (moved, [])
         if not raised and state.now >= self.alarms.next_fit(state):
             state, events = self.alarms.on_schedule(state)
-        return drop_old_samples(state), count, events
+        return state, count, events
 
     def _observed(self, state: MonitorState, samples: Samples) -> tuple[MonitorState, Tensor]:
         """The state after the samples, and the detector's statistic (S,) at each of them."""

@@ -9,14 +9,13 @@ from torch import Tensor
 
 from fdi_torch.monitor.observer_gain import Gain
 from fdi_torch.monitor.observer_run import run_observers
-from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.samples import ABSENT, Samples
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.inverted_sensor import levels_from_readings
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.scales import length_scale
 
-FIRST_SAMPLES = 100  # samples in which the first reading of a rarely read sensor gives its initial level
 LEVEL_OFFSET = 1e-5  # small change of the levels, in units of the plant's length scale
 DECAYED, DIVERGED = 1e-4, 1e3  # shares of that change at which the stability check stops
 
@@ -177,10 +176,10 @@ def _first_readings(readings: Tensor) -> Tensor:
 
 
 def initial_levels(network: TankNetwork, samples: Samples, values: PlaceValues) -> Tensor:
-    """Levels (*batch, tanks) from the first reading of each sensor, within FIRST_SAMPLES; nominal
+    """Levels (*batch, tanks) from the first reading of each sensor, within ABSENT samples; nominal
     where none is read.
     """
     start = [level.expand(samples.batch) for level in network.start_levels(values)]
-    readings = _first_readings(samples.readings[..., :FIRST_SAMPLES, :]).unbind(-1)
+    readings = _first_readings(samples.readings[..., :ABSENT, :]).unbind(-1)
     levels = levels_from_readings(network, readings, start, samples.time[0], values)
     return torch.stack(torch.broadcast_tensors(*levels), dim=-1)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.monitor.observer import initial_levels
 from fdi_torch.monitor.observer_gain import Gain
 from fdi_torch.monitor.observer_run import run_observers
@@ -184,6 +185,18 @@ class ObserverBank:
         typical = self.space.nominal().abs()
         width = torch.where(torch.isfinite(high - low), high - low, torch.where(typical > 0, typical, 1.0))
         return width
+
+    def search_space(self, believed: Tensor) -> ParameterSpace:
+        """The space in which changes are searched for: it goes on beyond an end that a known fault has reached, because
+        ranges are guesses, and a fault that is larger than its own would otherwise leave a residual for false ones.
+        """
+        space = self.space
+        for p, value in zip(self.space, believed.tolist(), strict=True):
+            end = end_reached(p, value)
+            if end is not None:
+                further = {"low": value - (p.high - p.low)} if end == p.low else {"high": value + (p.high - p.low)}
+                space = space.with_changes(p.name, **further)
+        return space
 
     def _lanes(self, believed: Tensor, changes: ChangeHypotheses, end: float) -> Tensor:
         """Parameter values of the switched plant for each hypothesis, (L, columns)."""

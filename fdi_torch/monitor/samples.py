@@ -12,6 +12,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Hold, Recording
 
 GAP = 10.0  # sampling intervals without a sample after which the observer restarts
+ABSENT = 100  # samples without a reading after which no level is expected from a sensor
 USUAL_QUANTILE = 0.75
 """The usual interval is this quantile of the intervals; with random intervals, ten medians would occur by chance."""
 
@@ -76,25 +77,40 @@ def usual_interval(time: Tensor) -> float:
 
 
 @dataclass(frozen=True)
+class Restart:
+    """A restart of the observer that waits for a reading of each sensor.
+
+    notice: why it restarts. readings (sensors,): the latest since the interruption, NaN where there is none yet.
+    """
+
+    notice: str
+    readings: Tensor
+
+
+@dataclass(frozen=True)
 class ClockState:
     """Clock of the samples processed so far. last: time of the last one, s. unknown_since: when an input became
-    unknown, s.
+    unknown, s. unread (sensors,): samples since the last reading of each sensor. restart: the one that is to come.
     """
 
     last: float
     unknown_since: float | None = None
+    unread: Tensor | None = None
+    restart: Restart | None = None
 
 
 def split_at_gaps(clock: ClockState, samples: Samples, usual: float) -> tuple[list[tuple[Samples, str]], ClockState]:
     """Split new samples at gaps, jumps of the clock and unknown inputs; returns the segments and the clock after them.
 
-    Each segment comes with a notice of the interruption before it, or an empty text. Repeated sample times are dropped.
-    usual: interval between samples, s. It is given rather than estimated here, so that events do not depend on later
-    samples.
+    Each segment comes with a notice of the interruption before it, or an empty text. After an interruption it begins
+    once each sensor has been read again, except those that were silent for ABSENT samples; its first sample has the
+    latest reading of each. Repeated sample times are dropped. usual: interval between samples, s. It is given rather
+    than estimated here, so that events do not depend on later samples.
     """
     inputs_known = torch.isfinite(samples.inputs).all(dim=-1)
-    segments: list[tuple[list[int], str]] = [([], "")]
-    last, unknown_since = clock.last, clock.unknown_since
+    unread = _samples_since_reading(clock.unread, samples.readings)
+    segments: list[tuple[list[int], str, Tensor | None]] = [([], "", None)]
+    last, unknown_since, restart = clock.last, clock.unknown_since, clock.restart
     for k, time in enumerate(samples.time.tolist()):
         if time == last:
             continue
@@ -103,12 +119,29 @@ def split_at_gaps(clock: ClockState, samples: Samples, usual: float) -> tuple[li
             last = time
             continue
         notice = _notice(last, time, usual, unknown_since)
-        if notice:
-            segments.append(([], notice))
-        segments[-1][0].append(k)
         last, unknown_since = time, None
-    parts = [(_rows(samples, rows), notice) for rows, notice in segments if rows]
-    return parts, ClockState(last, unknown_since)
+        if notice:
+            earlier = [restart.notice] if restart is not None else []
+            restart = Restart("; ".join([*earlier, notice]), torch.full_like(samples.readings[k], torch.nan))
+        if restart is None:
+            segments[-1][0].append(k)
+            continue
+        row = samples.readings[k]
+        restart = replace(restart, readings=torch.where(torch.isfinite(row), row, restart.readings))
+        if bool((torch.isfinite(restart.readings) | (unread[k] >= ABSENT)).all()):
+            segments.append(([k], restart.notice, restart.readings))
+            restart = None
+    parts = [(_rows(samples, rows, first), notice) for rows, notice, first in segments if rows]
+    return parts, ClockState(last, unknown_since, unread[-1] if len(unread) else clock.unread, restart)
+
+
+def _samples_since_reading(before: Tensor | None, readings: Tensor) -> Tensor:
+    """Samples since the last reading of each sensor, (S, sensors). before (sensors,): the same before the first one."""
+    count, sensors = readings.shape
+    before = torch.zeros(sensors, dtype=torch.int64) if before is None else before
+    index = torch.arange(1, count + 1).unsqueeze(-1)
+    latest = torch.where(torch.isfinite(readings), index, -before).cummax(0).values
+    return index - latest
 
 
 def _notice(last: float, time: float, usual: float, unknown_since: float | None) -> str:
@@ -121,9 +154,13 @@ def _notice(last: float, time: float, usual: float, unknown_since: float | None)
     return ""
 
 
-def _rows(samples: Samples, rows: Sequence[int]) -> Samples:
+def _rows(samples: Samples, rows: Sequence[int], first: Tensor | None) -> Samples:
+    """Some of the samples. first (sensors,): replaces the readings of the first one."""
     index = torch.tensor(list(rows))
-    return Samples(samples.time[index], samples.inputs[index], samples.readings[index], samples.hold)
+    readings = samples.readings[index]
+    if first is not None:
+        readings[0] = first
+    return Samples(samples.time[index], samples.inputs[index], readings, samples.hold)
 
 
 def concatenated(first: Samples, second: Samples) -> Samples:

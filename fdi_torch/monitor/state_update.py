@@ -60,11 +60,12 @@ def adopt_sizes(observer: ObserverBank, state: MonitorState, fit: HypothesisFit)
     return _run(observer, moved, window, before, fit.onset)
 
 
-def drop_old_samples(state: MonitorState) -> MonitorState:
-    """Remove the samples that no window can reach, once they are a quarter of all."""
-    first = max(int((state.samples.time < state.earliest_start).sum()) - 1, 0)
-    if first < 0.25 * len(state.samples):
-        return state
+def drop_old_samples(state: MonitorState, fewest: int) -> MonitorState:
+    """Remove the samples that no window can reach, except the last `fewest`.
+
+    What is kept depends on the time only, so that no result depends on how many samples are processed at once.
+    """
+    first = max(min(int((state.samples.time < state.earliest_start).sum()) - 1, len(state.samples) - fewest), 0)
     return replace(
         state,
         samples=state.samples.segment(first, len(state.samples)),

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.monitor.detection import Detector
-from fdi_torch.monitor.events import Event, Explanation, Kind, Size, amount_text
+from fdi_torch.monitor.events import Event, Explanation, Kind, size_of
 from fdi_torch.monitor.monitor import ResidualTrace
 from fdi_torch.monitor.monitor_state import MonitorState
 from fdi_torch.monitor.observer_bank import ObserverBank
@@ -84,7 +84,7 @@ class WindowMonitor:
                 events.append(
                     Event(float(segment.time[0]), "notice", notice, believed=self._off_nominal(state.believed))
                 )
-                state = replace(self.start(segment, state.believed), number=state.number)
+                state = replace(self.start(segment.segment(0, 1), state.believed), number=state.number)
                 segment = segment.segment(1, len(segment))
             while len(segment):
                 due = segment.time >= state.next_end
@@ -110,10 +110,10 @@ class WindowMonitor:
         if not state.alarmed and bool(above.any()):
             when = float(samples.time[int(above.to(torch.int8).argmax())])
             events.append(self._event(moved, when, "alarm", "the residual leaves its fault-free range"))
-        alarmed = state.alarmed or bool(above.any())
+        alarmed, fewest = state.alarmed or bool(above.any()), self._observer.whitening.order + 1
         state = replace(
             state,
-            observer=drop_old_samples(replace(moved, earliest_start=moved.now - 2.0 * self.length)),
+            observer=drop_old_samples(replace(moved, earliest_start=moved.now - 2.0 * self.length), fewest),
             alarmed=alarmed,
         )
         if moved.now < state.next_end:
@@ -158,7 +158,7 @@ class WindowMonitor:
 
     def _estimate_event(self, estimate: WindowEstimate, now: float, start: float, believed: Tensor) -> Event:
         rows = zip(self.space.parameters, estimate.value[0].tolist(), estimate.std[0].tolist(), strict=False)
-        sizes = [Size(p.name, v, s, p.unit, amount_text(p, v, s)) for p, v, s in list(rows)[: self.watched]]
+        sizes = [size_of(*row) for row in list(rows)[: self.watched]]
         text = f"{', '.join(s.shown for s in sizes)}; from {start:g} s to {now:g} s"
         return Event(
             now, "estimate", text, explanations=(Explanation(1.0, tuple(sizes)),), believed=self._off_nominal(believed)
