@@ -82,7 +82,7 @@ def localize(
         excess = max(excess, found.gain - expected)
         if not is_rounding_error(fitter, place, float(found.explained.square().mean(dim=0).max().sqrt())):
             needed, evaluated[place] = max(needed, found.gain + math.log(RARE)), found.localized(fitter)
-    before = -math.inf
+    before = needed - CONVERGED  # nothing is compared about an irrelevant discrepancy
     while evaluated and (likeliest := max(evaluated.values(), key=gain_of)).gain - before > CONVERGED:
         before = likeliest.gain
         for place, known in evaluated.items():
