@@ -71,7 +71,7 @@ class ExplanationPool:
         """Estimate noise and fit alternately until the evidence converges; keep the better explanation.
 
         Effects that were evaluated before are evaluated again only if this fit is better under the noise found then.
-        An explanation that falls too far behind those of its size that will be extended, or behind one with fewer of its
+        An explanation that falls too far behind those of its size that will be extended, or behind one with some of its
         effects, is given up, as a fit is.
         """
         before = self.explanations.get(fit.key)

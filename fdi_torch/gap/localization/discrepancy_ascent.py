@@ -119,7 +119,7 @@ class Ascent:
     def climbed(self, best: EvaluatedDiscrepancy, needed: float) -> EvaluatedDiscrepancy:
         """Noise, regressors and parameters of the fit in turn, until nothing gains or `needed` is out of reach."""
         for turn in range(MOST_TURNS):
-            before, best = best, max(best, self._with_likely_noise(best, turn == 0), key=gain_of)
+            before, best = best.gain, max(best, self._with_likely_noise(best, turn == 0), key=gain_of)
             best = self.with_finer_positions(best)
             if turn == 0 or bool((best.regressed.used & best.discrepancy.sinusoids).any()):
                 best = max(best, self._with_finer_frequency(best), key=gain_of)
@@ -128,7 +128,7 @@ class Ascent:
             # An effect at the place keeps its parameters: the discrepancy is then the error of its law.
             if all(p.location != best.location for p in self.fit.candidate.placements):
                 best = max(best, self._refitted(best), key=gain_of)
-            if best.gain - before.gain < max(CONVERGED, SHARE * (needed - best.gain)):
+            if best.gain - before < max(CONVERGED, SHARE * (needed - best.gain)):
                 break
         return best
 
@@ -168,6 +168,5 @@ class Ascent:
         """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew."""
         data, fit = self.fitter.data, known.regression.fit
         corrected = replace(data, readings=data.readings - known.explained)
-        refitter = Fitter(corrected, self.fitter.noise, known.under.whitening)
-        new = refitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
+        new = known.under.of(corrected).fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
         return self.about(new, known.explained, known.noise, known.location, known.discrepancy.frequency)
