@@ -13,6 +13,7 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.free_runs.between_runs import between_run_spread
 from fdi_torch.gap.free_runs.prediction import leave_one_file_out, predict
 from fdi_torch.gap.free_runs.refit import refit
+from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.recording import Recording
 
@@ -81,9 +82,8 @@ def test_a_refit_that_finds_no_course_of_the_levels_says_so(monkeypatch: pytest.
 
     def lost(fitter: Fitter, *asked: Any, **options: Any) -> Fit:
         fit = found(fitter, *asked, **options)
-        return replace(
-            fit, linearised=replace(fit.linearised, jacobian=torch.full_like(fit.linearised.jacobian, torch.nan))
-        )
+        broken = replace(fit.linearised, jacobian=torch.full_like(fit.linearised.jacobian, torch.nan))
+        return replace(fit, trajectory=Recomputed(lambda: broken))
 
     plant = rig()
     run = replace(recording(plant), source="a.csv")

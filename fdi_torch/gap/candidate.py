@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.parameters import ParameterName, ParameterSpace, is_effect_parameter
 from fdi_torch.plant.effect import Placement
 from fdi_torch.simulate.collocation import Linearised
@@ -31,15 +32,20 @@ class Candidate:
 class Fit:
     """The best fit of a candidate: parameters theta (P,), cost (chi-square with priors), linearised trajectory.
 
-    converged: whether less than DECREMENT remained to gain. False if the fit was given up or ran out of evaluations.
+    trajectory: computes the latter. converged: whether less than DECREMENT remained to gain. False if the fit was given
+    up or ran out of evaluations.
     """
 
     candidate: Candidate
     space: ParameterSpace
     theta: Tensor
     cost: float
-    linearised: Linearised
+    trajectory: Recomputed[Linearised]
     converged: bool
+
+    @property
+    def linearised(self) -> Linearised:
+        return self.trajectory()
 
     @property
     def values(self) -> dict[str, float]:

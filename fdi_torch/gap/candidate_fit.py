@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -20,6 +21,7 @@ from fdi_torch.estimate.kalman import KalmanWhitening
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.channel_noise import Noise, low_frequency_excess
 from fdi_torch.gap.dataset import DataSet, RecordingPart
+from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.gap.start_choice import Start, likeliest_starts, vector_of
 from fdi_torch.gap.trajectory_problem import CAP, FAR, DescentResult, TrajectoryProblem, descend
 from fdi_torch.parameters import ParameterSpace, common_name, name_in_recording
@@ -34,15 +36,23 @@ from fdi_torch.simulate.resampling import interpolate
 class Fitter:
     """Fits candidates to one data set under one noise: of the sensors, and of random flows if `whitening` is given."""
 
-    def __init__(self, data: DataSet, noise: Noise, whitening: KalmanWhitening | None = None) -> None:
-        self.data, self.noise, self.whitening = data, noise, whitening
+    def __init__(self, data: DataSet, noise: Noise, whitening: Recomputed[KalmanWhitening] | None = None) -> None:
+        self.data, self.noise, self._whitening = data, noise, whitening
         self.far = FAR * length_scale(data.plant)
+
+    @property
+    def whitening(self) -> KalmanWhitening | None:
+        return self._whitening() if self._whitening else None
+
+    def of(self, data: DataSet) -> Fitter:
+        """A fitter of other readings under the same noise."""
+        return Fitter(data, self.noise, self._whitening)
 
     @property
     def log_det(self) -> float:
         """Log determinant of the covariance that `whiten` reduces to the identity, over all readings."""
-        if self.whitening:
-            return self.whitening.log_det
+        if whitening := self.whitening:
+            return whitening.log_det
         return float((2.0 * torch.log(self.noise.innovation) * self.data.mask.sum(dim=0)).sum())
 
     def engine(
@@ -111,13 +121,15 @@ class Fitter:
         levels = torch.cat(guesses) if guesses else self.first_trajectory(engine, theta)
         descents = self.descend(engine, theta, levels, target, cap)
         best = int(torch.nan_to_num(descents.cost, nan=torch.inf).argmin())
+        lane = slice(best, best + 1)
         linearised = descents.linearised.lanes(torch.tensor([best]))
+        trajectory = partial(engine.linearise, descents.theta[lane], linearised.origin)
         return Fit(
             candidate,
             engine.space,
             descents.theta[best],
             float(descents.cost[best]),
-            linearised,
+            Recomputed(trajectory, linearised),
             bool(descents.converged[best]),
         )
 
@@ -212,7 +224,7 @@ class Fitter:
 
     def whiten(self, x: Tensor) -> Tensor:
         """Whiten x (*lanes, S, C) or (*lanes, S, C, P): unit variance, no correlation."""
-        return self.whitening(x) if self.whitening else self.noise.whiten(x, self.data.mask)
+        return whitening(x) if (whitening := self.whitening) else self.noise.whiten(x, self.data.mask)
 
     def priors(self, space: ParameterSpace, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Scales of the parameters (P,), and their normal priors in these scales: root of the precision (P,), and

@@ -71,13 +71,14 @@ class ExplanationPool:
         """Estimate noise and fit alternately until the evidence converges; keep the better explanation.
 
         Effects that were evaluated before are evaluated again only if this fit is better under the noise found then.
-        An explanation that falls too far behind those of its size that will be extended is given up, as a fit is.
+        An explanation that falls too far behind those of its size that will be extended, or behind one with some of its
+        effects, is given up, as a fit is.
         """
         before = self.explanations.get(fit.key)
         if before and before.fitter.cost(fit) > before.fit.cost - CONVERGED:
             return before
-        rivals = self.best_of(len(fit.key))[BEAM - 1 :]
-        rival = rivals[0].log_evidence if rivals else -math.inf
+        rivals = self.best_of(len(fit.key))[BEAM - 1 :] + [e for k, e in self.explanations.items() if k < fit.key]
+        rival = max((e.log_evidence for e in rivals), default=-math.inf)
         best: RankedExplanation | None = None
         climb = False
         while True:

@@ -63,10 +63,11 @@ class HypothesisSearch:
         least = likeliest(hypotheses).weight + math.log(RARE)
         return hypotheses + [law for h in hypotheses if h.weight > least for law in self._with_inexact_laws(h)]
 
-    def alone(self, explanation: RankedExplanation) -> CauseHypothesis:
+    def alone(self, explanation: RankedExplanation, best: float) -> CauseHypothesis:
         """An explanation without a discrepancy, linearised about the levels that it predicts, where discrepancies are:
-        their gains shall not contain that of another point."""
-        gain = localize(explanation.fitter, explanation.fit, explanation.noise, (), math.inf).itself
+        their gains shall not contain that of another point. best: weight of the likeliest explanation."""
+        needed = best + math.log(RARE) - explanation.log_weight
+        gain = localize(explanation.fitter, explanation.fit, explanation.noise, (), needed).itself
         return CauseHypothesis(explanation, causes_in_order(explanation.fit), explanation.log_weight + gain)
 
     def _with_discrepancies(
@@ -242,7 +243,7 @@ def _without_discrepancy(h: CauseHypothesis, at: LocalizedDiscrepancy) -> Fitter
     """Fitter of the readings without what the discrepancy of a hypothesis explains, under the noise that this left."""
     under = with_disturbances(h.explanation.fitter, at.fit, at.noise)
     corrected = replace(under.data, readings=under.data.readings - at.explained)
-    return Fitter(corrected, under.noise, under.whitening)
+    return under.of(corrected)
 
 
 def _names_unknown(known: RankedExplanation, h: CauseHypothesis) -> bool:

@@ -23,6 +23,7 @@ from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation, Linearised
 from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
@@ -51,8 +52,12 @@ def with_estimated_noise(
 
 def with_disturbances(fitter: Fitter, fit: Fit, noise: StateNoise, linearised: Linearised | None = None) -> Fitter:
     """The fitter with this disturbance noise, propagated along a linearised trajectory, by default that of the fit."""
-    whitening = KalmanWhitening(propagation_of(fitter, fit, linearised or fit.linearised), _sensors(fitter), noise)
-    return Fitter(fitter.data, fitter.noise, whitening)
+
+    def whitening() -> KalmanWhitening:
+        along = propagation_of(fitter, fit, linearised or fit.linearised)
+        return KalmanWhitening(along, _sensors(fitter), noise)
+
+    return Fitter(fitter.data, fitter.noise, Recomputed(whitening))
 
 
 def estimate_disturbances(
@@ -89,9 +94,10 @@ def predicted_levels(fitter: Fitter, fit: Fit) -> Tensor:
     rates, would explain random flows.
     """
     data, levels = fitter.data, fit.linearised.levels.clone()
-    if fitter.whitening is None:
+    whitening = fitter.whitening
+    if whitening is None:
         return levels
-    correction = fitter.whitening.predicted(data.readings - fit.linearised.readings[0])
+    correction = whitening.predicted(data.readings - fit.linearised.readings[0])
     first = 0
     for part, rows in zip(data.parts, data.rows, strict=True):
         nodes = part.experiment.nodes

@@ -96,9 +96,10 @@ def _count(fitter: Fitter) -> int:
 
 def detection_time(fitter: Fitter) -> float:
     """The shortest time t (s) after which the readings show a random flow; infinite if these are forgotten sooner."""
-    if fitter.whitening is None:
+    whitening = fitter.whitening
+    if whitening is None:
         return math.inf
-    propagation, noise = fitter.whitening.propagation, fitter.whitening.noise
+    propagation, noise = whitening.propagation, whitening.noise
     areas = torch.tensor([t.area for t in fitter.data.plant.tanks], dtype=torch.float64)
     sensitivity = propagation.output.abs().amax(dim=0)[:, : len(areas)]
     std = fitter.noise.std * noise.scale

@@ -123,8 +123,7 @@ class TrajectoryProblem:
     ) -> TrialTrajectory:
         """The trajectories at theta, a `step` away from `known` or from `near`."""
         linearised, far = _fitted(known).linearised, self.objective.far
-        shift = (linearised.slopes * step[:, None, None, :]).sum(-1)
-        guess = (near or linearised).levels + shift
+        guess = (near or linearised).levels + _along(linearised.slopes, step)
         levels, defect = corrected_trajectories(self.engine, theta, guess, far)
         readings = self.engine.read(levels, theta)
         cost = 0.5 * self.objective.chi_square(self.engine.space, theta, self.objective.residual(readings))
@@ -135,7 +134,7 @@ class TrajectoryProblem:
     def bend(self, known: Linearisation, trial: TrialTrajectory, step: Tensor) -> Tensor:
         """J'c (L, P) for the second-order change c of the whitened readings along the step; priors are linear."""
         here = _fitted(known)
-        linear = here.linearised.readings + (here.linearised.jacobian * step[:, None, None, :]).sum(-1)
+        linear = here.linearised.readings + _along(here.linearised.jacobian, step)
         bend = self.objective.whiten(trial.readings - linear)
         return (here.jacobian.flatten(1, 2).mT @ bend.flatten(1).unsqueeze(-1)).squeeze(-1)
 
@@ -190,6 +189,15 @@ def descend(
 def _fitted(model: Linearisation) -> FittedTrajectory:
     assert isinstance(model.state, FittedTrajectory)
     return model.state
+
+
+def _along(slopes: Tensor, step: Tensor) -> Tensor:
+    """Change (L, S, C) along a step (L, P), given slopes (L, S, C, P); parameter by parameter, without products of the
+    size of all slopes."""
+    total = torch.zeros_like(slopes[..., 0])
+    for by, change in zip(slopes.unbind(-1), step.unbind(-1), strict=True):
+        total.addcmul_(by, change[:, None, None])
+    return total
 
 
 def corrected_trajectories(engine: Engine, theta: Tensor, guess: Tensor, far: float) -> tuple[Tensor, Tensor]:

@@ -45,7 +45,8 @@ class Linearised:
     levels (L, K+1, n) m: the corrected trajectory of the n = `network.order` states, the tanks' levels first; slopes
     (L, K+1, n, P): its sensitivity. readings (L, S, C) and jacobian (L, S, C, P): the same at the sensors. transition
     (L, K, n, n) and gain (L, K, n, n): a disturbance w of the rates over step k adds gain_k w to the next state, and
-    transition propagates it. defect (L,): the largest correction of a state, m.
+    transition propagates it. defect (L,): the largest correction of a state, m. origin (L, K+1, n) m: the trajectory
+    before the correction, about which it is linearised.
     """
 
     levels: Tensor
@@ -55,6 +56,7 @@ class Linearised:
     transition: Tensor
     gain: Tensor
     defect: Tensor
+    origin: Tensor
 
     def lanes(self, which: Tensor) -> Linearised:
         """The selected lanes (indices or a mask)."""
@@ -118,6 +120,7 @@ class Collocation:
             transition.permute(0, 3, 1, 2),
             gain.permute(0, 3, 1, 2),
             defect,
+            path.movedim(2, 1),
         )
 
     def corrected(self, theta: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:

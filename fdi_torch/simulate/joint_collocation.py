@@ -83,7 +83,7 @@ class JointCollocation:
         pieces = zip(self.parts, self._own(theta), self._split(near.levels), transition, gain, strict=True)
         nothing = near.defect.new_zeros(0)
         return [
-            (part, columns, Linearised(levels, nothing, nothing, nothing, t, g, near.defect))
+            (part, columns, Linearised(levels, nothing, nothing, nothing, t, g, near.defect, nothing))
             for part, columns, levels, t, g in pieces
         ]
 
@@ -108,6 +108,7 @@ class JointCollocation:
             transition=with_blanks([f.transition for f in parts]),
             gain=with_blanks([f.gain for f in parts]),
             defect=torch.stack([f.defect for f in parts]).amax(dim=0),
+            origin=torch.cat([f.origin for f in parts], dim=1),
         )
 
     def _spread(self, slopes: Tensor, recording: int) -> Tensor:

@@ -87,12 +87,18 @@ class Ascent:
         self.largest, self.generator = largest_influence(fitter), torch.Generator().manual_seed(0)
 
     def evaluate(
-        self, regression: DiscrepancyRegression, discrepancy: Discrepancy, place: str, noise: StateNoise
+        self,
+        regression: DiscrepancyRegression,
+        discrepancy: Discrepancy,
+        place: str,
+        noise: StateNoise,
+        start: Tensor | None = None,
     ) -> EvaluatedDiscrepancy:
+        """The discrepancy under one noise. start (M,): precisions of its columns from which the regression starts."""
         fit = regression.fit
         under = with_disturbances(self.fitter, fit, noise, discrepancy.linearised)
         whitened = WhitenedDiscrepancy(under, fit, discrepancy)
-        regressed = whitened.sparse_fit(column_costs(discrepancy.choices, self.largest))
+        regressed = whitened.sparse_fit(column_costs(discrepancy.choices, self.largest), start)
         without = log_likelihood(under, fit, discrepancy.linearised) + noise.log_prior() - self.base
         return EvaluatedDiscrepancy(place, noise, under, regression, discrepancy, whitened, regressed, without)
 
@@ -113,15 +119,16 @@ class Ascent:
     def climbed(self, best: EvaluatedDiscrepancy, needed: float) -> EvaluatedDiscrepancy:
         """Noise, regressors and parameters of the fit in turn, until nothing gains or `needed` is out of reach."""
         for turn in range(MOST_TURNS):
-            before, best = best, max(best, self._with_likely_noise(best, turn == 0), key=gain_of)
+            before, best = best.gain, max(best, self._with_likely_noise(best, turn == 0), key=gain_of)
             best = self.with_finer_positions(best)
-            best = max(best, self._with_finer_frequency(best), key=gain_of)
+            if turn == 0 or bool((best.regressed.used & best.discrepancy.sinusoids).any()):
+                best = max(best, self._with_finer_frequency(best), key=gain_of)
             if best.gain < SHARE * (needed - best.gain):
                 break
             # An effect at the place keeps its parameters: the discrepancy is then the error of its law.
             if all(p.location != best.location for p in self.fit.candidate.placements):
                 best = max(best, self._refitted(best), key=gain_of)
-            if best.gain - before.gain < max(CONVERGED, SHARE * (needed - best.gain)):
+            if best.gain - before < max(CONVERGED, SHARE * (needed - best.gain)):
                 break
         return best
 
@@ -147,7 +154,7 @@ class Ascent:
     def _changed(self, known: EvaluatedDiscrepancy, discrepancy: Discrepancy) -> EvaluatedDiscrepancy:
         """The same with a discrepancy that differs in some columns."""
         whitened = known.whitened.with_columns(discrepancy.columns)
-        regressed = whitened.sparse_fit(column_costs(discrepancy.choices, self.largest))
+        regressed = whitened.sparse_fit(column_costs(discrepancy.choices, self.largest), known.regressed.precision)
         return replace(known, discrepancy=discrepancy, whitened=whitened, regressed=regressed)
 
     def _with_likely_noise(self, known: EvaluatedDiscrepancy, climb: bool) -> EvaluatedDiscrepancy:
@@ -155,12 +162,11 @@ class Ascent:
         further = LinearParameters(at.columns[used], torch.sqrt(known.regressed.precision[used]))
         fit = known.regression.fit
         likely = estimate_disturbances(self.fitter, fit, at.linearised, further, known.noise, climb).noise
-        return self.evaluate(known.regression, at, known.location, likely)
+        return self.evaluate(known.regression, at, known.location, likely, known.regressed.precision)
 
     def _refitted(self, known: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
         """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew."""
         data, fit = self.fitter.data, known.regression.fit
         corrected = replace(data, readings=data.readings - known.explained)
-        refitter = Fitter(corrected, self.fitter.noise, known.under.whitening)
-        new = refitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
+        new = known.under.of(corrected).fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
         return self.about(new, known.explained, known.noise, known.location, known.discrepancy.frequency)

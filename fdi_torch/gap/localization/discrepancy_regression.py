@@ -24,7 +24,7 @@ from fdi_torch.gap.localization.component_regressors import (
     fine_reading_regressors,
     reading_regressors,
 )
-from fdi_torch.gap.localization.regressors import harmonics, time_functions
+from fdi_torch.gap.localization.regressors import harmonics, step_functions, time_functions
 from fdi_torch.gap.marginal_likelihood import predicted_levels
 from fdi_torch.plant.description import OUTSIDE, Sensor
 from fdi_torch.plant.scales import time_scale
@@ -33,7 +33,7 @@ from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
 from fdi_torch.simulate.resampling import interpolate
 from fdi_torch.simulate.scan import product, scan_in_time
 
-SAMPLES_A_STEP = 9  # fewest samples per step function of time
+BATCH = 64  # regressors whose influence is computed together
 
 
 @dataclass(frozen=True)
@@ -156,15 +156,14 @@ class DiscrepancyRegression:
         self.linearised = self.engine.linearise(self.theta, self.levels)
         self.pieces = self._pieces(replace(self.linearised, levels=self.levels))
         self._last: tuple[str, list[Regressors], Linearised] | None = None
-        parts, samples = len(self.pieces), len(fitter.data.readings)
-        self.steps = max(min(steps, samples // SAMPLES_A_STEP) // parts, 2)
+        self.steps = step_functions(steps, len(fitter.data.readings), len(self.pieces))
 
     def of(self, place: str) -> Discrepancy:
         regressors, linearised = self.at(place)
         shared = [self.influence(place, k, r.functions) for k, r in enumerate(regressors)]
         for k, r in enumerate(regressors):
             if r.areas is not None:
-                shared[k] = torch.cat([self._influence_of_areas(place, k, r.areas), shared[k]], dim=-1)
+                shared[k] = side_by_side([self._influence_of_areas(place, k, r.areas), shared[k]])
         grid = _concatenated(shared, [self.influence(place, k, r.in_time) for k, r in enumerate(regressors)])
         frequency, columns = None, Columns((grid,))
         if len(self.frequencies):
@@ -205,7 +204,8 @@ class DiscrepancyRegression:
         piece, channel = self.pieces[recording], self.sensor(place)
         if channel is None:
             component = discrepancy_model_at(place, self.fitter.data.plant)
-            return piece.to_readings(self._rate_changes(piece, component, functions))
+            rates = (self._rate_changes(piece, component, some) for some in functions.split(BATCH))
+            return side_by_side([piece.to_readings(some) for some in rates])
         columns = functions.new_zeros(functions.shape[1], self.fitter.data.readings.shape[1], len(functions))
         columns[:, channel] = functions.T
         return columns
@@ -287,5 +287,10 @@ def _concatenated(shared: Sequence[Tensor], per_recording: Sequence[Tensor]) -> 
     rows, widths = [], [o.shape[-1] for o in per_recording]
     for k, (s, o) in enumerate(zip(shared, per_recording, strict=True)):
         before, after = (o.new_zeros(*o.shape[:-1], sum(w)) for w in (widths[:k], widths[k + 1 :]))
-        rows.append(torch.cat([s, before, o, after], dim=-1))
+        rows.append(side_by_side([s, before, o, after]))
     return with_blanks(rows, dim=0)
+
+
+def side_by_side(columns: Sequence[Tensor]) -> Tensor:
+    """Columns (S, ..., .) in one tensor (S, ..., M), with time last in memory."""
+    return torch.cat([c.movedim(0, -1) for c in columns], dim=-2).movedim(-1, 0)

@@ -30,7 +30,7 @@ from fdi_torch.gap.localization.single_regressor_gain import (
     strengths_of,
     whitened_residual,
 )
-from fdi_torch.gap.localization.sparse_regression import column_costs
+from fdi_torch.gap.localization.sparse_regression import COLLINEAR, VISIBLE, column_costs
 from fdi_torch.simulate.joint_collocation import with_blanks
 
 TRIED = 8  # positions with the largest estimated gains, whose gains are computed exactly
@@ -129,8 +129,9 @@ def with_best_frequency(
         columns = regression.sinusoids(place, frequencies)
         white = without(basis, under.whiten(columns.flatten(2)).flatten(0, 1))
         white = white.unflatten(1, columns.shape[2:]).transpose(0, 1)  # (F, S C + P, W)
-        explained = torch.linalg.qr(white)[0].mT @ residual
-        best = int(explained.square().sum(dim=(1, 2)).argmax())
+        score, gram = white.mT @ residual, white.mT @ white
+        gram = gram + torch.diag_embed(COLLINEAR * torch.diagonal(gram, dim1=1, dim2=2) + VISIBLE)
+        best = int((score * torch.linalg.solve(gram, score)).sum(dim=(1, 2)).argmax())
         frequency = float(frequencies[best])
     return discrepancy.with_sinusoids(frequency, columns[:, :, best])
 

@@ -28,7 +28,7 @@ from fdi_torch.gap.localization.localized_discrepancy import (
     nearly_without_disturbances,
 )
 from fdi_torch.gap.localization.random_processes import drifting_sensors, random_flows
-from fdi_torch.gap.localization.regressors import dominant_frequency
+from fdi_torch.gap.localization.regressors import dominant_frequency, step_functions
 from fdi_torch.gap.localization.single_regressor_gain import SingleRegressorGains
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, occam, with_disturbances
 
@@ -57,15 +57,18 @@ def localize(
     fitter: with the disturbance noise of the fit. needed: gain in log evidence below which a discrepancy is irrelevant;
     there are none in the result if none can reach it. rival: the noise that a likelier hypothesis left.
     """
+    base = log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
+    scale = torch.minimum(noise.scale, rival.scale) if rival else noise.scale
+    hopeless = _evidence_bound(fitter, fit, replace(noise, scale=scale)) - base < needed
+    if hopeless and not places:
+        return Localization((), 0.0)
     frequency = dominant_frequency(fitter.residual(fit.linearised.readings)[0], fitter.data.row_spacing)
     regression = DiscrepancyRegression(fitter, fit, frequency, STEPS)
-    base = log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     if not math.isfinite(base + log_evidence(fitter, fit, noise, regression.linearised)):
         return Localization((), 0.0)
     likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
     itself = max(log_evidence(fitter, fit, likely, regression.linearised) - base, 0.0)
-    scale = torch.minimum(noise.scale, rival.scale) if rival else noise.scale
-    if _evidence_bound(fitter, fit, replace(noise, scale=scale), regression.steps) - base < needed:
+    if hopeless or not places:
         return Localization((), itself)
     ascent = Ascent(fitter, fit, noise, base)
     starts = [likely, nearly_without_disturbances(likely)]
@@ -82,7 +85,7 @@ def localize(
         excess = max(excess, found.gain - expected)
         if not is_rounding_error(fitter, place, float(found.explained.square().mean(dim=0).max().sqrt())):
             needed, evaluated[place] = max(needed, found.gain + math.log(RARE)), found.localized(fitter)
-    before = -math.inf
+    before = needed - CONVERGED  # nothing is compared about an irrelevant discrepancy
     while evaluated and (likeliest := max(evaluated.values(), key=gain_of)).gain - before > CONVERGED:
         before = likeliest.gain
         for place, known in evaluated.items():
@@ -141,15 +144,17 @@ def _first_order_gains(
     }
 
 
-def _evidence_bound(fitter: Fitter, fit: Fit, noise: StateNoise, choices: int) -> float:
+def _evidence_bound(fitter: Fitter, fit: Fit, noise: StateNoise) -> float:
     """Upper bound of the log evidence of a discrepancy in addition to a fit.
 
     It is that of one regressor that explains everything except sensor noise. A regressor that reduces chi-square by G
-    costs (1 + log G) / 2 nats at its most likely precision, plus log(choices) for its selection.
+    costs (1 + log G) / 2 nats at its most likely precision, plus the logarithm of the number of steps in time for its
+    selection.
     """
     undisturbed = with_disturbances(fitter, fit, replace(noise, intensity=torch.zeros_like(noise.intensity)))
     count, residual = int(fitter.data.mask.sum()), undisturbed.residual(fit.linearised.readings)
-    cost = 0.5 * (1.0 + math.log(max(float(residual.square().sum()) - count, 1.0))) + math.log(choices)
+    steps = step_functions(STEPS, len(fitter.data.readings), len(fitter.data.parts))
+    cost = 0.5 * (1.0 + math.log(max(float(residual.square().sum()) - count, 1.0))) + math.log(steps)
     # The parameters are determined no better than with the disturbances.
     return (
         -0.5 * count

@@ -55,9 +55,9 @@ def random_flows(
 
 def _moved(fitter: Fitter, linearised: Linearised) -> float:
     """Norm of the change of the readings by the disturbances, in units of the sensor noise."""
-    assert fitter.whitening is not None
-    plant = fitter.data.plant
-    moved = fitter.whitening.smoothed(fitter.data.readings - linearised.readings[0])
+    whitening, plant = fitter.whitening, fitter.data.plant
+    assert whitening is not None
+    moved = whitening.smoothed(fitter.data.readings - linearised.readings[0])
     names = [t.name for t in plant.tanks]
     of_sensors = moved[:, [names.index(s.tank) for s in plant.sensors]]
     return float(torch.linalg.vector_norm(torch.where(fitter.data.mask, of_sensors, 0.0) / fitter.noise.std))

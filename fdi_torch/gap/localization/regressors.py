@@ -25,6 +25,7 @@ STICTION_BANDS = (0.1, 0.2, 0.3, 0.4)  # as shares of the signal's range
 TRAVEL_TIMES = (8.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # s, through the full range at the rate limit
 FATIGUE_TIMES = (150.0, 500.0)  # s, of the mean of a flow's recent past that changes it
 RAMPS = 12  # ramps in time, at equal distances
+SAMPLES_A_STEP = 9  # fewest samples per step function of time
 HARMONICS = 3  # of a dominant frequency of the residual
 
 
@@ -76,6 +77,11 @@ def fatigues(x: Tensor, step: Tensor, ends: tuple[float, float], scale: float) -
     """Efficiency that falls with recent use: x times its own recent mean, over the largest |x|."""
     largest = max(abs(ends[0]), abs(ends[1]), 1e-12)
     return [x * lagged(x, step, scale * tau) / largest for tau in FATIGUE_TIMES]
+
+
+def step_functions(most: int, samples: int, recordings: int) -> int:
+    """Number of step functions of time in each recording. most: in all recordings, of so many samples, together."""
+    return max(min(most, samples // SAMPLES_A_STEP) // recordings, 2)
 
 
 def time_functions(time: Tensor, duration: float, steps: int) -> list[Tensor]:

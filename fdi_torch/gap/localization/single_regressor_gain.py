@@ -156,8 +156,9 @@ def adjoints_of(regression: DiscrepancyRegression, under: Fitter, columns: Tenso
 def _whitened_adjoint(under: Fitter, columns: Tensor, basis: Tensor) -> Tensor:
     remaining = without(basis, columns)
     shape = under.data.mask.shape
-    assert under.whitening is not None
-    return under.whitening.transposed(remaining[: shape.numel()].reshape(*shape, -1))
+    whitening = under.whitening
+    assert whitening is not None
+    return whitening.transposed(remaining[: shape.numel()].reshape(*shape, -1))
 
 
 def inflow_weights(regression: DiscrepancyRegression, place: str, adjoints: Adjoints) -> list[Tensor]:

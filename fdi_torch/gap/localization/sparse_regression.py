@@ -58,12 +58,18 @@ def column_costs(choices: Tensor, largest: float) -> Tensor:
     return torch.log(choices) + math.log(max(math.log(largest) / math.sqrt(math.pi), 1.0))
 
 
-def sparse_fit(gram: Tensor, score: Tensor, costs: Tensor) -> SparseFit:
-    """Solve the regression with gram (M, M) = C'C and score (M,) = C'r. costs (M,): of using each column."""
+def sparse_fit(gram: Tensor, score: Tensor, costs: Tensor, start: Tensor | None = None) -> SparseFit:
+    """Solve the regression with gram (M, M) = C'C and score (M,) = C'r.
+
+    costs (M,): of using each column. start: precisions of the first columns from which the ascent starts.
+    """
     size = torch.diagonal(gram).clamp(min=0.0)
     visible, size = size > VISIBLE, torch.sqrt(size.clamp(min=VISIBLE))
     unit, target = gram / size.unsqueeze(1) / size, score / size
     precision = torch.full_like(target, math.inf)
+    if start is not None:
+        known = slice(len(start))
+        precision[known] = torch.where(visible[known], start / size[known].square(), math.inf)
     for _ in range(MOST_CHANGES if len(target) else 0):
         gain, updated = _changes(unit, target, precision, costs)
         gain = torch.where(visible, gain, -math.inf)

@@ -18,62 +18,84 @@ MOST_ROWS = 1000  # rows per channel from which columns are selected; more sampl
 
 
 @dataclass(frozen=True)
-class NormalEquations:
-    """gram (M, M) = C'C and score (M,) = C'r of columns C and the residual r."""
+class _Projection:
+    """Rows from which the parameters of a fit are projected out: sums of groups of samples, and the parameters' priors.
 
-    gram: Tensor
-    score: Tensor
+    group: samples in a sum. basis (R, P): of the parameters' influence. residual (R, 1): what it leaves.
+    """
+
+    group: int
+    basis: Tensor
+    residual: Tensor
+
+    @staticmethod
+    def of(group: int, residual: Tensor, jacobian: Tensor, pull: Tensor, off: Tensor) -> _Projection:
+        """residual (S, C) and jacobian (S, C, P): whitened. pull, off (P,): of the priors, as in `decomposed`."""
+        basis, _ = decomposed(_grouped(jacobian, group), pull)
+        rows = torch.cat([_grouped(residual.unsqueeze(-1), group), -off.unsqueeze(1)])
+        return _Projection(group, basis, without(basis, rows))
+
+    def remaining(self, columns: Tensor) -> Tensor:
+        """What is left (R, M) of whitened columns (S, C, M)."""
+        return without(self.basis, _grouped(columns, self.group))
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Columns (S, C, M), the same whitened, and what the projection for the selection leaves of them (R, M)."""
+
+    columns: Tensor
+    white: Tensor
+    remaining: Tensor
 
 
 class WhitenedDiscrepancy:
     """The columns of a discrepancy and the residual under one noise, with the parameters of a fit projected out.
 
-    columns (S C, M) and residual (S C,): whitened by the fitter `under`, not projected.
+    Columns are selected with samples summed in groups. A group is shorter than any regressor's changes. What a sum of
+    its samples leaves out is little of the residual, but may be many nats if the residual is large: it serves to select
+    columns, not to weigh them.
     """
 
     def __init__(self, under: Fitter, fit: Fit, discrepancy: Discrepancy) -> None:
         residual, jacobian = under.white(discrepancy.linearised)
-        scale, self._pull, self._off = under.priors(fit.space, fit.theta)
-        self._under, self._residual, self._jacobian = under, residual[0], jacobian[0] * scale
-        self._white = {id(block): (block, under.whiten(block)) for block in discrepancy.columns.blocks}
+        scale, pull, off = under.priors(fit.space, fit.theta)
+        groups = max(len(residual[0]) // MOST_ROWS, 1), 1
+        self._selecting, self._exact = (
+            _Projection.of(group, residual[0], jacobian[0] * scale, pull, off) for group in groups
+        )
+        self._under, self._products = under, dict[tuple[_Block, _Block], Tensor]()
+        self._blocks = list(map(self._block, discrepancy.columns.blocks))
+
+    def _block(self, columns: Tensor) -> _Block:
+        white = self._under.whiten(columns)
+        return _Block(columns, white, self._selecting.remaining(white))
 
     def with_columns(self, columns: Columns) -> WhitenedDiscrepancy:
         """The same with other columns (S, C, M), of which only new blocks are whitened."""
-        other = copy(self)
-        other._white = {id(b): self._white.get(id(b)) or (b, self._under.whiten(b)) for b in columns.blocks}
+        other, known = copy(self), {id(b.columns): b for b in self._blocks}
+        other._blocks = [known.get(id(columns)) or self._block(columns) for columns in columns.blocks]
         return other
 
-    @property
-    def _columns(self) -> Columns:
-        return Columns(tuple(white for _, white in self._white.values()))
+    def _product(self, a: _Block, b: _Block) -> Tensor:
+        if (a, b) not in self._products:
+            self._products[a, b] = a.remaining.T @ b.remaining
+            self._products[b, a] = self._products[a, b].T
+        return self._products[a, b]
 
-    def normal_equations(self, used: Tensor | None = None) -> NormalEquations:
-        """Of some columns, used (M,) bool, with all samples; or of all, with samples summed in groups.
-
-        A group is shorter than any regressor's changes. What a sum of its samples leaves out is little of the residual,
-        but may be many nats if the residual is large: it serves to select columns, not to weigh them.
-        """
-        blocks = self._columns.blocks if used is None else [self._columns[used]]
-        group = max(len(self._residual) // MOST_ROWS, 1) if used is None else 1
-        r, j, *grouped = (
-            _grouped(x, group).flatten(0, 1) for x in (self._residual[..., None], self._jacobian, *blocks)
-        )
-        c = torch.cat(grouped, dim=-1)
-        basis, _ = decomposed(j, self._pull)
-        of_priors = torch.nn.functional.pad(-self._off.unsqueeze(1), (c.shape[1], 0))
-        remaining = without(basis, torch.cat([torch.cat([c, r], dim=1), of_priors]))
-        products = remaining.T @ remaining
-        return NormalEquations(products[:-1, :-1], products[:-1, -1])
-
-    def sparse_fit(self, costs: Tensor) -> SparseFit:
-        """Sparse regression on the columns. costs (M,): of using each."""
-        selecting = self.normal_equations()
-        used = sparse_fit(selecting.gram, selecting.score, costs).used
-        exact = self.normal_equations(used)
-        return sparse_fit(exact.gram, exact.score, costs[used]).among(used)
+    def sparse_fit(self, costs: Tensor, start: Tensor | None = None) -> SparseFit:
+        """Sparse regression on the columns. costs (M,): of using each. start: precisions of the first columns."""
+        gram = torch.cat([torch.cat([self._product(a, b) for b in self._blocks], dim=1) for a in self._blocks])
+        score = torch.cat([(b.remaining.T @ self._selecting.residual).squeeze(1) for b in self._blocks])
+        selected = sparse_fit(gram, score, costs, start)
+        used = selected.used
+        columns = self._exact.remaining(Columns(tuple(b.white for b in self._blocks))[used])
+        score = (columns.T @ self._exact.residual).squeeze(1)
+        return sparse_fit(columns.T @ columns, score, costs[used], selected.precision[used]).among(used)
 
 
 def _grouped(x: Tensor, each: int) -> Tensor:
-    """Sums (S / each, ...) of groups of samples of x (S, ...), scaled to unit variance."""
+    """Sums (S / each C, M) of groups of samples of x (S, C, M), scaled to unit variance."""
     groups = len(x) // each
-    return x[: groups * each].reshape(groups, each, *x.shape[1:]).sum(dim=1) / each**0.5
+    sums = x if each == 1 else x[: groups * each].reshape(groups, each, *x.shape[1:]).sum(dim=1) / each**0.5
+    return sums.flatten(0, 1)
