@@ -194,13 +194,12 @@ def test_what_is_said_of_an_interrupted_job_is_true(
     folder, ended, complaints = struck_before_its_end(job, tmp_path, number)
     assert (ended, complaints.count("\n")) == (code, 1)
     log = log_of(folder)
-    again = "starts again from the beginning; it cannot be resumed"
-    going_on = "--resume goes on from there" if job.name in RESUMED else again
+    anew = "starts again from the beginning; it cannot be resumed"
+    going_on = "--resume goes on from there" if job.name in RESUMED else anew
     word = "interrupted" if number == signal.SIGINT else "terminated"
     kept = f"what was computed until now is in {log}"
-    assert (
-        complaints == f"fdi {job.words[0]}: {word}; {kept}; the same command {'with ' * (job.name in RESUMED)}{going_on}\n"
-    )
+    again = f"the same command {'with ' * (job.name in RESUMED)}{going_on}"
+    assert complaints == f"fdi {job.words[0]}: {word}; {kept}; {again}\n"
     assert read_run(log).metadata["fdi_torch.status"]["status"] == "interrupted"
     expect_whole(folder)
     expect_the_same_end(job, folder, capsys)
