@@ -118,6 +118,10 @@ def scored(case: Case, events: Sequence[Event]) -> dict[str, float]:
         count["certain, wrong"] += not held and str(e.state) == "isolated"
         count["certain"] += str(e.state) == "isolated"
         count["certain by its own probability"] += first[0].mass * (str(e.state) == "isolated")
+        if e.faults == (case.name,):
+            [size] = first[0].sizes
+            count["sizes"] += 1
+            count["sizes within three standard errors"] += abs(size.size - case.size_at(e.time)) <= 3.0 * size.std
     return count
 
 

@@ -63,6 +63,10 @@ class Case:
     def size(self) -> float:
         return SIZES[self.fault] * self.share if self.fault else 0.0
 
+    def size_at(self, time: float) -> float:
+        """Value of the faulty parameter at a time (s), in SI: a factor differs from 1 by the size."""
+        return self.name.endswith(".factor") + self.size * float(_grown(time, self.onset, self.ramp))
+
 
 def recordings(cases: Sequence[Case], step: float = STEP) -> list[tuple[Recording, Array]]:
     """Recording and true levels (T, N) m of each case, all simulated together."""
