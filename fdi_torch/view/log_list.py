@@ -81,9 +81,9 @@ def _read(name: str, path: Path, running: bool) -> Entry:
     try:
         log = read_run(path, salvage=True)
         material = gather(log, plant_of(log, []))
-        error, unit = residual_size(material)
+        error, unit, sensor = residual_size(material)
         with material.in_its_units():
-            error_text = amount(error, unit, 3) if error == error else ""
+            error_text = amount(error, unit, 3, sensor) if error == error else ""
         status = material.about("status").get("status", NO_END).replace("_", " ")
         started = material.about("run").get("started", "")[:19].replace("T", " ")
         state, verdict = (RUNNING, progress_of(material).text) if running else (status, headline(material))

@@ -235,7 +235,7 @@ def test_logs_without_an_error_come_last_in_both_directions(tmp_path: Path) -> N
 
 
 def test_the_error_is_the_root_mean_square_of_the_residuals(tmp_path: Path) -> None:
-    size, unit = residual_size(gather(read_run(write_fit(tmp_path / "a.mcap", 0.02))))
+    size, unit, _ = residual_size(gather(read_run(write_fit(tmp_path / "a.mcap", 0.02))))
     assert size == pytest.approx(0.02, rel=1e-12) and unit == "m"
     log = read_run(DATA / "log_format_1_monitor.mcap")
     columns = [[m.payload[name] for m in log.messages(["/observer/residual"])] for name in ("h1", "h2", "h3")]
