@@ -38,6 +38,7 @@ def report_of(material: Material, makers: Sequence[Maker] = SECTIONS) -> RunRepo
     return RunReport(material, tuple(section for section in made if section is not None))
 
 
+_WITHIN_DATE = re.compile(r"(?<=\d)-(?=\d)")
 _WITHIN_NUMBER = re.compile(r" (?=[±%])|(?<=±) |(?<=\d) (?=[^\s\d]{1,8}(?:[),;.]|$))")
 
 
@@ -86,8 +87,8 @@ def _article(report: RunReport, prefix: str) -> Markup:
 
 
 def unbroken(sentence: str) -> str:
-    """The sentence with spaces at which no line ends within a number with its error and unit."""
-    return _WITHIN_NUMBER.sub("\u00a0", sentence)
+    """The sentence whose lines do not end within a number with its error and unit, or within a date."""
+    return _WITHIN_DATE.sub("\u2060-\u2060", _WITHIN_NUMBER.sub("\u00a0", sentence))
 
 
 def _lead(report: RunReport, sections: list[Markup]) -> list[Markup]:
