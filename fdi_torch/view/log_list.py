@@ -38,6 +38,11 @@ class Entry:
     started: str
     progress: Progress
 
+    @property
+    def text(self) -> str:
+        """All in which words are looked for, in lower case."""
+        return f"{self.name} {self.kind} {self.started} {self.verdict} {self.state}".casefold()
+
 
 @dataclass
 class LogList:
@@ -115,12 +120,7 @@ def selected(
 ) -> list[Entry]:
     """The entries of that kind which contain every word of `text`, sorted; unknown errors come last."""
     words = text.casefold().split()
-    kept = [
-        entry
-        for entry in entries
-        if kind in ("", entry.kind)
-        and all(word in f"{entry.name} {entry.kind} {entry.verdict} {entry.state}".casefold() for word in words)
-    ]
+    kept = [entry for entry in entries if kind in ("", entry.kind) and all(word in entry.text for word in words)]
     key = SORTS.get(sort, SORTS["started"])
     if sort != "error":
         return sorted(kept, key=key, reverse=down)

@@ -247,3 +247,13 @@ def test_what_cannot_be_served_is_said(tmp_path: Path, capsys: pytest.CaptureFix
     assert "folder not found" in capsys.readouterr().err
     assert main(["view", str(tmp_path), "--port", "70000"]) == MISUSE
     assert "--port: expected a free port, got 70000" in capsys.readouterr().err
+
+
+def test_the_list_is_printed_for_a_day_and_for_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_fit(tmp_path / "a.mcap", 0.02)
+    started = read_run(tmp_path / "a.mcap").metadata["fdi_torch.run"]["started"][:10]
+    assert main(["view", str(tmp_path), "--list", started]) == 0
+    assert "a.mcap" in capsys.readouterr().out
+    assert main(["view", str(tmp_path), "--list", "no such words"]) == 0
+    assert capsys.readouterr().out.endswith("no log with the words 'no such words'\n")
+    assert main(["view", str(tmp_path / "gone"), "--list"]) != 0
