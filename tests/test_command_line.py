@@ -169,7 +169,11 @@ def test_check_of_a_run_file_says_what_is_usable(tmp_path: Path, capsys: pytest.
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["RIG"], "fdi check: expected --plant, a recording and --plant, or --config; see fdi check --help"),
+        (
+            ["RIG"],
+            "fdi check: expected --plant, a recording and --plant, or --config; without a plant file, "
+            "fdi new plant --recording FILE writes one from the columns of a recording",
+        ),
         (["RIG", "--plant", "three_tonk"], "got 'three_tonk'; the nearest is 'three_tank'"),
         (["gone.csv", "--plant", "three_tank"], "fdi check: gone.csv: file not found"),
         (["--config", "gone.yaml"], "fdi check: gone.yaml: file not found"),

@@ -90,3 +90,10 @@ def test_too_many_values_push_the_oldest_out(monkeypatch: pytest.MonkeyPatch) ->
         4.0,
     ]
     assert inbox.take(0.0) == []
+
+
+def test_time_0_is_the_first_reading_and_an_input_that_was_set_long_before_holds() -> None:
+    rows = buffer(dated=True)
+    for value in (Value("q", 1e9 - 3600.0, 5.0), Value("h", 1e9, 10.0), Value("h", 1e9 + 1.0, 11.0)):
+        rows.put(value, now=0.0)
+    assert equal(rows.rows(now=2.0), [(0.0, [11.0], [10.0]), (1.0, [11.0], [11.0])]) and rows.origin == 1e9

@@ -13,7 +13,7 @@ from fdi_torch.gap.verdict_words import causes_of, explanation_words, probabilit
 from fdi_torch.parameters import ParameterName, display_unit
 
 MOST_ROWS = 5
-SMALLEST_SHOWN = 1e-4  # probability
+SMALLEST_SHOWN = 1e-3  # probability
 MOVED = 2.0  # tolerances by which a constant must have moved to be shown
 STAGES = {
     "nominal": "nominal model",

@@ -155,7 +155,7 @@ def rig_difference(result: DiagnosisResult, held: HeldOut) -> str | None:
         return None
     fitter = Fitter(held.data, noise)
     refit = fitter.fit(Candidate(result.best.candidate.placements, (result.best.effect_values,)))
-    source = held.data.recording.source or "the hold-out"
+    source = Path(held.data.recording.source).name or "the hold-out"
     changed = (
         _changed(result, fitter, refit) if unexplained_chi_square(fitter, refit) < REFIT_EXPLAINS * unexplained else []
     )

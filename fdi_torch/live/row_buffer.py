@@ -49,8 +49,9 @@ class RowBuffer:
     """Buffer that sorts values into rows.
 
     align: interval to whose multiples stamps are rounded, s; 0 for none. origin: stamp of time 0; None for the stamp of
-    the first row if the clock has dates (`dated`), which is then available as `origin`, and 0 otherwise. seen: times of
-    rows that are known from an earlier run.
+    the first row with a reading if the clock has dates (`dated`), which is then available as `origin`, and 0 otherwise.
+    Earlier rows are only kept as inputs: a source begins with the present value of each input, which may be hours old.
+    seen: times of rows that are known from an earlier run.
     """
 
     def __init__(
@@ -98,7 +99,8 @@ class RowBuffer:
         notices = self._late_rows(now)
         old = [s for s, row in self._pending.items() if all_of_them or now - row.arrived >= self._reorder]
         last = max(old, default=-math.inf)
-        return [*notices, *(self._release(stamp) for stamp in sorted(s for s in self._pending if s <= last))]
+        due = [self._release(stamp) for stamp in sorted(s for s in self._pending if s <= last)]
+        return [*notices, *(row for row in due if row is not None)]
 
     def _stamp(self, stamp: float) -> float:
         """The stamp by which a row is recognised: rounded to `align`, and seconds since 1970 to the microsecond."""
@@ -123,15 +125,18 @@ class RowBuffer:
             "waits for them"
         ]
 
-    def _release(self, stamp: float) -> Row:
-        if self.origin is None:
-            self.origin = stamp
+    def _release(self, stamp: float) -> Row | None:
+        """The row with that stamp; None before the first reading."""
         found = self._pending.pop(stamp).values
+        if self.origin is None and max(found, default=-1) >= self._inputs:
+            self.origin = stamp
         self._last = stamp
         self._released[stamp] = None
         if len(self._released) > MOST_REMEMBERED:
             self._released.pop(next(iter(self._released)))
         values = [self._filled(k, found, stamp) for k in range(len(self.channels))]
+        if self.origin is None:
+            return None
         t = round(stamp - self.origin, 6) if self.origin else stamp
         return t, values[: self._inputs], values[self._inputs :]
 

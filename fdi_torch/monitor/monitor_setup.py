@@ -179,10 +179,12 @@ def usual_faults(plant: PlantDescription) -> list[str]:
 def fault_free_part(recording: Recording, start: float, stop: float) -> Recording:
     """The part between two moments (s). Raises ValueError if the recording, or a sensor, has too few samples there."""
     part = replace(recording.window(start, stop), source=f"{recording.source} ({start:g} to {stop:g} s)")
+    first = float(part.time[0])
     for name, count in zip(part.output_names, part.mask.sum(dim=0).tolist(), strict=True):
         if count < FEWEST_SAMPLES:
             raise ValueError(
                 f"{part.source}: {name}: expected at least {FEWEST_SAMPLES} readings to learn the noise from, "
-                f"got {count} in {len(part)} samples; lengthen fault_free, or correct the column or tag of {name}"
+                f"got {count} in {len(part)} samples, the first at {first:g} s; lengthen fault_free, or correct the "
+                f"column or tag of {name}"
             )
     return part

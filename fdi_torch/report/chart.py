@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,6 +44,8 @@ class Chart:
     median of the positive values (asinh). level: a horizontal reference
     line; at a level of 0 the lines are residuals. events: times of vertical lines. clock: charts of one clock show the
     same crosshair and zoom together. from_zero: the vertical axis begins at 0. height: of the picture, inches.
+    zero: time 0 as the recording's clock showed it, s since 1970; None for another axis, or a clock without dates.
+    after: its words beside the label.
     """
 
     title: str
@@ -56,16 +58,19 @@ class Chart:
     clock: str = ""
     from_zero: bool = False
     height: float = HEIGHT
+    zero: float | None = field(default_factory=clock_zero)
+    after: str = ""
 
-    @property
-    def zero(self) -> float | None:
-        """Time 0 as the recording's clock showed it, s since 1970; None for another axis, or a clock without dates."""
-        return clock_zero() if self.x_label == TIME and self.clock != PLANNED else None
+    def __post_init__(self) -> None:
+        if self.x_label != TIME or self.clock == PLANNED:
+            object.__setattr__(self, "zero", None)
+        elif self.zero is not None:
+            object.__setattr__(self, "after", f" after {clock_text(0.0)}")
 
     @property
     def axis(self) -> str:
         """The label of the horizontal axis."""
-        return self.x_label if self.zero is None else f"{self.x_label} after {clock_text(0.0)}"
+        return f"{self.x_label}{self.after}"
 
     @property
     def scale(self) -> tuple[str, float]:

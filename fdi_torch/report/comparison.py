@@ -10,13 +10,14 @@ import numpy as np
 from fdi_torch.logbook import Comparison, align
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.comparison_headline import comparison_headline
-from fdi_torch.report.html import folded, table, tag
+from fdi_torch.report.html import folded, short, table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, shown_unit, with_error
 from fdi_torch.report.predictions import predicted
 from fdi_torch.report.section import Picture, Section, signals
 from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT
 
+MOST_LETTERS = 160  # of a setting or result that differs; a longer one, such as a covariance, is cut
 COLOURS = (MODEL, MARK, OTHER, SOFT)
 CURVES = {
     "/estimator/de/generation": ("Search", "generation", "best_cost"),
@@ -34,12 +35,14 @@ def _section(compared: Comparison, runs: Sequence[Material]) -> Section:
     first, *others = comparison_headline(compared, runs)
     blocks: list[Any] = [tag("h3", first), *(tag("p", sentence) for sentence in (*others, *in_words(compared)))]
     if compared.results:
-        header = ["parameter", "unit", *compared.labels, "p", "agree"]
-        blocks.append(table(header, result_rows(compared), left=2))
+        header, rows = ["parameter", "unit", *compared.labels, "p", "agree"], result_rows(compared)
+        if all(result.agree is None for result in compared.results):
+            header, rows = header[:-2], [row[:-2] for row in rows]
+        blocks.append(table(header, rows, left=2))
     pictures = [*_convergence(compared, runs), *_residuals(compared, runs)]
     blocks += [pictures] if pictures else []
     for name, entries in compared.differences.items():
-        rows = [[key, *texts] for key, texts in entries.items()]
+        rows = [[key, *(short(text, MOST_LETTERS) for text in texts)] for key, texts in entries.items()]
         blocks.append(
             folded(f"{name}: {len(rows)} differ", table(["key", *compared.labels], rows, len(compared.labels) + 1))
         )

@@ -32,9 +32,9 @@ def raised(unit: str) -> str:
     return head
 
 
-def amount(value: float, si_unit: str, digits: int = 4) -> str:
-    """An SI value in its display unit, such as '33.1 cm³/s'."""
-    unit, scale = shown_unit(si_unit)
+def amount(value: float, si_unit: str, digits: int = 4, name: str = "") -> str:
+    """An SI value in its display unit, such as '33.1 cm³/s'; name: as for `shown_unit`."""
+    unit, scale = shown_unit(si_unit, name)
     return f"{number(scale * value, digits)} {unit}".rstrip()
 
 

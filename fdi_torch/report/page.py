@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +36,10 @@ def report_of(material: Material, makers: Sequence[Maker] = SECTIONS) -> RunRepo
     with material.in_its_units():
         made = [_made(maker, material) for maker in makers]
     return RunReport(material, tuple(section for section in made if section is not None))
+
+
+_WITHIN_DATE = re.compile(r"(?<=\d)-(?=\d)")
+_WITHIN_NUMBER = re.compile(r" (?=[±%])|(?<=±) |(?<=\d) (?=[^\s\d]{1,8}(?:[),;.]|$))")
 
 
 def page(reports: Sequence[RunReport], first: Sequence[Section] = (), above: Sequence[Markup] = ()) -> str:
@@ -71,7 +76,7 @@ def write_pictures(report: RunReport, folder: Path) -> list[Path]:
 
 def _article(report: RunReport, prefix: str) -> Markup:
     material = report.material
-    top = [tag("h1", f"{kind_words(material)} · {material.run.path.stem}"), tag("h2", headline(material))]
+    top = [tag("h1", f"{kind_words(material)} · {material.run.path.stem}"), tag("h2", unbroken(headline(material)))]
     top += [tag("p", sentence, class_="meta") for sentence in how_it_ended(material)]
     named = [(f"{prefix}s{k}", section) for k, section in enumerate(report.sections)]
     lead = [section_html(section, prefix, name) for name, section in named if section.lead]
@@ -79,6 +84,11 @@ def _article(report: RunReport, prefix: str) -> Markup:
     ordered = [each for each in named if each[1].lead] + [each for each in named if not each[1].lead]
     index = _index([(name, section.title) for name, section in ordered])
     return tag("article", *top, index, *_lead(report, lead), *others, id=f"{prefix}run")
+
+
+def unbroken(sentence: str) -> str:
+    """The sentence whose lines do not end within a number with its error and unit, or within a date."""
+    return _WITHIN_DATE.sub("\u2060-\u2060", _WITHIN_NUMBER.sub("\u00a0", sentence))
 
 
 def _lead(report: RunReport, sections: list[Markup]) -> list[Markup]:

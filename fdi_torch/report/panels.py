@@ -12,6 +12,7 @@ from fdi_torch.report.html import short
 from fdi_torch.report.style import INK, MARK, MODEL, OTHER, panel
 
 BAR_NAME = 28  # letters of a line of a bar's name, which has at most two
+ONE_LINE = 26  # letters of a parameter's name beside an axis
 
 
 def bar_panel(
@@ -39,6 +40,12 @@ def bar_panel(
     return figure
 
 
+def _in_two_lines(name: str) -> str:
+    """A long name of a parameter with its place on a line of its own."""
+    place, _, rest = name.partition(".")
+    return short(name, ONE_LINE) if len(name) <= ONE_LINE else f"{short(place, ONE_LINE)}.\n{short(rest, ONE_LINE)}"
+
+
 def ellipse_panel(
     names: tuple[str, str],
     units: tuple[str, str],
@@ -47,7 +54,7 @@ def ellipse_panel(
     truth: tuple[float, float] | None = None,
 ) -> Figure:
     """50 % and 95 % confidence regions of two parameters (chi^2 with two degrees of freedom), and the true values."""
-    labels = [f"{short(n, 26)}{', ' + u if u else ''}" for n, u in zip(names, units, strict=True)]
+    labels = [f"{_in_two_lines(n)}{', ' + u if u else ''}" for n, u in zip(names, units, strict=True)]
     figure, axes = panel("", labels[0], labels[1], width=3.6, height=3.0)
     values, vectors = np.linalg.eigh(covariance)
     angle = np.linspace(0.0, 2.0 * np.pi, 121)

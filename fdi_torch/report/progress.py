@@ -68,15 +68,17 @@ def sensor_residuals(material: Material) -> dict[str, SensorResidual]:
     return {n: SensorResidual(float(np.sqrt(s.mean())), u, len(s)) for (n, u), s in joined.items() if len(s)}
 
 
-def residual_size(material: Material) -> tuple[float, str]:
-    """Root mean square of the residuals of all sensors, and its SI unit. NaN if the log has none, or if its sensors
-    have different units.
+def residual_size(material: Material) -> tuple[float, str, str]:
+    """Root mean square of the residuals of all sensors, its SI unit, and one of the sensors. NaN if the log has none,
+    or if its sensors have different units.
     """
-    sensors = sensor_residuals(material).values()
+    residuals = sensor_residuals(material)
+    sensors = residuals.values()
     if len({sensor.unit for sensor in sensors}) != 1:
-        return math.nan, ""
+        return math.nan, "", ""
     readings = sum(sensor.readings for sensor in sensors)
-    return math.sqrt(sum(s.readings * s.rms**2 for s in sensors) / readings), next(iter(sensors)).unit
+    size = math.sqrt(sum(s.readings * s.rms**2 for s in sensors) / readings)
+    return size, next(iter(sensors)).unit, next(iter(residuals))
 
 
 def _number(value: object) -> str:

@@ -38,6 +38,11 @@ class Entry:
     started: str
     progress: Progress
 
+    @property
+    def text(self) -> str:
+        """All in which words are looked for, in lower case."""
+        return f"{self.name} {self.kind} {self.started} {self.verdict} {self.state}".casefold()
+
 
 @dataclass
 class LogList:
@@ -81,9 +86,9 @@ def _read(name: str, path: Path, running: bool) -> Entry:
     try:
         log = read_run(path, salvage=True)
         material = gather(log, plant_of(log, []))
-        error, unit = residual_size(material)
+        error, unit, sensor = residual_size(material)
         with material.in_its_units():
-            error_text = amount(error, unit, 3) if error == error else ""
+            error_text = amount(error, unit, 3, sensor) if error == error else ""
         status = material.about("status").get("status", NO_END).replace("_", " ")
         started = material.about("run").get("started", "")[:19].replace("T", " ")
         state, verdict = (RUNNING, progress_of(material).text) if running else (status, headline(material))
@@ -115,12 +120,7 @@ def selected(
 ) -> list[Entry]:
     """The entries of that kind which contain every word of `text`, sorted; unknown errors come last."""
     words = text.casefold().split()
-    kept = [
-        entry
-        for entry in entries
-        if kind in ("", entry.kind)
-        and all(word in f"{entry.name} {entry.kind} {entry.verdict} {entry.state}".casefold() for word in words)
-    ]
+    kept = [entry for entry in entries if kind in ("", entry.kind) and all(word in entry.text for word in words)]
     key = SORTS.get(sort, SORTS["started"])
     if sort != "error":
         return sorted(kept, key=key, reverse=down)

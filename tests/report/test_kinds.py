@@ -26,7 +26,7 @@ from fdi_torch.config import load_plant
 from fdi_torch.logbook import RunLog, read_run
 from fdi_torch.report.diagnosed_effects import diagnosed_effects
 from fdi_torch.report.material import gather
-from fdi_torch.report.page import RunReport, page, report_of
+from fdi_torch.report.page import RunReport, page, report_of, unbroken
 from fdi_torch.report.sections.before_after import profile_section, sample_noise
 from fdi_torch.report.verdict import _latest, headline
 
@@ -285,3 +285,25 @@ def test_provenance_has_no_arrays(tmp_path: Path) -> None:
         log.result({"status": "converged", "covariance": [[1.25, 2.25], [2.25, 3.25]], "names": ["a", "b"]})
     text = page([report_of(material_of(tmp_path / "run.mcap"))])
     assert "converged" in text and "2.25" not in text and "covariance" not in text
+
+
+def test_numbers_with_error_and_unit_are_not_broken_into_two_lines() -> None:
+    assert unbroken("pump lag at Q (7.36 ± 0.25 s), probability 99.2 %") == (
+        "pump lag at Q (7.36\u00a0±\u00a00.25\u00a0s), probability 99.2\u00a0%"
+    )
+    assert unbroken("3 faults: leak at T1") == "3 faults: leak at T1"
+
+
+def test_residuals_are_divided_by_the_noise_of_the_diagnosis_also_where_readings_are_rounded() -> None:
+    material = material_of(DATA / "log_format_1_gap.mcap", load_plant("three_tank"))
+    recording = material.recordings[0]
+    step = 0.01
+    predicted = material.arrays["augmented"]
+    material.recordings[0] = replace(recording, outputs=np.round(predicted / step) * step)
+    std = {name: {"std": step / np.sqrt(12.0)} for name in recording.output_names}
+    material.answer["noise"] = std
+    section = profile_section(material)
+    assert section is not None
+    charts = [block for block in section.pictures if block.chart is not None]
+    line = next(line for line in charts[0].chart.lines if line.name == "with the cause")
+    assert np.sqrt(np.nanmean(np.square(line.y))) == pytest.approx(1.0, abs=0.3)

@@ -235,7 +235,7 @@ def test_logs_without_an_error_come_last_in_both_directions(tmp_path: Path) -> N
 
 
 def test_the_error_is_the_root_mean_square_of_the_residuals(tmp_path: Path) -> None:
-    size, unit = residual_size(gather(read_run(write_fit(tmp_path / "a.mcap", 0.02))))
+    size, unit, _ = residual_size(gather(read_run(write_fit(tmp_path / "a.mcap", 0.02))))
     assert size == pytest.approx(0.02, rel=1e-12) and unit == "m"
     log = read_run(DATA / "log_format_1_monitor.mcap")
     columns = [[m.payload[name] for m in log.messages(["/observer/residual"])] for name in ("h1", "h2", "h3")]
@@ -247,3 +247,13 @@ def test_what_cannot_be_served_is_said(tmp_path: Path, capsys: pytest.CaptureFix
     assert "folder not found" in capsys.readouterr().err
     assert main(["view", str(tmp_path), "--port", "70000"]) == MISUSE
     assert "--port: expected a free port, got 70000" in capsys.readouterr().err
+
+
+def test_the_list_is_printed_for_a_day_and_for_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_fit(tmp_path / "a.mcap", 0.02)
+    started = read_run(tmp_path / "a.mcap").metadata["fdi_torch.run"]["started"][:10]
+    assert main(["view", str(tmp_path), "--list", started]) == 0
+    assert "a.mcap" in capsys.readouterr().out
+    assert main(["view", str(tmp_path), "--list", "no such words"]) == 0
+    assert capsys.readouterr().out.endswith("no log with the words 'no such words'\n")
+    assert main(["view", str(tmp_path / "gone"), "--list"]) != 0

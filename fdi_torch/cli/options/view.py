@@ -11,6 +11,7 @@ EXAMPLES = """
 examples:
   fdi view                                         the logs in ./logs
   fdi view /data/runs --port 8080 --open
+  fdi view --list "2026-11-24 leak"                the logs of that day about a leak, on the terminal
 """
 
 
@@ -21,6 +22,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         default="logs",
         help="folder of logs, with its subfolders (default: logs)",
+    )
+    parser.add_argument(
+        "--list",
+        metavar="WORDS",
+        nargs="?",
+        const="",
+        help="only print the logs, latest first; WORDS: those with them in name, kind, start, verdict or state",
     )
     parser.add_argument("--port", metavar="N", type=int, default=0, help="port of the pages (default: any free one)")
     parser.add_argument("--open", action="store_true", help="open the list in the browser")

@@ -9,7 +9,7 @@ import numpy as np
 from fdi_torch.logbook import Signals
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import axis, shown_unit
+from fdi_torch.report.numbers import as_float, axis, shown_unit
 from fdi_torch.report.predictions import MODELS, holdout_prefix
 from fdi_torch.report.section import Picture, Section, signals
 from fdi_torch.report.sections.signals import clock_of
@@ -77,9 +77,16 @@ def _excess(material: Material, recording: Signals, model: str) -> np.ndarray | 
     if predicted is None or predicted.shape != recording.outputs.shape:
         return None
     read = np.where(recording.mask, recording.outputs, np.nan)
-    ratio = ((read - predicted) / sample_noise(read)) ** 2
+    ratio = ((read - predicted) / _noise(material, recording, read)) ** 2
     counted = np.isfinite(ratio)
     return np.where(counted, ratio, 0.0).sum(1) / np.maximum(counted.sum(1), 1)
+
+
+def _noise(material: Material, recording: Signals, read: np.ndarray) -> np.ndarray:
+    """Noise (N,) by which the diagnosis weighed each sensor, rounding included; of the samples where it is unknown."""
+    stated = material.answer.get("noise") or {}
+    std = [as_float((stated.get(name) or {}).get("std")) for name in recording.output_names]
+    return np.where(np.array(std) > 0.0, std, sample_noise(read))
 
 
 def sample_noise(read: np.ndarray) -> np.ndarray:

@@ -18,8 +18,7 @@ from fdi_torch.report.panels import BAR_NAME, bar_panel
 from fdi_torch.report.section import Picture, Section
 
 MOST_BARS = 10
-LEAST_SHOWN = 1e-4  # of a probability
-LEAST_PLACE = 1e-3  # of a place that gets a bar
+LEAST_SHOWN = 1e-3  # of a probability that gets a bar
 CONTENT = 0.95  # probability of the plausible explanations together
 
 
@@ -30,8 +29,8 @@ def where_section(material: Material) -> Section | None:
     ranked = sorted(where.items(), key=lambda item: -float(item[1]["share"]))
     if not ranked:
         return None
-    shown = [item for item in ranked if float(item[1]["share"]) >= LEAST_PLACE] or ranked[:3]
-    caption = f"Below {percent(LEAST_PLACE)}: {len(ranked) - len(shown)} other places." if ranked[len(shown) :] else ""
+    shown = [item for item in ranked if float(item[1]["share"]) >= LEAST_SHOWN] or ranked[:3]
+    caption = f"Below {percent(LEAST_SHOWN)}: {len(ranked) - len(shown)} other places." if ranked[len(shown) :] else ""
     ranked = shown[:MOST_BARS]
     shares = [100.0 * float(place["share"]) for _, place in ranked]
     texts = [probability_text(float(place["share"])) + _chance(place) for _, place in ranked]

@@ -8,7 +8,7 @@ import numpy as np
 
 from fdi_torch.clock import clock_text
 from fdi_torch.report.chart import Chart, Line
-from fdi_torch.report.html import table
+from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, raised, shown_unit
 from fdi_torch.report.section import Section, signals
@@ -62,7 +62,7 @@ def event_section(material: Material) -> Section | None:
     rows = [
         [
             number(float(m["t"]), 6),
-            *([clock_text(float(m["t"]))] if dated else []),
+            *([_moment(float(m["t"]))] if dated else []),
             str(m.get("event", "")),
             str(m.get("channel", "")),
             raised(str(m.get("message", ""))),
@@ -76,7 +76,12 @@ def event_section(material: Material) -> Section | None:
     return Section("Events", [listed])
 
 
-def _onset(onset: Any, dated: bool) -> list[str]:
+def _onset(onset: Any, dated: bool) -> list[Any]:
     """The onset of an event's fault in s, and by the clock of a dated recording; empty cells without an onset."""
     known = isinstance(onset, int | float)
-    return [number(float(onset), 6) if known else "", *([clock_text(float(onset)) if known else ""] if dated else [])]
+    return [number(float(onset), 6) if known else "", *([_moment(float(onset)) if known else ""] if dated else [])]
+
+
+def _moment(seconds: float) -> Any:
+    """A clock time that is not broken into two lines."""
+    return tag("span", clock_text(seconds), class_="moment")

@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from fdi_torch.effects import build_network, effect
+from fdi_torch.parameters import ParameterName
+from fdi_torch.plant.effect import Placement
 from fdi_torch.report.html import folded, short, table
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import axis, number, percent, shown_unit
@@ -17,6 +20,7 @@ from fdi_torch.report.style import MARK, MODEL, SOFT, logarithmic, panel
 TRIAL, SUMMARY = "/study/trial", "/study/summary"
 MOST_PANELS, MOST_GROUPS, MOST_ROWS = 9, 40, 30
 ESTIMATORS = ("free", "boxed", "correlation", "search")
+MAIN = {"over_bound": "error over the Cramér-Rao bound", "coverage": "coverage of the 95 % interval"}
 _OWN = ("t", "trial", "trials", "group", "seed", "status")
 
 
@@ -30,9 +34,20 @@ def summary_section(material: Material) -> Section | None:
     rows = [["trials", *(str(m.get("trials", "")) for m in settings)]]
     rows += [[name, *(_shown(m.get(name)) or "" for m in settings)] for name in names]
     shown = table(header, rows)
-    return Section(
-        "Settings", [shown if len(rows) <= MOST_ROWS else folded(f"{len(rows)} numbers of each setting", shown)]
-    )
+    if len(rows) <= MOST_ROWS:
+        return Section("Settings", [shown])
+    estimator = next((name for name in ESTIMATORS if any(key.startswith(f"{name}.") for key in names)), "")
+    main = [
+        [_main_words(row[0]), *row[1:]] for row in rows if row[0].startswith(f"{estimator}.") and _main_words(row[0])
+    ]
+    blocks = [table(header, [rows[0], *main]), folded(f"All {len(rows)} numbers of each setting", shown)]
+    return Section("Settings", [f"Estimator: {estimator}.", *blocks] if main else blocks[1:])
+
+
+def _main_words(name: str) -> str:
+    """'A.leak.size: error over the Cramér-Rao bound' of 'free.A.leak.size.over_bound'; empty for a minor number."""
+    parameter, _, quantity = name.partition(".")[2].rpartition(".")
+    return f"{parameter}: {MAIN[quantity]}" if quantity in MAIN else ""
 
 
 def error_section(material: Material) -> Section | None:
@@ -49,13 +64,27 @@ def error_section(material: Material) -> Section | None:
             own = [m for m in trials if str(m.get("group", "")) == group]
             errors.append(np.array([abs(float(m[estimator][i]) - float(m["truth"][i])) for m in own]))
             bounds.append(np.median([float(m["bound"][i]) if "bound" in m else np.nan for m in own]))
-        figure = group_panel(name, "size of the error, SI", groups, errors)
+        unit, scale = _unit_of(material, name)
+        errors, bounds = [scale * e for e in errors], [scale * b for b in bounds]
+        figure = group_panel(name, axis("size of the error", unit), groups, errors)
         if all(np.nanmax(e, initial=0.0) > 0 for e in errors):
             logarithmic(figure.axes[0])
         figure.axes[0].plot(range(len(groups)), bounds, "_", color=MARK, ms=22, mew=2.0)
         pictures.append(Picture(f"errors_{i + 1}", figure))
     words = f"Estimator: {estimator}. Each point is a trial, blue is the median, orange the Cramér-Rao bound."
     return Section("Errors", [words, pictures])
+
+
+def _unit_of(material: Material, name: str) -> tuple[str, float]:
+    """The unit for display of a parameter, by the plant of the log, and its scale from SI; "SI" if it is not known."""
+    try:
+        place = ParameterName.parse(name)
+        placements = [Placement(effect(place.effect), place.place)] if place.effect else []
+        if material.plant is None:
+            return "SI", 1.0
+        return shown_unit(build_network(material.plant, placements).constants[name].unit, name)
+    except ValueError:
+        return "SI", 1.0
 
 
 def _parameters(material: Material, estimator: str, count: int) -> list[str]:
