@@ -51,8 +51,6 @@ def _show_event(event: Event, screen: Screen, publish: Publish) -> None:
     data = {"format": FORMAT, **event.to_dict()}
     screen.line(orjson.dumps(data).decode())
     publish(data)
-    if screen.unread:  # whoever reads events one by one, from a source that may never end, has read enough
-        raise BrokenPipeError
 
 
 def _show_setup(prepared: PreparedMonitor, screen: Screen) -> None:
