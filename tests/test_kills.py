@@ -199,7 +199,8 @@ def test_what_is_said_of_an_interrupted_job_is_true(
     word = "interrupted" if number == signal.SIGINT else "terminated"
     kept = f"what was computed until now is in {log}"
     assert (
-        complaints == f"fdi {job.words[0]}: {word}; {kept}; the same command {'with ' * (job.name in RESUMED)}{going_on}\n"
+        complaints
+        == f"fdi {job.words[0]}: {word}; {kept}; the same command {'with ' * (job.name in RESUMED)}{going_on}\n"
     )
     assert read_run(log).metadata["fdi_torch.status"]["status"] == "interrupted"
     expect_whole(folder)

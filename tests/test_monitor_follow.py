@@ -18,10 +18,10 @@ import yaml
 from fdi_torch.cli import INTERRUPTED, main
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.jobs.live_batches import DelayWatch, LiveBatches
 from fdi_torch.jobs.replay import repeat_run
 from fdi_torch.jobs.row_buffer import rows_until
 from fdi_torch.logbook import RunLog, follow, read_run
-from fdi_torch.monitor.live_batches import DelayWatch, LiveBatches
 from tests.test_monitor import recorded, step_to
 
 FAULT, ONSET, SAMPLES = "T3.leak.size", 200.0, 300
