@@ -253,6 +253,16 @@ def test_the_residual_s_variance_allows_for_the_coefficients_that_it_spends() ->
     assert float(whitening(series)[2:].square().sum()) == pytest.approx(60.0)
 
 
+def test_what_is_learnt_is_the_same_bit_for_bit_whatever_lies_in_memory() -> None:
+    series = torch.randn(800, 3, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+    kept, learnt = [], set()
+    for k in range(60):
+        kept.append(torch.empty(37 * k + 1))
+        w = next(w for _, w in score_whitenings(series.clone()) if w.order == 4)
+        learnt.add(w.coefficients.numpy().tobytes() + w.whitener.numpy().tobytes())
+    assert len(learnt) == 1
+
+
 def test_channels_that_move_together_are_separated() -> None:
     e = noise(3000, 2)
     mixed = torch.stack([e[:, 0], 0.9 * e[:, 0] + 0.3 * e[:, 1]], dim=1)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -16,10 +18,10 @@ import yaml
 from fdi_torch.cli import INTERRUPTED, main
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.jobs.live_batches import DelayWatch, LiveBatches
 from fdi_torch.jobs.replay import repeat_run
 from fdi_torch.jobs.row_buffer import rows_until
 from fdi_torch.logbook import RunLog, follow, read_run
-from fdi_torch.monitor.live_batches import DelayWatch, LiveBatches
 from tests.test_monitor import recorded, step_to
 
 FAULT, ONSET, SAMPLES = "T3.leak.size", 200.0, 300
@@ -145,6 +147,18 @@ def test_every_event_lies_in_the_log_from_which_a_page_is_made(
     assert main(["report", str(path), "--out", str(tmp_path), "--quiet"]) == 0
     page = path.with_suffix(".html") if path.with_suffix(".html").exists() else next(tmp_path.rglob("*.html"))
     assert "T3.leak.size = 0.0" in page.read_text()
+
+
+@pytest.mark.parametrize("options", ["", "--json", "--follow --idle 0.5"])
+def test_who_stops_reading_events_ends_neither_the_monitor_nor_its_log(options: str, tmp_path: Path) -> None:
+    written(tmp_path / "rig.csv")
+    words = f"{sys.executable} -m fdi_torch monitor --config {config(tmp_path)} --quiet {options}"
+    piped = f"{words} | head -1; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", piped], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr, done.stdout.count("\n")) == (0, "", 1)
+    [path] = (tmp_path / "logs").glob("*.mcap")
+    assert read_run(path).metadata["fdi_torch.status"]["status"] == "completed"
+    assert [e["event"] for e in logged_events(path)][-1] == "summary"
 
 
 def test_ctrl_c_keeps_what_was_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

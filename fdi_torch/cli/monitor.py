@@ -54,8 +54,6 @@ def _show_event(event: Event, screen: Screen, publish: Publish) -> None:
     data |= {"clock": moment, "onset_clock": onset or None} if moment else {}
     screen.line(orjson.dumps(data).decode())
     publish(data)
-    if screen.unread:  # whoever reads events one by one, from a source that may never end, has read enough
-        raise BrokenPipeError
 
 
 def _show_setup(prepared: PreparedMonitor, screen: Screen) -> None:

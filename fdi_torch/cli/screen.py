@@ -64,11 +64,6 @@ class Screen:
         self._out = _Results(width=None if sys.stdout.isatty() else ENDLESS, highlight=False, soft_wrap=True)
         self._err = _Output(stderr=True, highlight=False, soft_wrap=True)
 
-    @property
-    def unread(self) -> bool:
-        """Whether the reader of standard output, such as `head`, has stopped reading."""
-        return self._out.quiet
-
     def say(self, text: str = "") -> None:
         """Print a line of the result; not with JSON."""
         if not self.json:
@@ -105,7 +100,7 @@ class Screen:
 
     def line(self, text: str) -> None:
         """Print a line of JSON immediately, for results that come one by one; only with JSON."""
-        if self.json and not self.unread:
+        if self.json and not self._out.quiet:  # as long as someone reads standard output
             try:
                 with named_errors("standard output"):
                     sys.stdout.write(printable_json(text) + "\n")

@@ -20,6 +20,7 @@ from fdi_torch.config.growing_recordings import Row, growing_rows
 from fdi_torch.config.live_source import LiveRows
 from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor_file import MonitorRun
+from fdi_torch.jobs.live_batches import DelayWatch, LiveBatches
 from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
 from fdi_torch.jobs.logged_monitor import ALARM, LoggedMonitor, MonitorCallbacks, event_key
 from fdi_torch.jobs.row_buffer import (
@@ -32,7 +33,6 @@ from fdi_torch.jobs.row_buffer import (
 )
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook import RunLog
-from fdi_torch.monitor.live_batches import DelayWatch, LiveBatches
 from fdi_torch.recording import Recording
 
 IDLE = 60.0

@@ -15,23 +15,28 @@ from fdi_torch.monitor.detection import Detector
 from fdi_torch.monitor.event_text import EventWriter
 from fdi_torch.monitor.events import Event, Kind
 from fdi_torch.monitor.explanations import Explainer
-from fdi_torch.monitor.fault_recovery import (
+from fdi_torch.monitor.hypothesis import HypothesisFit, merged
+from fdi_torch.monitor.known_faults import (
+    STRONG_EVIDENCE,
+    effect_of_value,
     end_recovered,
     examine_hidden,
     recovered_columns,
     reset_to_nominal,
-    with_hidden,
-)
-from fdi_torch.monitor.fault_tracking import (
-    STRONG_EVIDENCE,
-    effect_of_value,
     size_change,
     updated_tracks,
+    with_hidden,
     with_new_sizes,
 )
-from fdi_torch.monitor.hypothesis import HypothesisFit, merged
-from fdi_torch.monitor.monitor_state import DetectedChange, HiddenFault, MonitorState, PendingAlarm
-from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, normalized_residuals
+from fdi_torch.monitor.monitor_state import (
+    DetectedChange,
+    HiddenFault,
+    MonitorState,
+    PendingAlarm,
+    adopt_change,
+    adopt_sizes,
+    normalized_residuals,
+)
 
 SMALLEST_PROBABILITY = 1e-3  # explanations below it are not fitted again
 

@@ -18,6 +18,8 @@ import torch
 from scipy.special import gammaincinv
 from torch import Tensor
 
+from fdi_torch.monitor.whitening import least_squares
+
 DRAWS = 1000  # from the posterior
 DIRECTIONS = 50  # of the sum that exceeds the GLR's threshold
 # Twice the mean overshoot of a sum of standard normal numbers, -2 zeta(1/2) / sqrt(2 pi), and its decrease with the
@@ -157,7 +159,7 @@ def rate_of_maxima(peaks: Tensor) -> Callable[[Tensor], Tensor]:
     fitted, hazard = peaks[used], torch.log(-torch.log(share[used]))
     centre = fitted.mean()
     powers = torch.stack([(fitted - centre) ** i for i in range(3)], dim=1)
-    c0, c1, c2 = torch.linalg.lstsq(powers, hazard.unsqueeze(1)).solution.flatten()
+    c0, c1, c2 = least_squares(powers, hazard.unsqueeze(1)).flatten()
 
     def rate(threshold: Tensor) -> Tensor:
         nearest = threshold.clamp(fitted[0], fitted[-1])

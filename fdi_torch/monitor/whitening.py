@@ -113,7 +113,7 @@ def _fit(residual: Tensor, order: int, highest: int, with_mean: bool) -> tuple[f
     regressors = torch.cat(past, dim=1) if past else target[:, :0]
     usable = torch.isfinite(target).all(1) & torch.isfinite(regressors).all(1)
     target, regressors = target[usable], regressors[usable]
-    solution = torch.linalg.lstsq(regressors, target).solution if order else regressors.new_zeros(0, channels)
+    solution = least_squares(regressors, target)
     error = target - regressors @ solution
     spent = order * channels + int(with_mean)
     covariance = error.mT @ error / max(len(error) - spent, 1)
@@ -122,6 +122,16 @@ def _fit(residual: Tensor, order: int, highest: int, with_mean: bool) -> tuple[f
     slow = _slow_error(regressors, matrices, whitener, len(error))
     score = len(error) * float(torch.logdet(covariance)) + spent * channels * math.log(len(error))
     return score, Whitening(mean, matrices, whitener, len(error), slow)
+
+
+def least_squares(rows: Tensor, target: Tensor) -> Tensor:
+    """The x (P, C) that minimises |rows x - target|, rows (S, P), target (S, C).
+
+    By QR, because the last bits of `torch.linalg.lstsq` differ from run to run, and with them those of a resumed
+    monitor.
+    """
+    q, r = torch.linalg.qr(rows)
+    return torch.linalg.solve_triangular(r, q.mT @ target, upper=True)
 
 
 def _apart(residual: Tensor, with_mean: bool) -> tuple[float, Whitening]:
