@@ -27,7 +27,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_writing import write_csv
 
-KEPT = 1 << 30  # bytes of free memory to keep, and size up to which an array is kept
+KEPT, LARGE = 1 << 30, 1 << 26  # bytes of free memory to keep, and size from which an array is not kept
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 
 
@@ -133,4 +133,4 @@ def keep_memory() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):  # another C library; TypeError: Windows wants a name
         return False
-    return bool(mallopt(_MMAP_THRESHOLD, KEPT)) and bool(mallopt(_TRIM_THRESHOLD, KEPT))
+    return bool(mallopt(_MMAP_THRESHOLD, LARGE)) and bool(mallopt(_TRIM_THRESHOLD, KEPT))
