@@ -6,6 +6,7 @@ import argparse
 import ctypes
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from fdi_torch.cli import DONE
@@ -49,7 +50,12 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     log = free_path(folder, "gap")
     with screen.progress("gap") as advance:
         settings = Settings(library, left_out, arguments.step, arguments.most, arguments.named_only)
-        answer = run_gap(log, plant, recordings, holdouts, settings, advance)
+
+        def next_stage(share: float, text: str) -> None:
+            release_memory()
+            advance(share, text)
+
+        answer = run_gap(log, plant, recordings, holdouts, settings, next_stage)
         advance(1.0, "done")
     show(answer, screen)
     written = _keep(arguments, plant, recordings, answer, screen)
@@ -124,7 +130,7 @@ def _error(plant: PlantDescription, recordings: Sequence[Recording]) -> float:
 
 
 def keep_memory() -> bool:
-    """Keep freed memory in the process. Returns False if the C library does not support it.
+    """Keep freed memory in the process, arrays from LARGE on excepted. Returns False if the C library cannot.
 
     Fits of whole trajectories allocate and free the same few large arrays again and again. By default the GNU C library
     maps each of them anew and the system clears every page, which takes a considerable part of a short run.
@@ -134,3 +140,9 @@ def keep_memory() -> bool:
     except (AttributeError, OSError, TypeError):  # another C library; TypeError: Windows wants a name
         return False
     return bool(mallopt(_MMAP_THRESHOLD, LARGE)) and bool(mallopt(_TRIM_THRESHOLD, KEPT))
+
+
+def release_memory() -> None:
+    """Return freed memory to the system: what one stage of a diagnosis needs is no measure of the next."""
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
