@@ -109,8 +109,10 @@ def test_the_evidence_is_the_largest_of_all_subsets_with_their_best_precisions()
             subset = list(chosen)
             found = minimize(lost, np.zeros(count), (subset,), "Nelder-Mead", options={"maxiter": 4000})
             best = max(best, -float(found.fun) - float(costs[subset].sum()))
-    fit = sparse_fit(columns.T @ columns, columns.T @ readings, costs)
-    assert fit.evidence == pytest.approx(best, abs=0.02)
+    gram, score = columns.T @ columns, columns.T @ readings
+    for start in (None, torch.tensor([0.5, math.inf, 10.0]), torch.ones(5)):  # the latter two begin elsewhere
+        fit = sparse_fit(gram, score, costs, start if start is None else start.double())
+        assert fit.evidence == pytest.approx(best, abs=0.02)
 
 
 @pytest.fixture(scope="module")

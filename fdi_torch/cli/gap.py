@@ -6,6 +6,7 @@ import argparse
 import ctypes
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from fdi_torch.cli import DONE
@@ -28,7 +29,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_writing import write_csv
 
-KEPT = 1 << 30  # bytes of free memory to keep, and size up to which an array is kept
+KEPT, LARGE = 1 << 30, 1 << 26  # bytes of free memory to keep, and size from which an array is not kept
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt(3)
 
 
@@ -51,7 +52,12 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     log = free_path(folder, "gap")
     with screen.progress("gap") as advance:
         settings = Settings(library, left_out, arguments.step, arguments.most, arguments.named_only)
-        answer = run_gap(log, plant, recordings, holdouts, settings, advance)
+
+        def next_stage(share: float, text: str) -> None:
+            release_memory()
+            advance(share, text)
+
+        answer = run_gap(log, plant, recordings, holdouts, settings, next_stage)
         advance(1.0, "done")
     diff = _adopt(arguments, plant, recordings, answer, screen)
     planned = _written(plant, answer, folder)
@@ -127,7 +133,7 @@ def _error(plant: PlantDescription, recordings: Sequence[Recording]) -> float:
 
 
 def keep_memory() -> bool:
-    """Keep freed memory in the process. Returns False if the C library does not support it.
+    """Keep freed memory in the process, arrays from LARGE on excepted. Returns False if the C library cannot.
 
     Fits of whole trajectories allocate and free the same few large arrays again and again. By default the GNU C library
     maps each of them anew and the system clears every page, which takes a considerable part of a short run.
@@ -136,4 +142,10 @@ def keep_memory() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):  # another C library; TypeError: Windows wants a name
         return False
-    return bool(mallopt(_MMAP_THRESHOLD, KEPT)) and bool(mallopt(_TRIM_THRESHOLD, KEPT))
+    return bool(mallopt(_MMAP_THRESHOLD, LARGE)) and bool(mallopt(_TRIM_THRESHOLD, KEPT))
+
+
+def release_memory() -> None:
+    """Return freed memory to the system: what one stage of a diagnosis needs is no measure of the next."""
+    with suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)

@@ -28,7 +28,7 @@ class Candidate:
         return frozenset((p.effect.name, p.location) for p in self.placements)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
     """The best fit of a candidate: parameters theta (P,), cost (chi-square with priors), linearised trajectory.
 

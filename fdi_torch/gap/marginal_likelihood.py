@@ -134,8 +134,8 @@ def _between_samples(engine: Collocation, theta: Tensor, linearised: Linearised,
         before_next = (step < next_node)[:, None, None]
         step = step.clamp(max=len(experiment.steps) - 1)
         a, b = linearised.transition[0, step], linearised.gain[0, step] / areas
-        forcing = torch.where(before_next, a @ forcing + b, forcing)
-        transition = torch.where(before_next, a @ transition, transition)
+        moved, pushed = (a @ transition, a @ forcing + b) if offset else (a, b)
+        transition, forcing = torch.where(before_next, moved, transition), torch.where(before_next, pushed, forcing)
     paths = identity.reshape(1, n, n, 1).expand(1, n, n, len(experiment.nodes)).contiguous()
     output = engine.look(linearised.levels, theta).along(paths, [-1] * n)[0]
     return transition, forcing, output.permute(2, 0, 1)

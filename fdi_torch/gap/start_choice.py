@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -66,7 +67,7 @@ def likeliest_starts(
     of_shared, in_base = (torch.tensor([s.index(n) for n in shared]) for s in (engine.space, base.space))
     varied = torch.tensor([engine.space.index(n) for n in engine.by])
     theta = torch.stack([vector_of(engine.space, {**base.values, **s.values}) for s in about])
-    projected = _Projected.of(objective, base, in_base)
+    projected = _projected(objective, base, tuple(in_base.tolist()))
     reduced = _Varied(engine, theta[0], varied)
     low, high, scale = objective.box(engine.space)
     # A start that lacks a parameter of others has it at its nominal value.
@@ -161,6 +162,11 @@ class _Projected:
         """Products (L, P, M) of the basis with whitened columns (L, S, C, M); each lane apart, so that it gives the
         same alone and in a batch."""
         return torch.stack([self.basis.T @ lane.flatten(0, 1) for lane in columns])
+
+
+@lru_cache(maxsize=1)  # all candidates that extend one fit share it
+def _projected(objective: Objective, base: Fit, which: tuple[int, ...]) -> _Projected:
+    return _Projected.of(objective, base, torch.tensor(which))
 
 
 class _Varied:

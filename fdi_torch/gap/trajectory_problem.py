@@ -36,6 +36,8 @@ class Objective(Protocol):
     far: largest defect (m) of a trajectory that counts as converged.
     """
 
+    def __hash__(self) -> int: ...
+
     @property
     def far(self) -> float: ...
 

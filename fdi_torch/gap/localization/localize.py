@@ -79,9 +79,9 @@ def localize(
     for place, (expected, start) in sorted(first_order.items(), key=lambda item: -item[1][0]):
         if len(evaluated) >= CALIBRATION_PLACES and expected + excess < needed:
             break
-        first = ascent.with_finer_positions(ascent.evaluate(regression, regression.of(place), place, start))
-        found = ascent.climbed(first, needed)
-        itself = max(itself, *(e.without for e in (first, found) if e.regression is regression))
+        found = ascent.evaluate(regression, regression.of(place), place, start)
+        found = ascent.climbed(ascent.with_finer_positions(found), needed)
+        itself = max(itself, found.without if found.regression is regression else -math.inf)
         excess = max(excess, found.gain - expected)
         if not is_rounding_error(fitter, place, float(found.explained.square().mean(dim=0).max().sqrt())):
             needed, evaluated[place] = max(needed, found.gain + math.log(RARE)), found.localized(fitter)
@@ -96,7 +96,7 @@ def localize(
                 evaluated[place] = max(known, again.localized(fitter), key=gain_of)
     localized = list(evaluated.values())
     random = [*drifting_sensors(regression, likely, places, base, needed)]
-    random += random_flows(regression, likely, places, base)
+    random += random_flows(regression, likely, places, base, needed)
     for process in random:
         localized = [p for p in localized if p.location != process.location or p.gain > process.gain]
         if all(p.location != process.location for p in localized):
@@ -117,7 +117,7 @@ def localize_beside(
         regression = DiscrepancyRegression(fitter, fit, None, STEPS)
         likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
         processes = [*drifting_sensors(regression, likely, [at.location], base, needed)]
-        processes += random_flows(regression, likely, [at.location], base)
+        processes += random_flows(regression, likely, [at.location], base, needed)
         return max(processes, key=gain_of, default=None)
     ascent = Ascent(fitter, fit, noise, base)
     found = ascent.about(fit, at.explained, at.noise, at.location, at.frequency)

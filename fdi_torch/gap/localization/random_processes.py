@@ -10,7 +10,7 @@ parameters: the prior of the size is log-uniform between a tenth of the sensor n
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -27,30 +27,53 @@ from fdi_torch.gap.localization.localized_discrepancy import (
     nearly_without_disturbances,
 )
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, with_disturbances
+from fdi_torch.gap.trajectory_problem import SHARE
 from fdi_torch.simulate.collocation import Linearised
 
 SMALLEST_DRIFT = 0.1  # as a share of the sensor's noise
 
 
 def random_flows(
-    regression: DiscrepancyRegression, noise: StateNoise, places: Sequence[str], base: float
+    regression: DiscrepancyRegression, noise: StateNoise, places: Sequence[str], base: float, needed: float
 ) -> list[LocalizedDiscrepancy]:
     """The tank with the largest disturbance, if more likely an unknown flow than one of the disturbances of the plant.
 
-    The prior of its logarithm is uniform over the range of the estimate instead of normal about the others'.
+    The prior of its logarithm is uniform over the range of the estimate instead of normal about the others'. needed: as
+    in `drifting_sensors`.
     """
     fitter, fit, linearised = regression.fitter, regression.fit, regression.linearised
     largest = int(noise.intensity.argmax())
     tank = fitter.data.plant.tanks[largest].name
     if tank not in places or len(noise.intensity) < 2:
         return []
-    start = replace(noise, apart=largest)
-    apart = estimate_disturbances(fitter, fit, linearised, start=start).noise
     cost = math.log(2.0 * LOG_BOUND / (SCATTER * math.sqrt(2.0 * math.pi)))
-    gain = log_evidence(fitter, fit, apart, linearised) - base - cost
-    size = _moved(with_disturbances(fitter, fit, apart, linearised), linearised)
     nothing = torch.zeros_like(fitter.data.readings)
-    return [LocalizedDiscrepancy(tank, gain, gain + cost, 1, nothing, None, size, None, fit, apart)]
+
+    def evaluate(apart: StateNoise) -> LocalizedDiscrepancy:
+        gain = log_evidence(fitter, fit, apart, linearised) - base - cost
+        size = _moved(with_disturbances(fitter, fit, apart, linearised), linearised)
+        return LocalizedDiscrepancy(tank, gain, gain + cost, 1, nothing, None, size, None, fit, apart)
+
+    return [_most_likely(regression, linearised, evaluate, replace(noise, apart=largest), needed)]
+
+
+def _most_likely(
+    regression: DiscrepancyRegression,
+    linearised: Linearised,
+    evaluate: Callable[[StateNoise], LocalizedDiscrepancy],
+    start: StateNoise,
+    needed: float,
+) -> LocalizedDiscrepancy:
+    """A random process with its most likely parameters.
+
+    Its correlation time stays that of `start` if its gain is then below SHARE of what it lacks to be relevant.
+    """
+    fitter, fit = regression.fitter, regression.fit
+    first = evaluate(estimate_disturbances(fitter, fit, linearised, start=start, climb=False).noise)
+    if first.gain < SHARE * (needed - first.gain):
+        return first
+    climbed = evaluate(estimate_disturbances(fitter, fit, linearised, start=first.noise).noise)
+    return max(first, climbed, key=lambda d: d.gain)
 
 
 def _moved(fitter: Fitter, linearised: Linearised) -> float:
@@ -66,7 +89,7 @@ def _moved(fitter: Fitter, linearised: Linearised) -> float:
 def drifting_sensors(
     regression: DiscrepancyRegression, noise: StateNoise, places: Sequence[str], base: float, needed: float
 ) -> list[LocalizedDiscrepancy]:
-    """Sensors with a drift, as far as their gain in evidence can be relevant."""
+    """Sensors with a drift, as far as their gain in evidence can be relevant, which it is from `needed` on."""
     fitter, fit = regression.fitter, regression.fit
 
     def evaluate(noise: StateNoise) -> LocalizedDiscrepancy:
@@ -76,10 +99,6 @@ def drifting_sensors(
         cost = _drift_cost(fitter, noise.wander)
         nothing, size = torch.zeros_like(fitter.data.readings), _drift_size(fitter, noise.wander)
         return LocalizedDiscrepancy(sensor, gain - cost, gain, 2, nothing, None, size, None, fit, noise)
-
-    def most_likely(start: LocalizedDiscrepancy) -> LocalizedDiscrepancy:
-        linearised = regression.at(start.location)[1]
-        return evaluate(estimate_disturbances(fitter, fit, linearised, start=start.noise).noise)
 
     starts = [
         _initial_drift(fitter, regression.at(p)[1], nearly_without_disturbances(noise), channel)
@@ -91,7 +110,8 @@ def drifting_sensors(
     for initial in sorted(map(evaluate, starts), key=lambda d: d.gain, reverse=True):
         if drifts and initial.gain + noise_gain < needed:
             break
-        best = max(initial, most_likely(initial), key=lambda d: d.gain)
+        found = _most_likely(regression, regression.at(initial.location)[1], evaluate, initial.noise, needed)
+        best = max(initial, found, key=lambda d: d.gain)
         noise_gain = max(noise_gain, best.gain - initial.gain)
         needed = max(needed, best.gain + math.log(RARE))
         assert best.noise.wander is not None

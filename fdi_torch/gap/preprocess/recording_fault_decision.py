@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import islice
 
 import torch
 
@@ -65,21 +66,26 @@ def recording_fault(
     suspected = list(suspicions(CorrectedFits(plant, recording, as_is, noise, prior), constant))
     if not suspected:
         return None
-    faults = _weighed(suspected, as_is.log_likelihood)
+    silent = {c for s in suspected if s.fault.silent for c in s.fault.channels}
+    target = max(s.log_weight for s in suspected) - log_odds(SURE)
+    others = _weights_with_effects(as_is, {s.name for s in plant.sensors if s.column in silent}, target)
     rivals = [as_is.log_likelihood]
+    for rival in islice(others, RIVALS):
+        rivals.append(rival)
+        if most < rival:
+            return None
+    faults = _weighed(suspected, as_is.log_likelihood, max(rivals))
     if not _surely_faulty(faults, rivals):
         return None
-    silent = {c for s in suspected if s.fault.silent for c in s.fault.channels}
-    target = max(f.log_weight for f in faults) - log_odds(SURE)
-    for rival in _weights_with_effects(as_is, {s.name for s in plant.sensors if s.column in silent}, target):
+    for rival in others:
         rivals.append(rival)
         if not _surely_faulty(faults, rivals):
             return None
     return max(faults, key=lambda f: f.log_weight).fault
 
 
-def _weighed(suspected: Sequence[Suspicion], base: float) -> list[WeightedFault]:
-    """The fitted faults, without those that cannot be relevant against the likeliest.
+def _weighed(suspected: Sequence[Suspicion], base: float, rival: float) -> list[WeightedFault]:
+    """The fitted faults, without those that cannot be relevant against the likeliest fault or the likeliest rival.
 
     base: log-likelihood of the recording as it is. A fit may gain more than its first-order estimate, by the largest
     factor among all faults that were fitted so far.
@@ -87,7 +93,7 @@ def _weighed(suspected: Sequence[Suspicion], base: float) -> list[WeightedFault]
     faults: list[WeightedFault] = []
     factor = 1.0
     for s in sorted(suspected, key=lambda s: -s.log_weight):
-        best = max([base, *(f.log_weight for f in faults)])
+        best = max([rival, *(f.log_weight for f in faults)])
         if faults and base + factor * (s.log_weight - base) < best + math.log(RARE):
             continue
         faults.append(s.weigh())
