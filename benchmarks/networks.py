@@ -14,7 +14,7 @@ from fdi_torch.effects import build_network, placements_for
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.recording import Recording
-from fdi_torch.simulate import compiled
+from fdi_torch.simulate import compiled_engine
 from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.simulated_recording import clean_readings
@@ -45,12 +45,12 @@ def an_hour(plant: PlantDescription) -> Recording:
 
 def compiler_seconds(work: Callable[[], object]) -> float:
     """CPU seconds of processes that some work starts, with nothing in the cache yet."""
-    compiled._kernel.cache_clear()
+    compiled_engine._kernel.cache_clear()
     with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, XDG_CACHE_HOME=folder):
         before = os.times()
         work()
         after = os.times()
-    compiled._kernel.cache_clear()
+    compiled_engine._kernel.cache_clear()
     return after.children_user + after.children_system - before.children_user - before.children_system
 
 
