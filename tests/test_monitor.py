@@ -542,5 +542,5 @@ def test_a_sensor_without_readings_is_named_with_its_remedy() -> None:
     time, zeros = torch.arange(60.0, dtype=torch.float64), torch.zeros(60, 3, dtype=torch.float64)
     names = (("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3)
     recording = Recording(time, zeros[:, :2], zeros, *names, mask=mask, source="rig")
-    with pytest.raises(ValueError, match=r"rig \(0 to 50 s\): h2: .* got 1 in 51 samples; .* column or tag of h2"):
+    with pytest.raises(ValueError, match=r"rig \(0 to 50 s\): h2: .* got 1 in 51 samples, .* column or tag of h2"):
         fault_free_part(recording, 0.0, 50.0)
