@@ -34,7 +34,7 @@ from fdi_torch.gap.localization.sparse_regression import column_costs, sparse_fi
 from fdi_torch.gap.localization.whitened_discrepancy import WhitenedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, with_disturbances, with_estimated_noise
 from fdi_torch.gap.problem import problem_of
-from fdi_torch.simulate.collocation import Linearised
+from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.resampling import interpolate
 from tests.test_gap import noise, nominal_plant, recorded
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.parameters import ParameterName, ParameterSpace, is_effect_parameter
 from fdi_torch.plant.effect import Placement
-from fdi_torch.simulate.collocation import Linearised
+from fdi_torch.simulate.linearised import Linearised
 
 Key = frozenset[tuple[str, str]]
 

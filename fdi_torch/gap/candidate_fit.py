@@ -28,8 +28,9 @@ from fdi_torch.parameters import ParameterSpace, common_name, name_in_recording
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.scales import length_scale
-from fdi_torch.simulate.collocation import Collocation, Linearised
+from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.joint_collocation import JointCollocation
+from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.resampling import interpolate
 
 

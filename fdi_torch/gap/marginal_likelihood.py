@@ -25,8 +25,9 @@ from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.simulate.collocation import Collocation, Linearised
+from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
+from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.resampling import interpolate
 
 

@@ -22,8 +22,9 @@ from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace
 from fdi_torch.plant.effect import Placement, Stage
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.operating_range import OperatingRange
-from fdi_torch.simulate.collocation import Collocation, Linearised
+from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
+from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.scan import scan_in_time
 
 Start = Mapping[str, float]

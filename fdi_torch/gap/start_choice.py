@@ -22,8 +22,9 @@ from fdi_torch.estimate.linear_parameters import decomposed
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.trajectory_problem import NEARLY, Objective, TrajectoryProblem, corrected_trajectories, descend
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.simulate.collocation import Collocation, Linearised
+from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.joint_collocation import JointCollocation
+from fdi_torch.simulate.linearised import Linearised
 
 NEAR = 1.0  # chi-square units; starts are compared when less than this remained to gain
 SHARES = (1.0, 0.5, 0.25, 0.0)  # of the change of the linear parameters, which is taken as far as it lowers chi-square

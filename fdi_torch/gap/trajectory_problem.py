@@ -16,7 +16,7 @@ from torch import Tensor
 from fdi_torch.estimate.levenberg_marquardt import Competition, RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.linearisation import Linearisation, are_all_lanes
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.simulate.collocation import Linearised
+from fdi_torch.simulate.linearised import Linearised
 
 # A fit has converged if a further step is predicted to gain less than this share of the chi-square per reading, or of
 # one if that is more. Parameters are then within a tenth of a standard error, misfit included.

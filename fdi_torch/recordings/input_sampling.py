@@ -15,7 +15,6 @@ import math
 from collections.abc import Iterator
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.metered_flow import MeteredFlow
@@ -91,17 +90,18 @@ def _score_of_the_next(recording: Recording, plant: PlantDescription, pump: Mete
     into = 1.0 if pump.target == pump.near_tank else -1.0
     change = torch.diff(readings)[rows] / torch.diff(recording.time)[rows] * into * math.copysign(1.0, gain)
     command = recording.inputs[:, recording.input_names.index(pump.channel)]
-    regressors = torch.stack([command[rows + lag] for lag in range(1, -PAST - 1, -1)], dim=1)
+    # The command to come is the last regressor: by QR, its coefficient and variance need the last row of R alone.
+    regressors = torch.stack([command[rows + lag] for lag in range(-PAST, 2)], dim=1)
     known = torch.isfinite(change) & torch.isfinite(regressors).all(dim=1)
     x, y = regressors[known], change[known]
-    x, y = x - x.mean(dim=0), y - y.mean()
-    rank = int(torch.linalg.matrix_rank(x)) if len(x) else 0
     freedom = len(x) - x.shape[1] - 1
-    if rank < x.shape[1] or freedom < 1:
+    if freedom < 1 or int(torch.linalg.matrix_rank(x - x.mean(dim=0))) < x.shape[1]:
         return 0.0
-    estimate: Tensor = torch.linalg.lstsq(x, y.unsqueeze(1)).solution.squeeze(1)
-    variance = float((y - x @ estimate).square().sum()) / freedom * float(torch.linalg.inv(x.T @ x)[0, 0])
-    return float(estimate[0]) / math.sqrt(variance)
+    q, r = torch.linalg.qr(x - x.mean(dim=0))
+    y = y - y.mean()
+    explained = q.T @ y
+    error = float((y - q @ explained).square().sum() / freedom) ** 0.5
+    return float(explained[-1] * r[-1, -1].sign()) / error if error > 0.0 else 0.0
 
 
 def _scatter(recording: Recording, plant: PlantDescription, tank: str) -> float:

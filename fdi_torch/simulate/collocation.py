@@ -14,7 +14,6 @@ vectors), K steps, S samples, C sensors, P parameters.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -27,6 +26,7 @@ from fdi_torch.plant.scales import length_scale
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.actuation import Actuation, with_parameters
 from fdi_torch.simulate.experiment import Experiment
+from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.midpoint import newton_correction, newton_step
 from fdi_torch.simulate.output_map import LinearisedOutputs, OutputMap
 from fdi_torch.simulate.pointwise import partials, partials_of
@@ -36,38 +36,6 @@ from fdi_torch.simulate.scan import scan_in_time
 # of one tank.
 CONVERGED, ONE_CONVERGED = 1e-7, 1e-5
 ONE_ROUNDS = 8  # most corrections of one tank
-
-
-@dataclass(frozen=True)
-class Linearised:
-    """A trajectory, its readings and their first derivatives.
-
-    levels (L, K+1, n) m: the corrected trajectory of the n = `network.order` states, the tanks' levels first; slopes
-    (L, K+1, n, P): its sensitivity. readings (L, S, C) and jacobian (L, S, C, P): the same at the sensors. transition
-    (L, K, n, n) and gain (L, K, n, n): a disturbance w of the rates over step k adds gain_k w to the next state, and
-    transition propagates it. defect (L,): the largest correction of a state, m. origin (L, K+1, n) m: the trajectory
-    before the correction, about which it is linearised.
-    """
-
-    levels: Tensor
-    slopes: Tensor
-    readings: Tensor
-    jacobian: Tensor
-    transition: Tensor
-    gain: Tensor
-    defect: Tensor
-    origin: Tensor
-
-    def lanes(self, which: Tensor) -> Linearised:
-        """The selected lanes (indices or a mask)."""
-        return Linearised(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
-
-    def replaced(self, which: Tensor, new: Linearised) -> Linearised:
-        """The same with the lanes at indices `which` replaced by those of `new`."""
-        if len(which) == len(self.defect):
-            return new
-        names = self.__dataclass_fields__
-        return Linearised(*(getattr(self, n).index_copy(0, which, getattr(new, n)) for n in names))
 
 
 class Collocation:

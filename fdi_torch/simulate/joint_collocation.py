@@ -10,7 +10,8 @@ from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace, name_in_recording
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.simulate.collocation import Collocation, Linearised
+from fdi_torch.simulate.collocation import Collocation
+from fdi_torch.simulate.linearised import Linearised
 
 
 class JointCollocation:

@@ -29,8 +29,9 @@ from fdi_torch.gap.localization.regressors import harmonics, step_functions, tim
 from fdi_torch.gap.marginal_likelihood import predicted_levels
 from fdi_torch.plant.description import OUTSIDE, Sensor
 from fdi_torch.plant.scales import time_scale
-from fdi_torch.simulate.collocation import Collocation, Linearised
+from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
+from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.output_map import LinearisedOutputs
 from fdi_torch.simulate.resampling import interpolate
 from fdi_torch.simulate.scan import product, scan_in_time

@@ -15,7 +15,7 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.regressors import HARMONICS
 from fdi_torch.gap.marginal_likelihood import occam, with_disturbances
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.simulate.collocation import Linearised
+from fdi_torch.simulate.linearised import Linearised
 
 
 @dataclass(frozen=True)

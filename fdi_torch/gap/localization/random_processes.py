@@ -28,7 +28,7 @@ from fdi_torch.gap.localization.localized_discrepancy import (
 )
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, with_disturbances
 from fdi_torch.gap.trajectory_problem import SHARE
-from fdi_torch.simulate.collocation import Linearised
+from fdi_torch.simulate.linearised import Linearised
 
 SMALLEST_DRIFT = 0.1  # as a share of the sensor's noise
 

@@ -25,7 +25,7 @@ from fdi_torch.gap.localization.component_regressors import discrepancy_model_at
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.sparse_regression import column_costs
 from fdi_torch.plant.description import OUTSIDE
-from fdi_torch.simulate.collocation import Linearised
+from fdi_torch.simulate.linearised import Linearised
 
 SIGNS = 64  # random sign vectors; the diagonal of C'C is then accurate to about 20 %
 
