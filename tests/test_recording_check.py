@@ -275,8 +275,8 @@ def test_a_command_that_is_held_from_sample_to_sample_is_accepted(faults: dict[s
 
 def test_a_constant_level_says_nothing_of_how_a_command_is_held() -> None:
     recording = with_q1(held_at_random(1.0, 3.0, 400, 0))
-    outputs = torch.full_like(recording.outputs, 0.5)
-    assert inputs_not_held(replace(recording, outputs=outputs), PLANT) == []
+    still = replace(recording, inputs=recording.inputs.double(), outputs=torch.full_like(recording.outputs, 0.5))
+    assert inputs_not_held(still, PLANT) == []
 
 
 def test_how_fast_a_command_moves_is_said() -> None:
