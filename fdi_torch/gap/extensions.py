@@ -68,5 +68,6 @@ def best_pairs(pairs: Pairs, count: int) -> list[Candidate]:
 
 def _joint_start(pairs: Pairs, i: int, j: int) -> dict[str, float]:
     pick = torch.tensor([i, j])
-    sizes = torch.linalg.lstsq(pairs.gram[pick][:, pick], pairs.score[pick].unsqueeze(1)).solution.flatten().tolist()
+    # The last bits of `torch.linalg.lstsq` depend on where its arguments lie in memory.
+    sizes = (torch.linalg.pinv(pairs.gram[pick][:, pick], hermitian=True) @ pairs.score[pick]).tolist()
     return sized(pairs.options[i], sizes[0]) | sized(pairs.options[j], sizes[1])
