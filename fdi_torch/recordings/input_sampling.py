@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from statistics import NormalDist
 
 import torch
 
@@ -74,7 +75,7 @@ def inputs_not_held(recording: Recording, plant: PlantDescription) -> list[str]:
     names = {finding.channel for finding in undersampled_inputs(recording, plant)}
     if recording.hold != "zero_order" or not names:
         return []
-    limit = math.sqrt(2.0) * float(torch.special.erfinv(torch.tensor(1.0 - 2.0 * BY_CHANCE / len(names)).double()))
+    limit = NormalDist().inv_cdf(1.0 - BY_CHANCE / len(names))
     pumps = {pump.channel: pump for pump in plant.metered_flows()}
     return [name for name in pumps if name in names and _score_of_the_next(recording, plant, pumps[name]) > limit]
 
