@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[1] / "fdi_torch"
 # Lowest first. A room imports from rooms further down, and sideways only where that closes no circle.
 LAYERS = (
     {
+        "amounts",
         "capacity",
         "clock",
         "disk",

@@ -153,7 +153,7 @@ def test_a_rig_in_code_from_simulation_to_report(tmp_path: Path) -> None:
     row = found.table().columns["parameter"].index("A.leak.size")
     estimate_of, error_of = (found.table().columns[name][row] for name in ("estimate", "std error"))
     assert abs(estimate_of - 0.3) < 4.0 * error_of < 0.2
-    assert found.headline.startswith("single fault: A.leak.size = 0.") and "A.leak.size" in repr(found)
+    assert found.headline.startswith("single fault: leak at A (size 0.") and "A.leak.size" in repr(found)
     assert "<table>" in found._repr_html_()
     # 200 cm^2 x 60 cm are 12 l, which leave in 2 A sqrt(H) / (0.6 * 0.5e-4 * sqrt(2 g)) = 233.17 s
     assert "<td>A</td><td>12</td><td>233.1" in RIG._repr_html_()
@@ -168,7 +168,7 @@ def test_a_rig_in_code_from_simulation_to_report(tmp_path: Path) -> None:
 def test_a_gap_is_found_closed_and_adopted_in_python(tmp_path: Path) -> None:
     recording, other = simulated(**{"Q.pump_lag.time_constant": "12 s"}), simulated(**{"Q.pump_gain.factor": 0.8})
     found = fdi_torch.gap(RIG, other, recording, out=tmp_path, library=("pump_gain", "leak"))
-    assert found.answer.verdict == "named" and "pump_gain at Q" in found.headline
+    assert found.answer.verdict == "named" and "pump gain at Q" in found.headline
     assert found.table().columns["parameter"] == ["factor"] and len(found.explanations()) >= 1
     better = found.adopted()
     before, after = (fdi_torch.predict(plant, other).prediction.rmse["h"] for plant in (RIG, better))
@@ -186,7 +186,7 @@ def test_a_monitor_runs_along_a_recording_in_memory(tmp_path: Path) -> None:
     wanted = {"plant": RIG, "recording": recording, "fault_free": ["0 s", "300 s"], "faults": ["A.leak"]}
     wanted["output"] = {"folder": str(tmp_path)}
     found = fdi_torch.monitor(wanted)
-    size, error = re.fullmatch(r"1 alarm in 700 s; A\.leak\.size = (.*) ± (.*)", found.headline).groups()  # type: ignore[union-attr]
+    size, error = re.fullmatch(r"1 alarm in 700 s; leak at A \(size (.*) ± (.*)\)", found.headline).groups()  # type: ignore[union-attr]
     assert abs(float(size) - 0.3) < 3.0 * float(error) < 0.01
     table = found.table().columns
     kinds = [kind for kind in table["kind"] if kind not in ("notice", "watching")]

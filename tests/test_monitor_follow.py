@@ -146,7 +146,7 @@ def test_every_event_lies_in_the_log_from_which_a_page_is_made(
     assert sum(1 for _ in run.messages(["/observer/residual"])) == SAMPLES - 1
     assert main(["report", str(path), "--out", str(tmp_path), "--quiet"]) == 0
     page = path.with_suffix(".html") if path.with_suffix(".html").exists() else next(tmp_path.rglob("*.html"))
-    assert "T3.leak.size = 0.0" in page.read_text()
+    assert "leak at T3 (size 0.0" in page.read_text()
 
 
 @pytest.mark.parametrize("options", ["", "--json", "--follow --idle 0.5"])

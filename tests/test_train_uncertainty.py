@@ -86,7 +86,7 @@ def test_faults_that_are_not_isolated_are_present_in_their_combination(
     assert combination.coefficients == pytest.approx((1.0, -1.0), abs=1e-5)
     assert combination.value == pytest.approx(0.2, abs=3.0 * combination.std) and combination.std < 0.05
     assert done.result.diagnosis.not_isolated == (combination,)
-    assert done.headline.startswith("fault not isolated: T2.leak.size or OUT2.plugging.size (T2.leak.size - OUT2.plug")
+    assert done.headline.startswith("fault not isolated: leak at T2 or plugging at OUT2 (T2.leak.size - OUT2.plug")
     material = gather(fdi_torch.read_run(done.log), load_plant("three_tank"))
     assert headline(material).startswith("Fault not isolated: leak at T2 or plugging at OUT2 (T2.leak.size - OUT2.plug")
     html = page([report_of(material)])

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from functools import partial
 
+from fdi_torch.amounts import parameter_words
 from fdi_torch.cli import DONE, NOT_CONVERGED
 from fdi_torch.cli.explained import exit_code, say_first
 from fdi_torch.cli.options import live, overrides
@@ -133,7 +134,7 @@ def in_words(done: TrainResult) -> list[str]:
             parts.append(f"{quantity_text(fault.flow, 'm^3/s', 3)} at the mean levels")
         if fault.hole is not None:
             parts.append(f"equivalent to a sharp-edged hole of {1e3 * fault.hole:.3g} mm")
-        lines.append(f"- {fault.name}: " + ", ".join(parts))
+        lines.append(f"- {parameter_words(fault.name)}: " + ", ".join(parts))
     lines += [f"- {name} lies at the {end} end of its range" for name, end in final.at_bounds.items()]
     lines += [f"- {sentence}" for sentence in final.undetermined]
     return lines

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from fdi_torch.amounts import parameter_words
 from fdi_torch.cli.screen import Screen
 from fdi_torch.estimate.stretches import Stretch
 from fdi_torch.estimate.windows import WindowFault
@@ -48,7 +49,7 @@ def _size(fault: WindowFault | Stretch, beyond: str) -> tuple[str, str]:
 
 def _name(fault: WindowFault | Stretch) -> str:
     unit, _ = display_unit(fault.unit, fault.name)
-    return f"{fault.name}, {unit}" if unit else fault.name
+    return f"{parameter_words(fault.name)}, {unit}" if unit else parameter_words(fault.name)
 
 
 def _cell(fault: WindowFault) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
+from fdi_torch.amounts import with_error
 from fdi_torch.estimate.information import Certainty, determined_combinations
 from fdi_torch.parameters import ParameterSpace, display_unit
 
@@ -54,7 +55,8 @@ class Combination:
     @property
     def words(self) -> str:
         """'a + 0.8 b = 0.0994 ± 0.0023', in the units for display."""
-        return value_text(self.formula, self.value, self.std, self.unit, self.parameters[0])
+        unit, scale = display_unit(self.unit, self.parameters[0])
+        return f"{self.formula} = {with_error(scale * self.value, scale * self.std)} {unit}".rstrip()
 
     def interval(self, confidence: float = 0.95) -> tuple[float, float]:
         """Confidence interval, from the normal distribution."""
@@ -117,12 +119,6 @@ def undetermined_groups(space: ParameterSpace, theta: Tensor, sure: Certainty) -
             )
         groups.append(UndeterminedGroup(tuple(space.names[i] for i in members), tuple(combinations)))
     return tuple(groups)
-
-
-def value_text(text: str, value: float, std: float, si_unit: str, name: str) -> str:
-    """'T1.leak.size = 0.3 ± 0.002', in the unit for display of the parameter `name`."""
-    unit, scale = display_unit(si_unit, name)
-    return f"{text} = {scale * value:.4g} ± {scale * std:.2g} {unit}".rstrip()
 
 
 def _verb(subjects: Sequence[str]) -> str:

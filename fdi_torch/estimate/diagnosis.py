@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fdi_torch.estimate.combinations import Combination, listed, value_text
+from fdi_torch.amounts import estimate_words, parameter_words, sized_words
+from fdi_torch.estimate.combinations import Combination, listed
 from fdi_torch.estimate.misfit import Misfit
 from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace, common_name
 from fdi_torch.plant.effect import Stage
@@ -71,18 +72,23 @@ class Diagnosis:
 
     @property
     def names(self) -> str:
-        """The faults that are present, such as 'T1.leak.size, T2.leak.size or OUT2.plugging.size'; may be empty."""
-        return ", ".join([*(f.name for f in self.present), *(listed(c.parameters, "or") for c in self.not_isolated)])
+        """The faults that are present, such as 'leak at T1, leak at T2 or plugging at OUT2'; may be empty."""
+        return ", ".join([*(parameter_words(f.name) for f in self.present), *map(_rivals, self.not_isolated)])
 
     @property
     def headline(self) -> str:
-        """Kind and sizes, such as 'single fault: T1.leak.size = 0.3 ± 0.002'.
+        """Kind and sizes, such as 'single fault: leak at T1 (size 0.3000 ± 0.0020)'.
 
         It begins with a warning if the model does not explain the recording.
         """
-        sizes = [value_text(f.name, f.value, f.std, f.unit, f.name) for f in self.present]
-        sizes += [f"{listed(c.parameters, 'or')} ({c.words})" for c in self.not_isolated]
+        sizes = [sized_words(f.name, [estimate_words(f.name, f.unit, f.value, f.std)]) for f in self.present]
+        sizes += [f"{_rivals(c)} ({c.words})" for c in self.not_isolated]
         return self.misfit.headline(f"{self.kind}: {'; '.join(sizes)}" if sizes else self.kind)
+
+
+def _rivals(combination: Combination) -> str:
+    """'leak at T2 or plugging at OUT2'."""
+    return listed([parameter_words(name) for name in combination.parameters], "or")
 
 
 def diagnose(

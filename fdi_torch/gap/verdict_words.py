@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from fdi_torch.amounts import effect_words
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import UNKNOWN
 from fdi_torch.parameters import quantity_text
@@ -52,12 +53,12 @@ def rounding_words(causes: Sequence[Named]) -> str:
 
 def cause_words(cause: Named) -> str:
     """'leak at T1', 'something unknown at Q1'."""
-    effect = "something unknown" if cause.get("effect") == UNKNOWN else cause.get("effect", "")
-    return f"{effect} at {cause.get('location', '')}"
+    effect = "something unknown" if cause.get("effect") == UNKNOWN else str(cause.get("effect", ""))
+    return effect_words(effect, str(cause.get("location", "")))
 
 
 def explanation_words(causes: Sequence[Named]) -> str:
-    """'leak at T1 and pump_lag at Q1', or that nothing lies beyond tolerances; without the rounding of readings."""
+    """'leak at T1 and pump lag at Q1', or that nothing lies beyond tolerances; without the rounding of readings."""
     return " and ".join(map(cause_words, apart_from_rounding(causes))) or "nothing beyond tolerances"
 
 

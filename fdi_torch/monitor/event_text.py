@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
+from fdi_torch.amounts import estimate_words, parameter_words, sized_words
 from fdi_torch.monitor.alarm_state import Alarm
 from fdi_torch.monitor.events import (
     Event,
@@ -13,7 +14,6 @@ from fdi_torch.monitor.events import (
     Kind,
     Limit,
     Size,
-    amount_text,
     headline,
     rate_text,
     shares_text,
@@ -24,6 +24,7 @@ from fdi_torch.monitor.level_forecast import forecast_limits
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, HiddenFault, MonitorState
 from fdi_torch.monitor.observer_bank import ObserverBank
+from fdi_torch.parameters import ParameterName
 
 FORECAST_WINDOWS = 4.0  # horizon of the level forecast, in longest windows
 
@@ -91,24 +92,23 @@ class EventWriter:
     ) -> Event:
         """Recovery of the faults of one alarm. observable: whether the readings would show them if still present."""
         explanations = tuple(self.explanation(f, state, change) for f in fits)
-        text = f"{', '.join(names)}: back to nominal, {_onset_text(fits[0])}"
+        faults = ", ".join(map(parameter_words, names))
+        text = f"{faults}: back to nominal, {_onset_text(fits[0])}"
         if " or " in headline(explanations):
             text += f"; {headline(explanations)}"
         if not observable:
-            text = (
-                f"{', '.join(names)}: the readings since {fits[0].onset:.1f} s would not show whether it still stands"
-            )
+            text = f"{faults}: the readings since {fits[0].onset:.1f} s would not show whether it still stands"
         kind: Kind = "recovered" if observable else "cannot tell"
         delay = change.alarm_time - fits[0].onset
         return self._event(state, kind, text, state.alarm(number), explanations=explanations, delay=delay)
 
     def end_shown(self, state: MonitorState, number: int, faults: Sequence[HiddenFault]) -> Event:
         """The end of hidden faults of one alarm, once the readings have shown it."""
-        names = [self.space.names[f.track.column] for f in faults]
+        names = [parameter_words(self.space.names[f.track.column]) for f in faults]
         ended = max(f.ended for f in faults)
         text = f"{', '.join(names)}: back to nominal, as the readings since {max(f.seen for f in faults):.1f} s show"
-        nominal = [self.space[name] for name in names]
-        sizes = tuple(Size(p.name, p.nominal, 0.0, p.unit, amount_text(p, p.nominal, 0.0)) for p in nominal)
+        nominal = [self.space.parameters[f.track.column] for f in faults]
+        sizes = tuple(Size(p.name, p.nominal, 0.0, p.unit, estimate_words(p.name, p.unit, p.nominal)) for p in nominal)
         explanations = (Explanation(1.0, sizes, ended, gone=True),)
         return self._event(state, "recovered", text, state.alarm(number), explanations=explanations)
 
@@ -132,7 +132,7 @@ class EventWriter:
         """Summary of one alarm at the end of the recording."""
         tracks = [t for t in state.tracks if t.number == alarm.number]
         sizes = "; ".join(f"{self._track_text(t)}, since {t.onset:.1f} s" for t in tracks)
-        faults = sizes or ", ".join(alarm.faults)
+        faults = sizes or ", ".join(map(parameter_words, alarm.faults))
         if alarm.count > 1:
             times = f"raised {alarm.count} times, {alarm.first:g} s to {alarm.last:g} s"
         else:
@@ -147,7 +147,7 @@ class EventWriter:
         for c in h.columns:
             p, size, std = self.space.parameters[c], float(fit.value[c]), float(fit.std[c])
             if change is not None and c in [f.track.column for f in state.hidden]:
-                sizes.append(Size(p.name, size, float("inf"), p.unit, f"{p.name} unknown"))
+                sizes.append(Size(p.name, size, float("inf"), p.unit, f"{ParameterName.parse(p.name).field} unknown"))
                 continue
             grows = change is not None and h.incipient and c in h.sizes and now > fit.onset
             rate = (size - float(change.before[c])) / (now - fit.onset) if grows and change else None
@@ -186,9 +186,8 @@ class EventWriter:
 
     def _track_text(self, track: FaultTrack) -> str:
         size = self._track_size(track)
-        return size.shown + (
-            f", changes by {rate_text(self.space[size.name], size.rate)}" if size.rate is not None else ""
-        )
+        rate = [f"changes by {rate_text(self.space[size.name], size.rate)}"] if size.rate is not None else []
+        return sized_words(size.name, [size.shown, *rate])
 
     def _event(self, state: MonitorState, kind: Kind, text: str, alarm: Alarm | None = None, **more: object) -> Event:
         off = (state.believed != state.healthy).nonzero().flatten().tolist()

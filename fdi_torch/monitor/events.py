@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from fdi_torch.amounts import amount_words, estimate_words, parameter_words, sized_words
 from fdi_torch.clock import clock_text
 from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.monitor.alarm_state import State
-from fdi_torch.parameters import Parameter, display_unit
+from fdi_torch.parameters import Parameter, ParameterName, display_unit
 
 Kind = Literal[
     "watching",
@@ -32,7 +33,8 @@ SMALLEST_SHARE = 0.05  # headlines name explanations with at least this probabil
 
 @dataclass(frozen=True)
 class Size:
-    """One parameter that an explanation changes. size, std: in `unit`, SI; shown: text in a practical unit.
+    """One parameter that an explanation changes. size, std: in `unit`, SI; shown: the value as text with a
+    practical unit.
 
     at_end: whether the estimate reached an end of its range. Then `size` is that end, the true value lies there or
     beyond, and std is infinite. rate: growth of an incipient fault, in `unit` per s.
@@ -69,8 +71,7 @@ class Explanation:
     def text(self) -> str:
         if not self.sizes:
             return "chance"
-        shown = " + ".join(s.shown for s in self.sizes)
-        return shown.replace(" = ", " back to ") if self.gone else shown
+        return " and ".join(_words(sizes, self.gone) for sizes in _by_effect(self.sizes))
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,20 @@ def headline(explanations: Sequence[Explanation]) -> str:
     named = [e for k, e in enumerate(explanations) if k == 0 or e.mass >= SMALLEST_SHARE]
     if len(named) == 1:
         return named[0].text
-    return " or ".join(f"{e.text} ({percent_text(e.mass)})" for e in named)
+    return ", or ".join(f"{e.text}, {percent_text(e.mass)}" for e in named)
+
+
+def _by_effect(sizes: Sequence[Size]) -> list[list[Size]]:
+    grouped: dict[str, list[Size]] = {}
+    for size in sizes:
+        grouped.setdefault(ParameterName.parse(size.name).prefix, []).append(size)
+    return list(grouped.values())
+
+
+def _words(sizes: Sequence[Size], gone: bool) -> str:
+    """'leak at A (size 0.200 ± 0.010)', or 'leak at A back to size 0' for one that has gone."""
+    shown = [s.shown for s in sizes]
+    return f"{parameter_words(sizes[0].name)} back to {', '.join(shown)}" if gone else sized_words(sizes[0].name, shown)
 
 
 def percent_text(mass: float) -> str:
@@ -199,17 +213,11 @@ def size_of(p: Parameter, size: float, std: float, rate: float | None = None) ->
     """A parameter's estimate as events report it."""
     end = end_reached(p, size)
     if end is None:
-        return Size(p.name, size, std, p.unit, amount_text(p, size, std), rate=rate)
+        return Size(p.name, size, std, p.unit, estimate_words(p.name, p.unit, size, std), rate=rate)
     unit, scale = display_unit(p.unit, p.name)
-    most = f"{p.name} at {'least' if end == p.high else 'most'} {scale * end:.4g} {unit}".rstrip()
-    return Size(p.name, end, math.inf, p.unit, f"{most}, the end of its range", at_end=True)
-
-
-def amount_text(p: Parameter, size: float, std: float) -> str:
-    """'Q1.pump_offset.offset = 23.1 ± 0.4 cm^3/s', in a practical unit."""
-    unit, scale = display_unit(p.unit, p.name)
-    error = f" ± {scale * std:.2g}" if std > 0.0 else ""
-    return f"{p.name} = {scale * size:.4g}{error} {unit}".rstrip()
+    most = f"at {'least' if end == p.high else 'most'} {scale * end:.4g}"
+    shown = f"{amount_words(p.name, most, unit)}, the end of its range"
+    return Size(p.name, end, math.inf, p.unit, shown, at_end=True)
 
 
 def rate_text(p: Parameter, rate: float) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from fdi_torch.amounts import amount_words
 from fdi_torch.effects import effect
 from fdi_torch.estimate.combinations import Combination
 from fdi_torch.gap.verdict_words import apart_from_rounding, cause_words, equivalents_words
@@ -41,22 +42,17 @@ class DiagnosedEffect:
     @property
     def words(self) -> str:
         """'leak at T1', 'something unknown at Q1'."""
-        return cause_words(readable({"effect": self.effect, "location": self.location}))
+        return cause_words({"effect": self.effect, "location": self.location})
 
     @property
     def sized(self) -> str:
         """'leak at T1 (size 0.3000 ± 0.0020, 33.1 cm³/s)': the effect with its size and, if it has one, its flow."""
-        unit, scale = shown_unit(self.unit, f"{self.location}.{self.effect}.{self.quantity}")
+        name = f"{self.location}.{self.effect}.{self.quantity}"
+        unit, scale = shown_unit(self.unit, name)
         value = with_error(scale * self.size, scale * self.std)
-        size = f"{self.quantity.replace('_', ' ')} {value}" if unit in ("", "1") else f"{value} {unit}"
-        sizes = [size] if math.isfinite(self.size) else []
+        sizes = [amount_words(name, value, unit)] if math.isfinite(self.size) else []
         sizes += [f"{amount(self.flow, 'm^3/s', 3)}"] if math.isfinite(self.flow) else []
         return f"{self.words} ({', '.join(sizes)})" if sizes else self.words
-
-
-def readable(cause: Mapping[str, Any]) -> dict[str, Any]:
-    """The cause with its effect in words: pump_lag -> 'pump lag'."""
-    return {**cause, "effect": str(cause.get("effect", "")).replace("_", " ")}
 
 
 def diagnosed_effects(material: Material) -> list[DiagnosedEffect]:
@@ -85,12 +81,6 @@ def combinations_of(material: Material, result: str) -> list[Combination]:
         return []
 
 
-def fault_at(name: str) -> tuple[str, str]:
-    """A parameter's full name, 'L.leak.size', as an effect in words and its place: 'leak', 'L'."""
-    at = ParameterName.of_effect(name)
-    return (at.effect.replace("_", " "), at.place) if at.place else (name, "")
-
-
 def _cause(cause: Mapping[str, Any], plant: PlantDescription | None) -> DiagnosedEffect:
     """A log may hold the parameters in any order: which is the size, the effect itself says."""
     name, location, parameters = str(cause["effect"]), str(cause["location"]), cause.get("parameters", {})
@@ -98,7 +88,7 @@ def _cause(cause: Mapping[str, Any], plant: PlantDescription | None) -> Diagnose
     quantity = quantity if quantity in parameters else next(iter(parameters), "size")
     size: Mapping[str, Any] = parameters.get(quantity, {})
     value, std = as_float(size.get("value")), as_float(size.get("std"))
-    others = equivalents_words({"same_as": [readable(c) for c in cause.get("same_as") or []]})
+    others = equivalents_words({"same_as": cause.get("same_as") or []})
     unit = str(size.get("unit", ""))
     return DiagnosedEffect(name, location, True, value, std, unit, quantity=quantity, equivalents=others)
 

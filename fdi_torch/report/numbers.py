@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fdi_torch import amounts
 from fdi_torch.parameters import display_unit, significant
 
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
@@ -51,19 +52,8 @@ def number(value: float, digits: int = 4) -> str:
 
 
 def with_error(value: float, std: float) -> str:
-    """'0.3000 ± 0.0020', '(2.44 ± 0.24)·10⁻⁷': the error with two digits, the value with as many decimals.
-
-    A value with an infinite error is not determined.
-    """
-    if std == math.inf:
-        return "not determined"
-    if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
-        return number(value)
-    if (largest := max(abs(value), std)) < 1e-3:
-        exponent = math.floor(math.log10(largest))
-        return f"({with_error(value / 10.0**exponent, std / 10.0**exponent)})·10{str(exponent).translate(_RAISED)}"
-    digits = min(max(1 - math.floor(math.log10(std)), 0), 12)
-    return _minus(f"{value:.{digits}f} ± {std:.{digits}f}") if abs(value) < 1e9 else f"{number(value)} ± {std:.2g}"
+    """'0.3000 ± 0.0020': the error with two digits, the value with as many decimals; a dash for NaN."""
+    return _minus(amounts.with_error(value, std)) if math.isfinite(value) else number(value)
 
 
 def percent(share: float) -> str:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from fdi_torch.amounts import parameter_words
 from fdi_torch.clock import clock_text
 from fdi_torch.estimate.combinations import Combination
 from fdi_torch.estimate.misfit import UNRELIABLE, Misfit
 from fdi_torch.gap.verdict_words import verdict_sentence
-from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects, fault_at, readable
+from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
 from fdi_torch.report.sections.rehearsal import rehearsal_tables
@@ -77,15 +78,13 @@ def fault_words(material: Material) -> str:
 
 
 def _rivals(combination: Combination) -> str:
-    effects = [fault_at(name) for name in combination.parameters]
-    return f"{' or '.join(f'{effect} at {place}' for effect, place in effects)} ({combination.words})"
+    return f"{' or '.join(map(parameter_words, combination.parameters))} ({combination.words})"
 
 
 def gap_words(material: Material) -> str:
     """The sentence of the terminal, with the sizes of the named causes."""
     sized = _listed([finding.sized + finding.equivalents for finding in diagnosed_effects(material)])
-    certain = [readable(cause) for cause in material.answer.get("certain") or []]
-    return verdict_sentence({**material.answer, "certain": certain}, sized).removesuffix(".")
+    return verdict_sentence(material.answer, sized).removesuffix(".")
 
 
 def monitor_words(material: Material) -> str:
@@ -174,8 +173,7 @@ def windows_words(material: Material) -> str:
         return ""
     when: dict[str, list[str]] = {}
     for stretch in stretches:
-        effect, place = fault_at(str(stretch["name"]))
-        spans = when.setdefault(f"{effect} at {place}" if place else effect, [])
+        spans = when.setdefault(parameter_words(str(stretch["name"])), [])
         spans.append(f"{number(float(stretch['start']), 6)} to {number(float(stretch['stop']), 6)} s")
     text = "; ".join(f"{fault} from {_listed(spans)}" for fault, spans in when.items()) or "no fault in any window"
     return text[:1].upper() + text[1:]

@@ -8,9 +8,13 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from fdi_torch.clock import clock_unit
-from fdi_torch.gap.verdict_words import FORMAT_1, apart_from_rounding, causes_of, rounding_words
-from fdi_torch.gap.verdict_words import explanation_words as in_words
-from fdi_torch.report.diagnosed_effects import readable
+from fdi_torch.gap.verdict_words import (
+    FORMAT_1,
+    apart_from_rounding,
+    causes_of,
+    explanation_words,
+    rounding_words,
+)
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, number, percent, probability_text, shown_unit, with_error
@@ -148,8 +152,3 @@ def _cause_rows(cause: Mapping[str, Any]) -> list[list[str]]:
         rows.append([effect, location, str(name).replace("_", " "), with_error(value, std)])
         rows[-1].append(clock_unit(unit, name, value))
     return rows or [[effect, location, "", "", ""]]
-
-
-def explanation_words(causes: Sequence[Mapping[str, Any]]) -> str:
-    """'leak at T1 and something unknown at Q1'."""
-    return in_words([readable(cause) for cause in causes])

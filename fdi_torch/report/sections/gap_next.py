@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from fdi_torch.gap.verdict_words import explanation_words
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import folded, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, as_vector, axis, number, percent, shown_unit
 from fdi_torch.report.section import Section, signals
-from fdi_torch.report.sections.gap import explanation_words
 from fdi_torch.report.style import MODEL
 
 MOST_LISTED = 40

@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects, fault_at
+from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number, shown_unit
 from fdi_torch.report.schematic import Overlay, schematic
@@ -66,8 +67,8 @@ def marks_of(material: Material) -> dict[str, list[str]]:
             size = "" if math.isnan(finding.size) else f" {number(scale * finding.size, 3)} {unit}".rstrip()
             marks.setdefault(finding.location, []).append(f"{finding.effect.replace('_', ' ')}{size}")
     for combination in combinations_of(material, "not_isolated"):
-        for effect, place in map(fault_at, combination.parameters):
-            marks.setdefault(place, []).append(f"{effect}, not isolated")
+        for fault in map(ParameterName.of_effect, combination.parameters):
+            marks.setdefault(fault.place, []).append(f"{fault.effect.replace('_', ' ')}, not isolated")
     return marks
 
 

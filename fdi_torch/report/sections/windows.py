@@ -8,6 +8,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from fdi_torch.amounts import parameter_words
 from fdi_torch.report.html import short, table
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, number, shown_unit, with_error
@@ -41,7 +42,7 @@ def _row(stretch: dict[str, Any]) -> list[str]:
     flow, flow_scale = shown_unit("m^3/s")
     moved = as_float(stretch.get("flow")) * flow_scale
     return [
-        str(stretch["name"]),
+        parameter_words(str(stretch["name"])),
         *(number(stretch[name], 6) for name in ("start", "stop")),
         f"{shown} {unit}".rstrip(),
         f"{number(moved, 3)} {flow}" if math.isfinite(moved) else "",

@@ -1,0 +1,63 @@
+"""Faults and estimates as text for people: terminal, page, log and Python say them in the same words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from fdi_torch.parameters import ParameterName, display_unit, significant
+
+_RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+
+
+def effect_words(effect: str, place: str) -> str:
+    """'pump lag at Q1', from the effect's name in files, pump_lag."""
+    return f"{effect.replace('_', ' ')} at {place}"
+
+
+def parameter_words(name: str) -> str:
+    """'T1.leak.size' -> 'leak at T1'; a constant, 'T1.area', -> 'area of T1'."""
+    at = ParameterName.parse(name)
+    if at.effect:
+        return effect_words(at.effect, at.place)
+    field = at.field.replace("_", " ")
+    return f"{field} of {at.place}" if at.place else field
+
+
+def sized_words(name: str, amounts: Sequence[str]) -> str:
+    """'leak at T1 (size 0.3004 ± 0.0020, 30 cm^3/s)'."""
+    return f"{parameter_words(name)} ({', '.join(amounts)})" if amounts else parameter_words(name)
+
+
+def amount_words(name: str, text: str, unit: str) -> str:
+    """'size 0.3' or '12 cm^3/s': the text of a parameter's value with its unit, or else with its name."""
+    return f"{text} {unit}" if unit not in ("", "1") else f"{ParameterName.parse(name).field.replace('_', ' ')} {text}"
+
+
+def estimate_words(name: str, si_unit: str, value: float, std: float = 0.0) -> str:
+    """'size 0.3004 ± 0.0020' or '12.0 ± 1.2 cm^3/s', from SI values."""
+    unit, scale = display_unit(si_unit, name)
+    return amount_words(name, with_error(scale * value, scale * std), unit)
+
+
+def with_error(value: float, std: float) -> str:
+    """'0.3000 ± 0.0020', '(2.44 ± 0.24)·10⁻⁷': the error with two digits, the value with as many decimals.
+
+    A value with an infinite error is not determined.
+    """
+    if std == math.inf:
+        return "not determined"
+    if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
+        return significant(value, 4) if math.isfinite(value) else "unknown"
+    if (largest := max(abs(value), std)) < 1e-3:
+        exponent = math.floor(math.log10(largest))
+        return f"({with_error(value / 10.0**exponent, std / 10.0**exponent)})·10{str(exponent).translate(_RAISED)}"
+    if abs(value) >= 1e9:
+        return f"{significant(value, 4)} ± {std:.2g}"
+    digits = decimals(std)
+    return f"{value:.{max(digits, 0)}f} ± {std:.{max(digits, 0)}f}"
+
+
+def decimals(std: float) -> int:
+    """Decimals of a value with this standard error: as many as show two digits of the error; negative for tens."""
+    return min(1 - math.floor(math.log10(std)), 12)

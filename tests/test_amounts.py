@@ -1,0 +1,57 @@
+"""Faults and estimates in words: the same on terminal, page and log, with the digits that the error justifies."""
+
+from __future__ import annotations
+
+import pytest
+
+from fdi_torch.amounts import estimate_words, parameter_words, sized_words, with_error
+from fdi_torch.monitor.events import Explanation, Size, headline
+from fdi_torch.parameters import displayed_in
+
+
+def size(name: str, value: float, std: float, unit: str = "1") -> Size:
+    return Size(name, value, std, unit, estimate_words(name, unit, value, std))
+
+
+LEAK = Explanation(0.57, (size("A.leak.size", 0.20241, 0.00163),))
+OFFSET = Explanation(0.43, (size("Q.pump_offset.offset", -17.87e-6, 0.143e-6, "m^3/s"),))
+
+
+def test_names_of_parameters_in_words() -> None:
+    assert parameter_words("T1.leak.size") == "leak at T1"
+    assert parameter_words("P13.laminar_flow.transition_head") == "laminar flow at P13"
+    assert parameter_words("T1.area") == "area of T1" and parameter_words("gravity") == "gravity"
+
+
+def test_a_monitor_says_faults_as_pages_do() -> None:
+    assert headline([LEAK]) == "leak at A (size 0.2024 ± 0.0016)"
+    with displayed_in({"m^3/s": "l/min"}):
+        offset = Explanation(0.43, (size("Q.pump_offset.offset", -17.87e-6, 0.143e-6, "m^3/s"),))
+        assert headline([LEAK, offset]) == (
+            "leak at A (size 0.2024 ± 0.0016), 57 %, or pump offset at Q (-1.0722 ± 0.0086 l/min), 43 %"
+        )
+
+
+def test_parameters_of_one_effect_and_several_effects_stand_together() -> None:
+    wave = (size("Q.pulsation.amplitude", 2.0e-6, 0.1e-6, "m^3/s"), size("Q.pulsation.phase", 0.31, 0.02))
+    assert Explanation(1.0, (*wave, *LEAK.sizes)).text == (
+        "pulsation at Q (2.00 ± 0.10 cm^3/s, phase 0.310 ± 0.020) and leak at A (size 0.2024 ± 0.0016)"
+    )
+    assert Explanation(1.0, (size("A.leak.size", 0.0, 0.0),), gone=True).text == "leak at A back to size 0"
+    assert Explanation(1.0, ()).text == "chance" and sized_words("A.leak.size", []) == "leak at A"
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "text"),
+    [
+        (0.3, 0.002, "0.3000 ± 0.0020"),
+        (1234.5, 123.4, "1234 ± 123"),
+        (2.44e-7, 2.4e-8, "(2.44 ± 0.24)·10⁻⁷"),
+        (-1.07218, 0.0086, "-1.0722 ± 0.0086"),
+        (0.3, 0.0, "0.3"),
+        (0.3, float("inf"), "not determined"),
+        (float("nan"), 1.0, "unknown"),
+    ],
+)
+def test_an_error_has_two_digits_and_the_value_its_decimals(value: float, std: float, text: str) -> None:
+    assert with_error(value, std) == text
