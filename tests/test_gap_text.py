@@ -11,6 +11,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.gap.answer import Amount, Answer, Cause, ProbableExplanation, adopted
 from fdi_torch.gap.verdict_words import causes_of, probability_words, verdict_sentence
 from fdi_torch.parameters import displayed_in
+from fdi_torch.report.random_flows import flows_that_matter
 from tests.test_gap import nominal_plant
 
 LEAK = Cause("leak", "T1", {"size": Amount(0.2, 0.01, "1")})
@@ -35,7 +36,7 @@ BOTH = Answer(
 
 
 def test_the_terminal_prints_the_unknown_and_the_named_causes(capsys: pytest.CaptureFixture[str]) -> None:
-    show(BOTH, [], Screen())
+    show(BOTH, nominal_plant(), [], Screen())
     said = capsys.readouterr().out
     assert said.startswith(
         "The gap comes from leak at T1 and something unknown at Q1, probability 97.0 %; no effect of the library "
@@ -45,6 +46,16 @@ def test_the_terminal_prints_the_unknown_and_the_named_causes(capsys: pytest.Cap
     assert ["T1", "2.5", "cm^3/s", "15", "s"] in rows and ["T2", "1", "cm^3/s", "none"] in rows
     assert ["explanations", "that", "were", "not", "examined", "2.0", "%"] in rows
     assert ["Q1", "97.0", "%"] in rows and not any(row[:1] == ["P13"] for row in rows)
+
+
+def test_random_flows_below_the_noise_are_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    """A flow of 2.5 cm^3/s moves T1, which empties in some 200 s from 154 cm^2, by 3 cm; 0.7 mm^3/s by 0.01 mm."""
+    noise = {name: {"std": 1e-3, "unit": "m"} for name in ("h1", "h2", "h3")}
+    small = {"std": 7e-10, "unit": "m^3/s", "correlation_time": 320.0}
+    answer = replace(BOTH, noise=noise, disturbances={"T1": FLOWS["T1"], "T2": small})
+    assert list(flows_that_matter(answer.to_dict(), nominal_plant())) == ["T1"]
+    show(replace(answer, disturbances={"T2": small}), nominal_plant(), [], Screen())
+    assert "random" not in capsys.readouterr().out
 
 
 def test_constants_that_stay_out_of_their_tolerances_are_to_be_calibrated_first() -> None:
@@ -112,7 +123,7 @@ def test_rounded_readings_are_no_fault_and_are_told_in_the_unit_of_the_sensor(
     posterior = [ProbableExplanation((("leak", "T1"), (ROUNDS, "h1")), 0.99)]
     both = replace(BOTH, verdict="named", causes=[LEAK, Cause(ROUNDS, "h1", step)], posterior=posterior, unexamined=0.0)
     with displayed_in({f"h1.{ROUNDS}.step": "%"}):
-        show(both, ["do this"], Screen())
+        show(both, nominal_plant(), ["do this"], Screen())
         said = capsys.readouterr().out
         assert said.startswith(
             "The gap comes from leak at T1, probability 99.0 %. Readings are rounded, which is no fault: h1 to 1 %.\n"

@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     diff = _adopt(arguments, plant, recordings, answer, screen)
     planned = _written(plant, answer, folder)
     adopted_file = arguments.adopt if diff else None
-    show(answer, next_steps(answer, bool(holdouts), library, planned, adopted_file), screen)
+    show(answer, plant, next_steps(answer, bool(holdouts), library, planned, adopted_file), screen)
     for line in diff:
         screen.say(line)
     screen.say(f"log: {log} (fdi report {log} makes the page)")

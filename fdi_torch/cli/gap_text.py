@@ -11,6 +11,8 @@ from fdi_torch.clock import clock_unit
 from fdi_torch.gap.answer import UNKNOWN, Answer
 from fdi_torch.gap.verdict_words import causes_of, explanation_words, probability_words, rounds, verdict_sentence
 from fdi_torch.parameters import ParameterName, display_unit
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.report.random_flows import flows_that_matter
 
 MOST_ROWS = 5
 SMALLEST_SHOWN = 1e-3  # probability
@@ -24,7 +26,7 @@ STAGES = {
 }
 
 
-def show(answer: Answer, steps: Sequence[str], screen: Screen) -> None:
+def show(answer: Answer, plant: PlantDescription, steps: Sequence[str], screen: Screen) -> None:
     """Print the verdict, what to do next, doubts, and the tables."""
     as_json = answer.to_dict()
     screen.say(verdict_sentence(as_json))
@@ -35,7 +37,7 @@ def show(answer: Answer, steps: Sequence[str], screen: Screen) -> None:
     rows = [[place, probability_words(p)] for place, p in answer.where[:MOST_ROWS] if p >= SMALLEST_SHOWN]
     if rows and answer.verdict != "no_gap":
         screen.table("where", ("location", "probability that the model is wrong there"), rows)
-    _disturbances(answer.disturbances, screen)
+    _disturbances(flows_that_matter(as_json, plant), screen)
     if answer.closure:
         _closure(answer.closure, screen)
     _constants(answer.constants, screen)

@@ -19,6 +19,7 @@ from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, number, percent, probability_text, shown_unit, with_error
 from fdi_torch.report.panels import BAR_NAME, bar_panel
+from fdi_torch.report.random_flows import flows_that_matter
 from fdi_torch.report.section import Picture, Section
 
 MOST_BARS = 10
@@ -73,9 +74,8 @@ def causes_section(material: Material) -> Section | None:
 
 
 def disturbances_section(material: Material) -> Section | None:
-    """Random flows into the tanks, estimated together with the likeliest explanation."""
-    flows = material.answer.get("disturbances")
-    rows = [_flow_row(tank, flow) for tank, flow in flows.items()] if isinstance(flows, dict) else []
+    """Random flows into the tanks that matter, estimated together with the likeliest explanation."""
+    rows = [_flow_row(tank, flow) for tank, flow in flows_that_matter(material.answer, material.plant).items()]
     if not rows:
         return None
     words = (
@@ -86,8 +86,7 @@ def disturbances_section(material: Material) -> Section | None:
     return Section("Random flows", [words, table(header, rows)])
 
 
-def _flow_row(tank: str, flow: Any) -> list[str]:
-    flow = flow if isinstance(flow, dict) else {}
+def _flow_row(tank: str, flow: Mapping[str, Any]) -> list[str]:
     unit, scale = shown_unit(str(flow.get("unit", "")))
     time = as_float(flow.get("correlation_time"))
     return [tank, number(scale * as_float(flow.get("std")), 3), unit, f"{number(time, 3)} s" if time else "none"]
