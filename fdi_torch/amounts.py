@@ -58,6 +58,16 @@ def with_error(value: float, std: float) -> str:
     return f"{value:.{max(digits, 0)}f} ± {std:.{max(digits, 0)}f}"
 
 
+def rounded(value: float, std: float) -> str:
+    """The value with as many digits as show two of its standard error; with six where it has none."""
+    if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
+        return f"{value:.6g}"
+    digits = decimals(std)
+    if digits <= 6:
+        return f"{value:.{max(digits, 0)}f}"
+    return f"{value:.{max(digits + math.floor(math.log10(abs(value) or std)), 1)}e}"
+
+
 def decimals(std: float) -> int:
     """Decimals of a value with this standard error: as many as show two digits of the error; negative for tens."""
     return min(1 - math.floor(math.log10(std)), 12)

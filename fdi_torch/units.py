@@ -64,6 +64,12 @@ def factor(unit: str, target: str) -> float:
 
 
 @lru_cache(maxsize=4096)
+def si_factor(unit: str) -> float:
+    """The value of one `unit` in SI base units. Raises UnitError for an unknown unit."""
+    return float(_registry.Quantity(1.0, _parsed(unit)).to_base_units().magnitude)
+
+
+@lru_cache(maxsize=4096)
 def same_kind(unit: str, among: tuple[str, ...]) -> str | None:
     """The first unit of `among` with the dimension of `unit`; None for another dimension or a text that is no unit."""
     try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fdi_torch.amounts import estimate_words, parameter_words, sized_words, with_error
+from fdi_torch.amounts import estimate_words, parameter_words, rounded, sized_words, with_error
 from fdi_torch.monitor.events import Explanation, Size, headline
 from fdi_torch.parameters import displayed_in
 
@@ -55,3 +55,9 @@ def test_parameters_of_one_effect_and_several_effects_stand_together() -> None:
 )
 def test_an_error_has_two_digits_and_the_value_its_decimals(value: float, std: float, text: str) -> None:
     assert with_error(value, std) == text
+
+
+def test_numbers_of_a_table_have_the_digits_of_their_error() -> None:
+    assert [rounded(v, 0.004) for v in (0.0271818, 0.004, 0.0)] == ["0.0272", "0.0040", "0.0000"]
+    assert rounded(1234.56, 123.0) == "1235" and rounded(2.4417e-9, 2.4e-10) == "2.44e-09"
+    assert rounded(2.4e-10, 2.4e-10) == "2.4e-10" and rounded(0.3, 0.0) == "0.3" and rounded(0.3, float("inf")) == "0.3"

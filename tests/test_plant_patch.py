@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from fdi_torch.cli.adoption import write_adopted
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_patch import patched_plant
+from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.config.yaml_files import parse_yaml, shipped_plants
 from fdi_torch.gap.answer import with_constants
 from fdi_torch.plant.description import PlacedEffect, PlantDescription
@@ -185,3 +187,35 @@ def test_what_a_sensor_in_percent_gets_is_written_in_percent() -> None:
     changed, kept = patched_plant(text, before, biased)
     _, new = lines_changed(text, changed)
     assert kept and new == ["    offset: -0.21 %", "- {effect: sensor_bias, location: pB, parameters: {bias: 1 %}}"]
+
+
+@pytest.mark.parametrize(
+    ("std", "shown"),
+    [(4e-6, "20.123 cm^2"), (2.4e-5, "20.12 cm^2"), (4e-4, "20.1 cm^2"), (math.inf, "20 cm^2"), (0.0, "20.12346 cm^2")],
+)
+def test_a_value_has_the_digits_that_its_standard_error_justifies(std: float, shown: str) -> None:
+    """Two digits of the error, 0.040, 0.24, 4.0 cm^2, and never fewer than two of the value."""
+    text = TEXT.replace("area: 0.02 m^2", "area: 25 cm^2")
+    after = with_constants(read(text), {"A.area": 20.123456e-4})
+    changed, kept = patched_plant(text, read(text), after, {"A.area": std})
+    assert kept and lines_changed(text, changed)[1] == [
+        f'  A: {{area: {shown}, height: "600 mm"}}   # measured on 3 May'
+    ]
+
+
+def test_a_new_effect_has_the_digits_of_its_standard_errors() -> None:
+    leak = PlacedEffect("leak", "A", {"size": 0.2034567})
+    lag = PlacedEffect("pump_lag", "Q", {"time_constant": 7.8691234})
+    changed, _ = patched_plant(
+        TEXT, BEFORE, replace(BEFORE, effects=(lag, leak)), {"A.leak.size": 0.0123, "Q.pump_lag.time_constant": 0.084}
+    )
+    assert "parameters: {size: 0.203}" in changed and "time_constant: 7869 ms" in changed
+
+
+def test_tolerances_are_written_in_one_style() -> None:
+    """1/3 is no short share of 100 %, hence all are bare numbers."""
+    for odd, styles in ((0.05, {str}), (1.0 / 3.0, {float})):
+        mixed = replace(BEFORE, tolerances={"link.discharge_coefficient": 0.03, "drain.discharge_coefficient": odd})
+        written = parse_yaml(dump_plant(mixed).encode(), "rig")["tolerances"]
+        assert {type(value) for value in written.values()} == styles
+        assert read(dump_plant(mixed)) == mixed

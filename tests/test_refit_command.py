@@ -42,7 +42,9 @@ def test_a_refit_adopts_the_effect_and_predicts_each_file_by_the_other(
     shown = json.loads(capsys.readouterr().out)
     fitted = shown["fitted"]["Q2.pump_gain.factor"]
     assert abs(fitted["value"] - GAIN["Q2.pump_gain.factor"]) < 4.0 * fitted["std"]
-    assert load_plant(tmp_path / "better.yaml").effects[0].parameters["factor"] == pytest.approx(fitted["value"])
+    assert load_plant(tmp_path / "better.yaml").effects[0].parameters["factor"] == pytest.approx(
+        fitted["value"], abs=0.05 * fitted["std"]
+    )
     assert [Path(trial["source"]).name for trial in shown["leave_one_file_out"]] == ["day3.csv", "day5.csv"]
     for trial in shown["leave_one_file_out"]:
         assert sum(trial["refitted"].values()) < sum(trial["as_is"].values())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from difflib import unified_diff
 from pathlib import Path
 
@@ -13,13 +14,18 @@ from fdi_torch.plant.description import PlantDescription
 
 
 def write_adopted(
-    name: str, before: PlantDescription, after: PlantDescription, target: Path, screen: Screen
+    name: str,
+    before: PlantDescription,
+    after: PlantDescription,
+    target: Path,
+    screen: Screen,
+    errors: Mapping[str, float] | None = None,
 ) -> list[str]:
     """Write the plant file `name` (a file or a shipped plant, read as `before`) changed to `after`. Returns the diff,
-    line by line.
+    line by line. errors: standard errors of fitted values, which determine their digits.
     """
     text = find_plant(name, Path.cwd()).read_text(encoding="utf-8")
-    changed, kept = patched_plant(text, before, after)
+    changed, kept = patched_plant(text, before, after, errors)
     write_text(target, changed)
     if not kept:
         screen.note(f"{target}: rewritten without the comments of {name}, because components share values in it")

@@ -25,6 +25,7 @@ from fdi_torch.gap.free_runs.prediction import predict
 from fdi_torch.gap.free_runs.refit import narrowed
 from fdi_torch.jobs.gap import run_gap
 from fdi_torch.jobs.log_paths import free_path
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_writing import write_csv
@@ -90,14 +91,15 @@ def _adopt(
                 "--with-constants also writes the constants that were fitted together with the causes"
             )
             return []
-        diff = write_adopted(arguments.plant, plant, better, target, screen)
+        diff = write_adopted(arguments.plant, plant, better, target, screen, _errors(answer))
         constants = (
             "as fitted with them" if arguments.with_constants else "unchanged (--with-constants writes the fitted ones)"
         )
         screen.note(f"plant file with the causes, its constants {constants}: {target}")
         return diff
     if arguments.adopt and arguments.with_constants and answer.verdict == "no_gap":
-        diff = write_adopted(arguments.plant, plant, _adopted(plant, answer, arguments), Path(arguments.adopt), screen)
+        better, target = _adopted(plant, answer, arguments), Path(arguments.adopt)
+        diff = write_adopted(arguments.plant, plant, better, target, screen, _errors(answer))
         screen.note(f"plant file with its fitted constants; no cause was found: {arguments.adopt}")
         return diff
     if arguments.adopt and not named:
@@ -109,7 +111,17 @@ def _adopted(plant: PlantDescription, answer: Answer, arguments: argparse.Namesp
     better = adopted(plant, answer, arguments.with_constants)
     if not arguments.narrow:
         return better
-    return narrowed(better, {name: float(constant["std"]) for name, constant in answer.constants.items()})
+    return narrowed(better, _errors(answer))
+
+
+def _errors(answer: Answer) -> dict[str, float]:
+    """Standard errors of the fitted values, by full name, SI."""
+    causes = {
+        str(ParameterName(cause.location, cause.effect, name)): amount.std
+        for cause in answer.causes
+        for name, amount in cause.parameters.items()
+    }
+    return causes | {name: float(constant["std"]) for name, constant in answer.constants.items()}
 
 
 def _written(plant: PlantDescription, answer: Answer, folder: Path) -> Path | None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from fdi_torch.amounts import rounded
 from fdi_torch.cli.screen import Screen
 from fdi_torch.clock import clock_unit
 from fdi_torch.gap.answer import UNKNOWN, Answer
@@ -100,7 +101,7 @@ def _causes(answer: Answer, screen: Screen) -> None:
     for cause in answer.causes:
         for name, amount in cause.parameters.items():
             unit, scale = display_unit(amount.unit, str(ParameterName(cause.location, cause.effect, name)))
-            numbers = [f"{scale * amount.value:.4g}", f"{scale * amount.std:.2g}"]
+            numbers = [rounded(scale * value, scale * amount.std) for value in (amount.value, amount.std)]
             row = [cause.effect, cause.location, name, *numbers, clock_unit(unit, name, amount.value)]
             rows += [] if rounds(cause.effect) else [row]
     if rows:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from fdi_torch.amounts import rounded
 from fdi_torch.cli.adoption import write_adopted
 from fdi_torch.cli.explained import exit_code, say_first
 from fdi_torch.cli.gap_text import MOVED
@@ -52,7 +53,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         _show_run_specific(fitted, screen)
         if arguments.adopt:
             adopted = fitted.narrowed() if arguments.narrow else fitted.plant
-            for line in write_adopted(arguments.plant, plant, adopted, Path(arguments.adopt), screen):
+            errors = {name: std for name, (_, std) in fitted.fitted.items()}
+            for line in write_adopted(arguments.plant, plant, adopted, Path(arguments.adopt), screen, errors):
                 screen.say(line)
             screen.note(f"plant file with the fitted values: {arguments.adopt}")
             if plant.tolerances and not arguments.narrow:
@@ -101,7 +103,10 @@ def _show(result: Refit, before: PlantDescription, screen: Screen) -> None:
     rows, remarks = [], []
     for name, (value, error) in result.fitted.items():
         unit, scale = display_unit(constants[name].unit, name)
-        numbers = [f"{scale * constants[name].nominal:.4g}", f"{scale * value:.4g}", f"{scale * error:.2g}"]
+        numbers = [
+            f"{scale * constants[name].nominal:.4g}",
+            *(rounded(scale * v, scale * error) for v in (value, error)),
+        ]
         rows.append([name, *numbers, "" if unit == "1" else unit])
         far = abs(value - constants[name].nominal) / constants[name].std
         if far > MOVED:
@@ -122,7 +127,7 @@ def _show_run_specific(result: Refit, screen: Screen) -> None:
         unit, scale = display_unit(constants[name].unit, name)
         each = [own for own in result.own if own.name == name]
         for own in each:
-            numbers = [f"{scale * own.value:.4g}", f"{scale * own.std:.2g}", unit]
+            numbers = [*(rounded(scale * v, scale * own.std) for v in (own.value, own.std)), unit]
             rows.append([name, Path(own.source).name, f"{own.start:g}", *numbers])
         variation = between_run_spread(each, constants[name].std)
         if variation:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from functools import partial
 
-from fdi_torch.amounts import parameter_words
+from fdi_torch.amounts import parameter_words, rounded
 from fdi_torch.cli import DONE, NOT_CONVERGED
 from fdi_torch.cli.explained import exit_code, say_first
 from fdi_torch.cli.options import live, overrides
@@ -88,8 +88,9 @@ def estimate_cells(value: float, std: float, nominal: float, scale: float) -> li
     value, std = scale * value, scale * std
     if math.isfinite(std):
         low, high = value - 1.96 * std, value + 1.96 * std
-        return [f"{value:.6g}", f"{std:.2g}", f"{low:.5g} .. {high:.5g}", f"{scale * nominal:.5g}"]
-    return [f"{value:.6g}", "–", "not determined", f"{scale * nominal:.5g}"]
+        interval = f"{rounded(low, std)} .. {rounded(high, std)}"
+        return [rounded(value, std), rounded(std, std), interval, f"{scale * nominal:.5g}"]
+    return [rounded(value, std), "–", "not determined", f"{scale * nominal:.5g}"]
 
 
 def show_uncertainty(done: TrainResult, screen: Screen) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 
+from fdi_torch.amounts import decimals
 from fdi_torch.config.plant_file import build_plant
 from fdi_torch.config.plant_in_code import absolute_units
 from fdi_torch.config.plant_writer import dump_plant, plant_mapping
@@ -18,33 +19,47 @@ from fdi_torch.config.yaml_files import compose_yaml, parse_yaml
 from fdi_torch.effects import units_for_display
 from fdi_torch.parameters import display_unit, displayed_in, si_unit_of
 from fdi_torch.plant.description import FLOW_KINDS, PlacedEffect, PlantDescription
-from fdi_torch.units import UnitError, in_unit, number_and_unit
+from fdi_torch.units import UnitError, in_unit, number_and_unit, si_factor
 
 DIGITS = 7
-"""Significant digits of written numbers; the rounding error is far below any standard error."""
+"""Significant digits of numbers without a standard error."""
 _SAME = 1e-6  # relative tolerance of numbers written with `DIGITS` digits
 _PARTS = ("tanks", *(kind.part() for kind in FLOW_KINDS), "sensors")
 Path = tuple[str | int, ...]
 
 
-def patched_plant(text: str, before: PlantDescription, after: PlantDescription) -> tuple[str, bool]:
+def patched_plant(
+    text: str, before: PlantDescription, after: PlantDescription, errors: Mapping[str, float] | None = None
+) -> tuple[str, bool]:
     """The text of a plant file changed to describe `after`, and whether its format could be kept.
 
-    text: the file from which `before` was read. Numbers are written with `DIGITS` digits in the unit of the text. If
-    the changes cannot be located in the text (anchors shared by several components), the file is written anew.
+    text: the file from which `before` was read. errors: standard errors by full name, SI. Numbers are written in the
+    unit of the text with as many digits as show two digits of the error, those without an error with `DIGITS`. If the
+    changes cannot be located in the text (anchors shared by several components), the file is written anew.
     """
-    edits = _Edits(text)
-    with displayed_in(units_for_display(after)):
-        for path, value in _changes(before, after):
-            edits.set(path, value, _unit_of(path, after))
-        for placed in _new_effects(before, after):
-            edits.append(("effects",), _rounded(placed, after))
-    changed = edits.applied()
+    changed = _edited(text, before, after, {})
     try:
         kept = _equal(build_plant({"name": after.name, **parse_yaml(changed.encode(), "patched")}, "patched"), after)
     except ConfigError:
         kept = False
-    return (changed, True) if kept else (dump_plant(after), False)
+    return (_edited(text, before, after, errors or {}), True) if kept else (dump_plant(after), False)
+
+
+def _edited(text: str, before: PlantDescription, after: PlantDescription, errors: Mapping[str, float]) -> str:
+    edits = _Edits(text)
+    with displayed_in(units_for_display(after)):
+        for path, value in _changes(before, after):
+            edits.set(path, value, _unit_of(path, after), errors.get(_full_name(path, after)))
+        for placed in _new_effects(before, after):
+            edits.append(("effects",), _rounded(placed, after, errors))
+    return edits.applied()
+
+
+def _full_name(path: Path, plant: PlantDescription) -> str:
+    """The name of the parameter at that path; a tolerance has none."""
+    if path[0] == "effects":
+        return plant.effects[int(path[1])].full_name(str(path[-1]))
+    return "" if path[0] == "tolerances" else f"{path[1]}.{path[2]}"
 
 
 def _changes(before: PlantDescription, after: PlantDescription) -> Iterator[tuple[Path, str | float]]:
@@ -82,11 +97,14 @@ def _new_effects(before: PlantDescription, after: PlantDescription) -> list[Plac
     return [e for e in after.effects if (e.effect, e.location) not in known]
 
 
-def _rounded(placed: PlacedEffect, plant: PlantDescription) -> dict[str, Any]:
+def _rounded(placed: PlacedEffect, plant: PlantDescription, errors: Mapping[str, float]) -> dict[str, Any]:
     """The mapping of the effect in a plant file."""
     mapping: dict[str, Any] = plant_mapping(plant)["effects"][plant.effects.index(placed)]
-    units = {n: display_unit("1", placed.full_name(n))[0] or "1" for n in mapping["parameters"]}
-    return mapping | {"parameters": {n: _in_display_unit(v, units[n]) for n, v in mapping["parameters"].items()}}
+    written = {}
+    for name, value in mapping["parameters"].items():
+        full = placed.full_name(name)
+        written[name] = _in_display_unit(value, display_unit("1", full)[0] or "1", errors.get(full))
+    return mapping | {"parameters": written}
 
 
 class _Edits:
@@ -98,18 +116,18 @@ class _Edits:
         self._replaced: list[tuple[int, int, str]] = []
         self._added: dict[Path, list[str]] = {}
 
-    def set(self, path: Path, value: str | float, unit: str) -> None:
+    def set(self, path: Path, value: str | float, unit: str, std: float | None) -> None:
         """Write a value in the unit of the present one, or of the pattern that stands for it, or add the key to its
-        mapping. unit: of a value without a unit.
+        mapping. unit: of a value without a unit. std: its standard error, SI.
         """
         node = self._at(path)
         if isinstance(node, yaml.ScalarNode):
             quote = node.style if node.style in ("'", '"') else ""
-            new = f"{quote}{_in_unit_of(value, node.value)}{quote}"
+            new = f"{quote}{_in_unit_of(value, node.value, std)}{quote}"
             self._replaced.append((node.start_mark.index, node.end_mark.index, new))
         else:
             pattern = self._pattern_of(path)
-            new = _in_display_unit(value, unit) if pattern is None else _in_unit_of(value, pattern)
+            new = _in_display_unit(value, unit, std) if pattern is None else _in_unit_of(value, pattern, std)
             self._added.setdefault(path[:-1], []).append(_flow({path[-1]: new})[1:-1])
 
     def append(self, path: Path, item: Mapping[str, Any]) -> None:
@@ -174,14 +192,14 @@ def _flow(value: Any) -> str:
     return str(yaml.safe_dump(value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10**6)).strip()
 
 
-def _in_display_unit(value: str | float, unit: str) -> Any:
-    """A quantity with `DIGITS` digits, in the unit for display if it has one, else in `unit`."""
+def _in_display_unit(value: str | float, unit: str, std: float | None) -> Any:
+    """A quantity in the unit for display if it has one, else in `unit`."""
     si_unit = si_unit_of(number_and_unit(str(value))[1])
-    return _in_unit_of(value, f"1 {unit if si_unit == '1' else display_unit(si_unit)[0] or si_unit}")
+    return _in_unit_of(value, f"1 {unit if si_unit == '1' else display_unit(si_unit)[0] or si_unit}", std)
 
 
-def _in_unit_of(value: str | float, written: str | None) -> Any:
-    """A quantity with `DIGITS` digits, in the unit of `written`; a bare number stays one."""
+def _in_unit_of(value: str | float, written: str | None, std: float | None) -> Any:
+    """A quantity in the unit of `written`; a bare number stays one. std: standard error, SI."""
     number, unit = number_and_unit(str(value))
     if written is not None:
         try:
@@ -190,6 +208,8 @@ def _in_unit_of(value: str | float, written: str | None) -> Any:
         except UnitError:
             pass  # `written` is a word such as equilibrium
     short = f"{number:.{DIGITS}g}"
+    if std:
+        short = f"{round(number, decimals(min(std / si_factor(unit), abs(number) or 1.0))):.{DIGITS}g}"
     return float(short) if unit == "1" else f"{short} {unit}"
 
 

@@ -52,7 +52,8 @@ def plant_mapping(plant: PlantDescription) -> dict[str, Any]:
             data[kind.part()] = {c.name: _flow_mapping(c) for c in getattr(plant, kind.part())}
         data["sensors"] = {s.name: _sensor_mapping(s) for s in plant.sensors}
         units = absolute_units(plant)
-        data["tolerances"] = {n: _text(v, units[n]) if n in units else _share(v) for n, v in plant.tolerances.items()}
+        shares = _shares({n: v for n, v in plant.tolerances.items() if n not in units})
+        data["tolerances"] = {n: shares[n] if n in shares else _text(v, units[n]) for n, v in plant.tolerances.items()}
         data["varying"] = list(plant.varying)
         data["effects"] = [_effect_mapping(placed, plant) for placed in plant.effects]
         data["matters"] = {m.fault: _matter_mapping(m, plant) for m in plant.matters}
@@ -118,10 +119,11 @@ def _given(**fields: Any) -> dict[str, Any]:
     return {key: value for key, value in fields.items() if value is not None}
 
 
-def _share(value: float) -> str | float:
-    """'3 %', or the bare number if that does not read back exactly."""
-    short = f"{100.0 * value:.9g} %"
-    return short if parse_quantity(short, "1") == value else value
+def _shares(values: dict[str, float]) -> dict[str, str | float]:
+    """Relative tolerances in one style: all as '3 %', or all as bare numbers if some would not read back exactly."""
+    percents = {n: f"{100.0 * v:.9g} %" for n, v in values.items()}
+    exact = all(parse_quantity(percents[n], "1") == v for n, v in values.items())
+    return {n: percents[n] if exact else v for n, v in values.items()}
 
 
 def _text(value: float, unit: str) -> str | float:
