@@ -267,6 +267,11 @@ def quantity_text(value: float, si_unit: str, digits: int = 4, name: str = "") -
     return f"{significant(scale * value, digits)} {unit}".rstrip()
 
 
+def displayed_units() -> Mapping[str, str]:
+    """The units for display of this context."""
+    return _DISPLAYED.get()
+
+
 def display_in(units: Mapping[str, str]) -> None:
     """Set the units for display in this context: SI unit, or name of a channel or parameter -> unit."""
     _DISPLAYED.set(dict(units))

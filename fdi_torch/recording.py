@@ -12,7 +12,7 @@ from torch import Tensor
 
 from fdi_torch.clock import stamp
 from fdi_torch.names import unknown
-from fdi_torch.tables import Shown, Table, needed
+from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
 
 Hold = Literal["zero_order", "linear"]
 LONGEST, LARGEST = 5e9, 1e12
@@ -91,11 +91,16 @@ class Recording(Shown):
         lasts = float(self.time[-1] - self.time[0]) if len(self) else 0.0
         return f"{self.source}: {len(self)} samples, {lasts:g} s, one every {self.interval:g} s"
 
+    @property
+    def shown_units(self) -> Mapping[str, str]:
+        return {**self._made_in, **self.written}
+
+    @in_its_units
     def table(self) -> Table:
-        """One row per channel: role, unit, range and number of missing samples, SI."""
+        """One row per channel: role, unit, range in that unit and number of missing samples."""
         readings = torch.where(self.mask, self.outputs, torch.nan)
         rows = [
-            (name, role, unit, *_range(values), int((~torch.isfinite(values)).sum()))
+            (name, role, *in_display_unit(name, unit, *_range(values)), int((~torch.isfinite(values)).sum()))
             for role, names, units, table in (
                 ("input", self.input_names, self.input_units, self.inputs),
                 ("output", self.output_names, self.output_units, readings),

@@ -1,15 +1,26 @@
-"""Display of results in a session: a headline and a table, as text, as HTML, and for pandas."""
+"""Display of results in a session: a headline and a table, as text, as HTML, and for pandas.
+
+Results show numbers in the units for display of the context in which they were made: those of plant and recording.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import wraps
 from html import escape
 from importlib import import_module
-from typing import Any
+from typing import Any, Self, TypeVar, cast
+
+from fdi_torch.amounts import rounded
+from fdi_torch.parameters import display_unit, displayed_in, displayed_units
 
 MOST_ROWS = 60
 """Number of displayed rows; a data frame has all of them."""
+ERROR = "std error"
+WITH_ERROR = ("value", "estimate", ERROR, "95 % low", "95 % high")
+"""Columns whose displayed digits follow from the standard error in the same row."""
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
@@ -28,7 +39,14 @@ class Table:
 
     def rows(self, most: int = MOST_ROWS) -> list[list[str]]:
         """The first rows as text."""
-        columns = [[_cell(value) for value in column[:most]] for column in self.columns.values()]
+        errors = self.columns.get(ERROR)
+        columns = [
+            [
+                _cell(value, errors[k] if errors and name in WITH_ERROR else None)
+                for k, value in enumerate(column[:most])
+            ]
+            for name, column in self.columns.items()
+        ]
         return [list(row) for row in zip(*columns, strict=True)]
 
     def text(self) -> str:
@@ -51,8 +69,37 @@ class Table:
         return [f"... and {len(self) - MOST_ROWS} more rows"] if len(self) > MOST_ROWS else []
 
 
+def in_its_units(method: Method) -> Method:
+    """A method of a `Shown` within the result's units for display."""
+
+    @wraps(method)
+    def within(self: Shown, *args: Any, **more: Any) -> Any:
+        with displayed_in(self.shown_units):
+            return method(self, *args, **more)
+
+    return cast(Method, within)
+
+
+def in_display_unit(name: str, si_unit: str, *values: float) -> tuple[Any, ...]:
+    """The unit for display of a channel or parameter ('1' for none), and the SI values in it."""
+    unit, scale = display_unit(si_unit, name)
+    return unit or "1", *(scale * value for value in values)
+
+
 class Shown:
     """Base of results with a display: a headline and a table."""
+
+    _made_in: Mapping[str, str]
+
+    def __new__(cls, *_args: Any, **_fields: Any) -> Self:
+        made = super().__new__(cls)
+        object.__setattr__(made, "_made_in", displayed_units())
+        return made
+
+    @property
+    def shown_units(self) -> Mapping[str, str]:
+        """Units for display: SI unit, or name of a channel or parameter -> unit."""
+        return self._made_in
 
     @property
     def headline(self) -> str:
@@ -60,7 +107,7 @@ class Shown:
         raise NotImplementedError
 
     def table(self) -> Table:
-        """The numbers behind the headline, in SI unless a column names another unit."""
+        """The numbers behind the headline; a column `unit` names the unit of each row."""
         raise NotImplementedError
 
     def brief(self) -> Table:
@@ -100,9 +147,9 @@ def needed(library: str, extra: str = "") -> Any:
         raise MissingExtraError(sentence) from error
 
 
-def _cell(value: Any) -> str:
+def _cell(value: Any, std: float | None = None) -> str:
     if value is None or value != value:
         return ""
     if isinstance(value, float):
-        return f"{value:.6g}"
-    return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+        return rounded(value, std or 0.0)
+    return ", ".join(map(_cell, value)) if isinstance(value, list | tuple) else str(value)

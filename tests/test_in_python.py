@@ -17,6 +17,7 @@ from fdi_torch import Pipe, PlacedEffect, Plant, Pump, Recording, Sensor, Tank
 from fdi_torch.config import plant_in_code
 from fdi_torch.config.plant_file import build_plant
 from fdi_torch.config.yaml_files import shipped_plants
+from fdi_torch.parameters import displayed_in
 from tests.rigs import blank_recording
 
 IN_YAML = """
@@ -196,6 +197,26 @@ def test_a_monitor_runs_along_a_recording_in_memory(tmp_path: Path) -> None:
     assert table["onset"][isolated] == pytest.approx(400.0, abs=3.0) and table["units"][isolated] == ("1",)
 
 
+def test_tables_are_in_the_units_that_the_user_wrote(tmp_path: Path) -> None:
+    """A rig in mm and l/min; another plant, in ft, is in use when the results are printed."""
+    rig = replace(RIG, units={**RIG.units, "m": "mm"})
+    recording = fdi_torch.simulate(rig, inputs=STEPS, duration="300 s", noise={"std": {"h": "1 mm"}}, seed=3)
+    run = {"plant": rig, "recordings": [recording], "estimate": {"parameters": ["A.leak"]}}
+    found = fdi_torch.train(run | {"output": {"folder": str(tmp_path)}})
+    free, calibrated = fdi_torch.predict(rig, recording), fdi_torch.refit(rig, recording)
+    with displayed_in({"m": "ft"}):
+        estimate, ranges = found.table().columns, recording.table().columns
+        level = estimate["parameter"].index("A.start_level")
+        assert estimate["unit"][level] == "mm"
+        assert estimate["estimate"][level] == pytest.approx(1e3 * float(found.result.estimate.value[level]), rel=1e-12)
+        assert free.table().columns["unit"] == ["mm"]
+        assert free.table().columns["RMSE"][0] == pytest.approx(1e3 * free.prediction.rmse["h"], rel=1e-12)
+        assert ranges["unit"] == ["l/min", "mm"]
+        assert ranges["highest"][0] == pytest.approx(6e4 * float(recording.inputs.max()), rel=1e-12)
+        shown = [*map(repr, (found, free, calibrated, recording)), found.profile("A.start_level")[0].headline]
+    assert " mm" in calibrated.headline and shown[-1].endswith("mm") and "ft" not in "".join(shown[:-1]).split()
+
+
 def test_a_plant_prints_as_its_file() -> None:
     assert build_plant(yaml.safe_load(str(in_code())), "text") == in_code()
 
@@ -264,7 +285,7 @@ def test_results_become_data_frames() -> None:
     assert list(frame.columns) == ["Q", "h"] and frame.attrs["units"] == {"t": "s", "Q": "m^3/s", "h": "m"}
     assert frame["h"].to_numpy() == pytest.approx(recording.outputs[:, 0].numpy())
     told = fdi_torch.predict(RIG, recording).to_pandas()
-    assert isinstance(told, pandas.DataFrame) and list(told.columns) == ["sensor", "RMSE", "unit"]
+    assert isinstance(told, pandas.DataFrame) and list(told.columns) == ["sensor", "unit", "RMSE"]
     assert len(fdi_torch.effects().to_pandas()) == len(fdi_torch.EFFECTS)
 
 

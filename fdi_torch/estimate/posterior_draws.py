@@ -20,7 +20,7 @@ from torch import Tensor
 
 from fdi_torch.estimate.bounds import reflected
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.tables import Shown, Table, needed
+from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
 
 # Rank-normalised split R-hat and effective sample size from which draws count as converged (Vehtari et al. 2021,
 # Bayesian Analysis 16:667, section 4).
@@ -92,8 +92,16 @@ class Draws(Shown):
         tail = 0.5 - 0.5 * confidence
         return flat.quantile(tail, 0), flat.quantile(1.0 - tail, 0)
 
+    @in_its_units
     def table(self) -> Table:
-        """One row per parameter, SI."""
+        """One row per parameter, in its unit for display."""
+        columns, amounts = self._summary(), ("median", "std", "95 % low", "95 % high")
+        numbers = zip(*(columns[name] for name in amounts), strict=True)
+        rows = [in_display_unit(name, u, *v) for name, u, v in zip(self.names, self.units, numbers, strict=True)]
+        return Table(columns | {name: [row[k] for row in rows] for k, name in enumerate(("unit", *amounts))})
+
+    def _summary(self) -> dict[str, Any]:
+        """Columns with one value per parameter, SI."""
         flat, (low, high) = self.values.flatten(0, 1), self.interval()
         columns: dict[str, Any] = {"parameter": self.names, "unit": self.units, "median": self.median().tolist()}
         columns |= {"std": flat.std(0).tolist(), "95 % low": low.tolist(), "95 % high": high.tolist()}
@@ -102,11 +110,11 @@ class Draws(Shown):
             "ESS bulk": self.ess_bulk.tolist(),
             "ESS tail": self.ess_tail.tolist(),
         }
-        return Table(columns)
+        return columns
 
     def to_dict(self) -> dict[str, Any]:
         """Summary as plain values for JSON."""
-        return {name: list(column) for name, column in self.table().columns.items()} | {
+        return {name: list(column) for name, column in self._summary().items()} | {
             "steps": self.steps,
             "acceptance": self.acceptance,
             "converged": self.converged,

@@ -25,7 +25,7 @@ from fdi_torch.estimate.linearisation import Linearise
 from fdi_torch.estimate.refinement import CONVERGED_WITHIN, TIGHT_DECREASE
 from fdi_torch.estimate.uncertainty import Estimate, plain_value
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.tables import Shown, Table
+from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
 
 # Points of the first grid; a grid whose end is still inside the interval is extended, each time to twice its reach.
 POINTS, MOST_EXTENSIONS = 16, 30
@@ -36,6 +36,9 @@ LIMIT_TOLERANCE, MOST_BISECTIONS = 2e-3, 40
 # A restart from a neighbour counts as an improvement above the Newton decrement at which a fit counts as converged.
 IMPROVEMENT = 0.5 * CONVERGED_WITHIN**2
 SETTINGS = RefineSettings(iterations=200, decrease_tolerance=TIGHT_DECREASE)
+
+
+SEPARATE = ("theta", "converged", "_made_in")  # not in the JSON of a profile
 
 
 @dataclass(frozen=True, repr=False)
@@ -68,12 +71,12 @@ class Profile(Shown):
         return chi_square_quantile(self.confidence)
 
     @property
+    @in_its_units
     def headline(self) -> str:
         ends = " and ".join(self.ends)
-        text = f"{self.name}: {self.value:.5g}, {100 * self.confidence:g} % interval {self.low:.5g} .. {self.high:.5g}"
-        text = f"{text} {self.unit.removeprefix('1')}".rstrip() + (
-            f" (bounded only by its range: {ends})" if ends else ""
-        )
+        unit, value, low, high = in_display_unit(self.name, self.unit, self.value, self.low, self.high)
+        text = f"{self.name}: {value:.5g}, {100 * self.confidence:g} % interval {low:.5g} .. {high:.5g}"
+        text = f"{text} {unit.removeprefix('1')}".rstrip() + (f" (bounded only by its range: {ends})" if ends else "")
         return "; ".join([text, *self.warnings])
 
     @property
@@ -92,13 +95,16 @@ class Profile(Shown):
             )
         return tuple(lines)
 
+    @in_its_units
     def table(self) -> Table:
-        """One row per value of the parameter, SI."""
-        return Table({self.name: self.x.tolist(), "likelihood ratio": self.ratio.tolist()})
+        """One row per value of the parameter, in its unit for display."""
+        unit, *values = in_display_unit(self.name, self.unit, *self.x.tolist())
+        name = self.name if unit == "1" else f"{self.name}, {unit}"
+        return Table({name: values, "likelihood ratio": self.ratio.tolist()})
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON; an infinite limit becomes None."""
-        plain = {name: plain_value(v, name) for name, v in vars(self).items() if name not in ("theta", "converged")}
+        plain = {name: plain_value(v, name) for name, v in vars(self).items() if name not in SEPARATE}
         return plain | {"warnings": list(self.warnings)}
 
 

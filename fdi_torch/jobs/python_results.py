@@ -6,18 +6,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fdi_torch.amounts import effect_words
+from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import Misfit, misfit_of
 from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.free_runs.prediction import Prediction
 from fdi_torch.gap.free_runs.refit import Refit, narrowed
-from fdi_torch.gap.verdict_words import cause_words, explanation_words, verdict_sentence
+from fdi_torch.gap.verdict_words import explanation_words, verdict_sentence
 from fdi_torch.monitor.events import Event
-from fdi_torch.parameters import quantity_text
+from fdi_torch.parameters import ParameterName, quantity_text
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import notebook_svg
-from fdi_torch.tables import Shown, Table
+from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
 
 
 @dataclass(frozen=True, repr=False)
@@ -29,16 +31,21 @@ class GapResult(Shown):
     log: Path
 
     @property
+    @in_its_units
     def headline(self) -> str:
         return verdict_sentence(self.answer.to_dict())
 
+    @in_its_units
     def table(self) -> Table:
-        """One row per parameter of each cause, SI; without a cause, the explanations and their probabilities."""
-        rows = [
-            (cause_words({"effect": c.effect, "location": c.location}), name, a.value, a.std, a.unit)
-            for c in self.answer.causes
-            for name, a in c.parameters.items()
-        ]
+        """One row per parameter of each cause, in its unit for display; without a cause, the explanations and their
+        probabilities.
+        """
+        rows = []
+        for cause in self.answer.causes:
+            for name, a in cause.parameters.items():
+                full = str(ParameterName(cause.location, cause.effect, name))
+                unit, value, std = in_display_unit(full, a.unit, a.value, a.std)
+                rows.append((effect_words(cause.effect, cause.location), name, value, std, unit))
         return (
             Table.of_rows(("cause", "parameter", "value", "std error", "unit"), rows) if rows else self.explanations()
         )
@@ -74,10 +81,18 @@ class MonitorResult(Shown):
         isolated = [event for event in self.events if event.kind in ("isolated", "revised")]
         return f"{count} in {self.lasted:g} s" + (f"; {isolated[-1].headline}" if isolated else "")
 
+    @in_its_units
     def table(self) -> Table:
         """One row per event; sizes in the units of the column `units`."""
-        names = ("time", "kind", "alarm", "text", "headline", "faults", "sizes", "stds", "units", "onset", "onset_std")
-        return Table({name: [getattr(event, name) for event in self.events] for name in names})
+        names = ("time", "kind", "alarm", "text", "headline", "faults", "onset", "onset_std")
+        columns = {name: [getattr(event, name) for event in self.events] for name in names}
+        sizes = [
+            [in_display_unit(*s) for s in zip(e.faults, e.units, e.sizes, e.stds, strict=True)] for e in self.events
+        ]
+        amounts = {
+            name: [tuple(s[k] for s in each) for each in sizes] for k, name in enumerate(("units", "sizes", "stds"))
+        }
+        return Table(columns | amounts)
 
     def brief(self) -> Table:
         return Table.of_rows(("time, s", "event", "text"), [(e.time, e.kind, e.text) for e in self.events])
@@ -92,6 +107,7 @@ class FreeRun(Shown):
     prediction: Prediction
 
     @property
+    @in_its_units
     def headline(self) -> str:
         return self.misfit.headline(f"free run of {self.plant.name} along {self.recording.source}")
 
@@ -99,11 +115,13 @@ class FreeRun(Shown):
     def misfit(self) -> Misfit:
         return misfit_of(self.prediction.rmse, [self.recording], self.plant)
 
+    @in_its_units
     def table(self) -> Table:
-        """One row per sensor: root mean square error, SI."""
-        rows = [(s.name, self.prediction.rmse[s.name], s.unit) for s in self.plant.sensors]
-        return Table.of_rows(("sensor", "RMSE", "unit"), rows)
+        """One row per sensor: root mean square error, in its unit for display."""
+        rows = [(s.name, *in_display_unit(s.column, s.unit, self.prediction.rmse[s.name])) for s in self.plant.sensors]
+        return Table.of_rows(("sensor", "unit", "RMSE"), rows)
 
+    @in_its_units
     def picture(self) -> str:
         """Measured and predicted readings, as SVG."""
         columns = [sensor.column for sensor in self.plant.sensors]
@@ -129,13 +147,18 @@ class RefitResult(Shown):
         return self.fit.plant
 
     @property
+    @in_its_units
     def headline(self) -> str:
-        errors = ", ".join(f"{s.name} {quantity_text(self.fit.rmse[s.name], s.unit)}" for s in self.plant.sensors)
+        rmse = self.fit.rmse
+        errors = ", ".join(f"{s.name} {quantity_text(rmse[s.name], s.unit, name=s.column)}" for s in self.plant.sensors)
         return self.misfit.headline(f"refit of {self.plant.name}: root mean square error {errors}")
 
+    @in_its_units
     def table(self) -> Table:
-        """One row per value that all recordings share, SI."""
-        return Table.of_rows(("parameter", "value", "std error"), [(n, *pair) for n, pair in self.fit.fitted.items()])
+        """One row per value that all recordings share, in its unit for display."""
+        constants = build_network(self.plant).constants
+        rows = [(n, *in_display_unit(n, constants[n].unit, *pair)) for n, pair in self.fit.fitted.items()]
+        return Table.of_rows(("parameter", "unit", "value", "std error"), rows)
 
     def narrowed(self) -> PlantDescription:
         """The plant with the standard errors of the fit as tolerances where these are smaller."""

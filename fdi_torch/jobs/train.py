@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +35,7 @@ from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import notebook_svg, save
-from fdi_torch.tables import Shown, Table, needed
+from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
 
 Tell = Callable[[float, str], None]
 STATE = "/estimator/de/population"
@@ -53,31 +54,36 @@ class TrainResult(Shown):
     profiles: tuple[Profile, ...] = ()
 
     @property
+    @in_its_units
     def headline(self) -> str:
         """The diagnosis in one sentence; it begins with a warning if the model does not explain the recording."""
         return self.result.diagnosis.headline
 
+    @in_its_units
     def table(self) -> Table:
-        """One row per parameter, SI."""
+        """One row per parameter, in its unit for display."""
         final = self.result.estimate
-        low, high = final.interval()
-        columns: dict[str, Sequence[Any]] = {"parameter": final.names, "unit": final.units}
-        columns |= {"estimate": final.value.tolist(), "std error": final.std.tolist()}
-        columns |= {"95 % low": low.tolist(), "95 % high": high.tolist()}
-        columns["nominal"] = [p.nominal for p in self.fitting.space]
+        names = ["parameter", "unit", "estimate", "std error", "95 % low", "95 % high", "nominal"]
+        columns = [c.tolist() for c in (final.value, final.std, *final.interval(), self.fitting.space.nominal())]
         if self.truth:
-            columns["simulated"] = [self.truth.get(name) for name in final.names]
-        return Table(columns)
+            names.append("simulated")
+            columns.append([self.truth.get(p.name, math.nan) for p in self.fitting.space])
+        by_parameter = zip(self.fitting.space, *columns, strict=True)
+        rows = [(p.name, *in_display_unit(p.name, p.unit, *numbers)) for p, *numbers in by_parameter]
+        return Table.of_rows(names, rows)
 
+    @in_its_units
     def picture(self) -> str:
         """Readings and fit of the first recording, as SVG."""
         figure = fit_figure(self.fitting.recordings[0], {"estimate": self.result.predicted[0]}, self.headline)
         return notebook_svg(figure, self.log.stem, self.headline)
 
+    @in_its_units
     def profile(self, *names: str, confidence: float = 0.95) -> tuple[Profile, ...]:
         """Profile likelihoods of the named parameters, of all if none is named; see `profile_likelihood`."""
         return profiles_of(self.fitting, self.result, names or self.result.estimate.names, confidence)
 
+    @in_its_units
     def sample(self, draws: int = 1000, seed: int = 0, most_steps: int = 16_000) -> Draws:
         """Draws from the posterior (extra `draws`); see `draw_posterior`."""
         drawn = with_draws(self.fitting, self.result, draws, seed, most_steps).estimate.draws
