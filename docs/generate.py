@@ -217,8 +217,8 @@ def python_api() -> str:
     names = fdi_torch.__all__
     parts = [
         "# Python API",
-        "Generated from `fdi_torch.__all__`. Tensors are in SI, with leading dimensions as batches; `table()` is in your units. Examples: "
-        "[Use it from Python](../how-to/python.md).",
+        "Generated from `fdi_torch.__all__`. Tensors are in SI, with leading dimensions as batches; `table()` is in "
+        "your units. Examples: [Use it from Python](../how-to/python.md).",
         " · ".join(f"[`{name}`](#{anchor(name)})" for name in names),
         *(api_entry(name, getattr(fdi_torch, name)) for name in names),
     ]

@@ -16,11 +16,12 @@ from types import ModuleType
 from typing import Any
 
 _HOMES: dict[str, tuple[str, ...]] = {
-    "fdi_torch.config": (
-        *("ConfigError", "dump_plant", "load_plant", "load_recordings", "load_run"),
-        *("read_frame", "read_recording"),
-    ),
+    "fdi_torch.config.loaded_recordings": ("load_recordings", "read_frame", "read_recording"),
+    "fdi_torch.config.plant_file": ("load_plant",),
     "fdi_torch.config.plant_in_code": ("Plant",),
+    "fdi_torch.config.plant_writer": ("dump_plant",),
+    "fdi_torch.config.problems": ("ConfigError",),
+    "fdi_torch.config.run_file": ("load_run",),
     "fdi_torch.effects": ("EFFECTS", "build_network", "place", "placements_for"),
     "fdi_torch.effects.catalogue": ("Catalogue", "effects"),
     "fdi_torch.estimate.fitting": ("Fitting", "set_up"),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from fdi_torch.config import load_run
 from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.run_file import load_run
 from fdi_torch.config.study_file import load_study
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.jobs.train import train

@@ -109,6 +109,7 @@ def test_a_plant_is_checked_alone_and_drawn(tmp_path: Path, capsys: pytest.Captu
 
 def test_check_shows_channels_and_findings(rig: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["check", rig, "--plant", "three_tank"]) == cli.DONE
+    assert cli.main(["check", "--plant", "three_tank", "--recording", rig, "--quiet"]) == cli.DONE
     shown = capsys.readouterr().out
     assert "50 samples, 49 s, one every 1 s" in shown
     assert "h1       output  cm          40" in shown
@@ -171,7 +172,7 @@ def test_check_of_a_run_file_says_what_is_usable(tmp_path: Path, capsys: pytest.
     [
         (
             ["RIG"],
-            "fdi check: expected --plant, a recording and --plant, or --config; without a plant file, "
+            "fdi check: expected --plant, --plant and --recording, or --config; without a plant file, "
             "fdi new plant --recording FILE writes one from the columns of a recording",
         ),
         (["RIG", "--plant", "three_tonk"], "got 'three_tonk'; the nearest is 'three_tank'"),

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from fdi_torch.config import ConfigError, RunConfig, load_run
 from fdi_torch.config.key_reference import config_reference, keys
 from fdi_torch.config.plant_file import PlantConfig
+from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.run_file import RunConfig, load_run
 
 RUN = {path: (default, meaning) for path, default, meaning in keys(RunConfig)}
 

@@ -9,10 +9,11 @@ import pytest
 import torch
 import yaml
 
-from fdi_torch.config import ConfigError, build_run, load_recordings, load_run, read_recording
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
+from fdi_torch.config.loaded_recordings import load_recordings, read_recording
 from fdi_torch.config.monitor_file import load_monitor
-from fdi_torch.config.run_file import Run
+from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.simulation import NoiseConfig, noise_std, planned_recording
 from fdi_torch.config.yaml_files import SHIPPED, read_yaml
 from fdi_torch.effects import build_network

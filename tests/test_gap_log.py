@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from fdi_torch import cli
-from fdi_torch.config import load_plant
 from fdi_torch.config.logged_config import logged_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.gap.answer import Amount, Answer, Cause, adopted
 from fdi_torch.gap.diagnose import Settings

@@ -14,7 +14,9 @@ from rigs import blank_recording, factor, rescaled
 from torch import Tensor
 
 import fdi_torch
-from fdi_torch.config import ConfigError, build_plant, dump_plant
+from fdi_torch.config.plant_file import build_plant
+from fdi_torch.config.plant_writer import dump_plant
+from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.yaml_files import parse_yaml
 from fdi_torch.effects import build_network, place
 from fdi_torch.parameters import ParameterSpace

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from fdi_torch.config import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import RecordingCheck, check_recording
@@ -189,7 +189,8 @@ def test_valve_in_percent_taken_for_a_share() -> None:
 @pytest.mark.data
 def test_what_is_odd_about_a_real_rig_is_found(real_data: Path) -> None:
     """The tanks are empty for long: the sensors rest at their lowest value, R's 2 cm below its zero."""
-    from fdi_torch.config import RecordingConfig, read_recording
+    from fdi_torch.config.loaded_recordings import read_recording
+    from fdi_torch.config.recording_config import RecordingConfig
 
     rig = load_plant("dts200")
     file = RecordingConfig(file=str(real_data / "dts200" / "exp5_pump_staircase_drain__2194.csv"))

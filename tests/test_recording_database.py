@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from fdi_torch.cli import DONE, MISUSE, main
-from fdi_torch.config import load_plant
 from fdi_torch.config.loaded_recordings import read_recording
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.recordings.database import expect_no_password, write_query

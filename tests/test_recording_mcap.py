@@ -8,8 +8,11 @@ import pytest
 import torch
 from mcap.writer import Writer
 
-from fdi_torch.config import ConfigError, RecordingConfig, load_plant, read_recording
 from fdi_torch.config.growing_recordings import growing_rows
+from fdi_torch.config.loaded_recordings import read_recording
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.logbook import RunLog
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.mcap_files import read_mcap

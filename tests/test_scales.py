@@ -14,10 +14,11 @@ import torch
 from rigs import blank_recording, factor, rescaled, three_tank
 from torch import Tensor
 
-from fdi_torch.config import load_plant, load_run
 from fdi_torch.config.monitor_file import MonitorConfig
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.resolved_config import resolve
+from fdi_torch.config.run_file import load_run
 from fdi_torch.effects import all_placements, build_network, placements_for
 from fdi_torch.estimate.fitting import set_up
 from fdi_torch.estimate.hybrid import HybridResult, estimate_parameters

@@ -11,7 +11,7 @@ import fdi_torch
 from fdi_torch import load_plant
 from fdi_torch.cli.screen import Screen
 from fdi_torch.cli.train import show
-from fdi_torch.config import ConfigError
+from fdi_torch.config.problems import ConfigError
 from fdi_torch.logbook.signals import arrays
 from fdi_torch.report.material import gather
 from fdi_torch.report.page import page, report_of

@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             spans = ", ".join(f"{p.recording.time[0]:g} to {p.recording.time[-1]:g} s" for p in stretches)
             screen.say(f"usable with all inputs known: {spans}")
     if checks and arguments.config is None:
-        named = f"--plant {arguments.plant} --recording {arguments.recording}"
+        named = f"--plant {arguments.plant} --recording {arguments.recording or arguments.file}"
         screen.say(f"next: fdi gap {named} says whether the plant file explains it")
     screen.result({"format": "fdi_torch.check/1", "plant": plant, "recordings": checks})
     return 0
@@ -70,15 +70,16 @@ def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[Recor
         if not run_file.config.recordings:
             raise ValueError("expected recordings in the run file, got a simulation; fdi simulate writes its recording")
         return run_file.plant, run_file.config.recordings, run_file.base
+    recording = arguments.recording or arguments.file
+    if arguments.recording and arguments.file:
+        raise ValueError(f"expected one recording, got {arguments.file} and --recording {arguments.recording}")
     if arguments.plant is None:
         raise ValueError(
-            "expected --plant, a recording and --plant, or --config; without a plant file, "
+            "expected --plant, --plant and --recording, or --config; without a plant file, "
             "fdi new plant --recording FILE writes one from the columns of a recording"
         )
     plant, folder = chosen_plant(arguments.plant), Path.cwd()
-    return plant, *(
-        ([], folder) if arguments.recording is None else listed_recordings(arguments.recording, plant, folder)
-    )
+    return plant, *(([], folder) if recording is None else listed_recordings(recording, plant, folder))
 
 
 def _show_plant(plant: PlantDescription, screen: Screen) -> None:

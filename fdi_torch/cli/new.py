@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from importlib.resources import files
 from pathlib import Path
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.file_templates import template
-from fdi_torch.config.plant_file import chosen_plant
-from fdi_torch.config.plant_from_recording import plant_from_recording
-from fdi_torch.config.yaml_files import find_data
 from fdi_torch.disk import named_errors
 
 NEXT = {
-    "plant": "fdi check {recording}--plant {}",
+    "plant": "fdi check --plant {}{recording}",
     "run": "fdi train --config {}",
     "monitor": "fdi monitor --config {}",
     "study": "fdi study --config {}",
@@ -27,15 +24,27 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         raise ValueError(f"--out: expected a file that ends in .yaml, got {path}; rename it")
     if arguments.recording and arguments.kind != "plant":
         raise ValueError(f"--recording: expected it for a plant only, not for a {arguments.kind}; leave it out")
-    if arguments.recording:
-        text = plant_from_recording(find_data(arguments.recording, Path.cwd()), path.stem)
-    else:
-        text = template(arguments.kind, chosen_plant(arguments.plant), arguments.plant, path.stem)
+    text = _text(arguments, path.stem)
     if path.exists():
         raise ValueError(f"{path}: expected a new file, but it exists; choose another name with --out")
     with named_errors(path), path.open("x", encoding="utf-8") as file:
         file.write(text)
-    recording = f"{arguments.recording} " if arguments.recording else ""
+    recording = f" --recording {arguments.recording}" if arguments.recording else ""
     screen.say(f"{path}; next: {NEXT[arguments.kind].format(path, recording=recording)}")
     screen.result({"format": "fdi_torch.new/1", "file": str(path), "kind": arguments.kind})
     return DONE
+
+
+def _text(arguments: argparse.Namespace, name: str) -> str:
+    """The text of the new file. Only a file that depends on a plant or a recording waits for torch."""
+    if arguments.kind != "plant":
+        from fdi_torch.config.file_templates import template
+        from fdi_torch.config.plant_file import chosen_plant
+
+        return template(arguments.kind, chosen_plant(arguments.plant), arguments.plant, name)
+    if arguments.recording:
+        from fdi_torch.config.plant_from_recording import plant_from_recording
+        from fdi_torch.config.yaml_files import find_data
+
+        return plant_from_recording(find_data(arguments.recording, Path.cwd()), name)
+    return files("fdi_torch.config").joinpath("templates", "plant.yaml").read_text(encoding="utf-8")

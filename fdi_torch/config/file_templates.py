@@ -1,31 +1,27 @@
-"""Commented minimal files: a plant, and runs, monitors and studies of any plant."""
+"""Commented minimal runs, monitors and studies of any plant."""
 
 from __future__ import annotations
 
 from importlib.resources import files
 from string import Template
 
-from fdi_torch.names import unknown
 from fdi_torch.parameters import quantity_text
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recordings.csv_writing import header_of
 
-KINDS = ("plant", "run", "monitor", "study")
-
 
 def template(kind: str, plant: PlantDescription, plant_file: str, name: str) -> str:
-    """The text of a new file of that kind.
+    """The text of a new run, monitor or study.
 
     plant: the plant of the file; plant_file: its entry under the key `plant`; name: of the run and of the recording
-    that it reads. Raises ValueError for an unknown kind.
+    that it reads.
     """
-    if kind not in KINDS:
-        raise ValueError(unknown("a kind of file", kind, KINDS))
     pipe = plant.pipes[0].name if plant.pipes else plant.tanks[0].name
     plugging = f"{pipe}.plugging" if plant.pipes else f"{pipe}.evaporation"
     constant = f"{pipe}.discharge_coefficient" if plant.pipes else f"{pipe}.area"
-    text = files("fdi_torch.config").joinpath("templates", f"{kind}.yaml").read_text(encoding="utf-8")
-    return Template(text).substitute(
+    return Template(
+        files("fdi_torch.config").joinpath("templates", f"{kind}.yaml").read_text(encoding="utf-8")
+    ).substitute(
         plant=plant_file,
         name=name,
         header=header_of(plant.channel_units(), {s.column: s.unit for s in plant.sensors}),

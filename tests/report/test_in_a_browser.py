@@ -24,7 +24,7 @@ from sample_runs import (
     write_train,
 )
 
-from fdi_torch.config import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.jobs.report import comparison_of
 from fdi_torch.report.page import RunReport, page, report_of
 

@@ -22,7 +22,7 @@ from sample_runs import (
     write_study,
 )
 
-from fdi_torch.config import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.logbook import RunLog, read_run
 from fdi_torch.report.diagnosed_effects import diagnosed_effects
 from fdi_torch.report.material import gather

@@ -10,7 +10,7 @@ import pytest
 from sample_runs import NASTY, material_of, write_train
 
 from fdi_torch import cli
-from fdi_torch.config import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.logbook import RunLog
 from fdi_torch.report.page import page, report_of, write_pictures
 from fdi_torch.report.verdict import headline

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fdi_torch.config import load_plant
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.report.rig_layout import tank_places
 from fdi_torch.report.schematic import Overlay, schematic

@@ -10,15 +10,16 @@ EXAMPLES = """
 examples:
   fdi check --plant rig.yaml                       the plant alone
   fdi check --plant rig.yaml --picture rig.png     and a drawing of it
-  fdi check run.csv --plant rig.yaml               the plant and a recording
-  fdi check runs.yaml --plant rig.yaml             all recordings that a YAML file maps to the plant
+  fdi check --plant rig.yaml --recording run.csv   the plant and a recording
+  fdi check --plant rig.yaml --recording runs.yaml    all recordings that a YAML file maps to the plant
   fdi check --config own.yaml                      all recordings of a run file
   fdi check --keys                                 the keys of a plant file
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recording", nargs="?", help="CSV or MCAP file, or a YAML file with `recordings`")
+    parser.add_argument("file", nargs="?", help="a recording, as --recording FILE")
+    parser.add_argument("--recording", metavar="FILE", help="CSV or MCAP file, or a YAML file with `recordings`")
     parser.add_argument("--plant", metavar="NAME|FILE", help="a shipped plant such as three_tank, or a plant file")
     parser.add_argument("--picture", metavar="FILE", help="draw the rig (PNG or SVG)")
     add_config(parser)
