@@ -60,7 +60,7 @@ def test_every_template_is_a_file_of_its_kind_for_every_shipped_plant(name: str,
 def test_a_new_plant_file_does_not_wait_for_torch(tmp_path: Path) -> None:
     words = ["-X", "importtime", "-m", "fdi_torch", "new", "plant", "--out", str(tmp_path / "rig.yaml")]
     imported = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True).stderr
-    assert "fdi_torch.cli.new" in imported and "torch._C" not in imported and "fdi_torch.units" not in imported
+    assert "fdi_torch.cli.screen" in imported and "torch._C" not in imported and "fdi_torch.units" not in imported
     assert load_plant(tmp_path / "rig.yaml").name == "rig"
 
 
