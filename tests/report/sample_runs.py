@@ -20,14 +20,15 @@ FIXED: dict[str, Any] = {
 NASTY = '<script>alert("1")</script>'
 
 
-def write_train(path: Path, name: str = "T1.leak.size", predicted: bool = True) -> Path:
+def write_train(path: Path, name: str = "T1.leak.size", predicted: bool = True, setting: str = "") -> Path:
     """A diagnosis of two parameters; the first is called `name`."""
     rng = np.random.default_rng(0)
     time = np.arange(1000.0)
     clean = np.stack([0.3 + 0.1 * np.exp(-time / 300), 0.2 + 0.05 * np.exp(-time / 200)], 1)
     read = clean + 1e-3 * rng.standard_normal(clean.shape)
     inputs = np.stack([5e-5 + 1e-5 * (time % 200 > 100), np.full(1000, 4e-5)], 1)
-    with RunLog(path, "train", config_text="plant: three_tank\n", **FIXED) as log:
+    config = {"estimate.parameters": setting} if setting else None
+    with RunLog(path, "train", config=config, config_text="plant: three_tank\n", **FIXED) as log:
         log.recording(time, inputs, read, ("Q1", "Q2"), ("h1", "h2"), ("m^3/s",) * 2, ("m",) * 2)
         log.write("/plant/truth", {name: 0.3, "P13.openness.size": 0.6}, 0.0)
         for g in range(20):
@@ -202,7 +203,13 @@ def write_study(path: Path) -> Path:
         for k, (group, spread) in enumerate((("SNR 50", 1e-3), ("SNR 30", 1e-2))):
             for n in range(20):
                 free = (np.array([0.3, 0.6]) + spread * rng.standard_normal(2)).tolist()
-                numbers = {"truth": [0.3, 0.6], "free": free, "bound": [spread, spread], "cost": float(n)}
+                numbers = {
+                    "truth": [0.3, 0.6],
+                    "free": free,
+                    "bound": [spread, spread],
+                    "cost": float(n),
+                    "iterations": 12.0,
+                }
                 log.trial(20 * k + n, numbers, group=group, seed=n, status="converged" if n else "stalled")
             scores = {
                 f"free.{name}.{score}": spread for name in ("T1.leak", "P13.openness") for score in ("bias", "rmse")

@@ -118,7 +118,8 @@ def made(kind: str, folder: Path) -> str:
         return report_of(material_of(path, load_plant(plant)))
 
     if kind == "compare":
-        both = [report(write_train(folder / f"{name}.mcap")) for name in ("first", "second")]
+        long = {name: f"[{','.join(f'{name}_{k}.plugging.size' for k in range(30))}]" for name in ("first", "second")}
+        both = [report(write_train(folder / f"{name}.mcap", setting=text)) for name, text in long.items()]
         return page(both, [comparison_of(both)])
     if kind == "nasty":
         return page([report(write_train(folder / "nasty.mcap", name=f"{NASTY * 4}.leak.size"))])

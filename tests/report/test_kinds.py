@@ -170,6 +170,8 @@ def test_a_study_page_shows_settings_and_trials(tmp_path: Path) -> None:
     assert headline(made.material) == "40 trials in 2 settings"
     assert titles(made)[:3] == ["Settings", "Isolation", "Errors"] and titles(made)[4] == "The rig"
     assert {"trials_1", "errors_2", "isolation"} <= names(made) and ">T1.leak<" in page([made])
+    assert "cost, no unit" in page([made]) or ">cost<" in page([made])
+    assert ">iterations<" not in page([made]), "the same in all trials"
     assert "38 of 40 modes stated correctly; 2 faults missed" in page([made]) and "none (10 %)" in page([made])
 
 

@@ -107,8 +107,9 @@ def trials_section(material: Material) -> Section | None:
         ends = [sum(str(m.get("status", "")) == status for m in own) / len(own) for status in statuses]
         rows.append([group, str(len(own)), *(percent(share) for share in ends)])
     names = dict.fromkeys(k for m in trials for k, v in m.items() if k not in _OWN and isinstance(v, float))
+    varying = [name for name in names if len({m[name] for m in trials if name in m}) > 1]
     pictures = []
-    for k, name in enumerate(list(names)[:MOST_PANELS]):
+    for k, name in enumerate(varying[:MOST_PANELS]):
         unit, scale = shown_unit(material.unit(TRIAL, name))
         figure = group_panel(name, axis(name, unit), groups, [scale * _column(trials, g, name) for g in groups])
         pictures.append(Picture(f"trials_{k + 1}", figure))
