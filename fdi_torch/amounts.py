@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from fdi_torch.parameters import ParameterName, display_unit, significant
 
-_RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def effect_words(effect: str, place: str) -> str:
@@ -51,7 +51,7 @@ def with_error(value: float, std: float) -> str:
         return significant(value, 4) if math.isfinite(value) else "unknown"
     if (largest := max(abs(value), std)) < 1e-3:
         exponent = math.floor(math.log10(largest))
-        return f"({with_error(value / 10.0**exponent, std / 10.0**exponent)})·10{str(exponent).translate(_RAISED)}"
+        return f"({with_error(value / 10.0**exponent, std / 10.0**exponent)})·10{str(exponent).translate(RAISED)}"
     if abs(value) >= 1e9:
         return f"{significant(value, 4)} ± {std:.2g}"
     digits = decimals(std)

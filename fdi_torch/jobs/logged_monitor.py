@@ -12,6 +12,7 @@ import orjson
 import torch
 from torch import Tensor
 
+from fdi_torch.amounts import parameter_words
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.jobs.row_buffer import CLOCK
@@ -157,7 +158,7 @@ class LoggedMonitor:
     def _watched_faults_text(self, prepared: PreparedMonitor, whole: Recording) -> str:
         """The watched faults, and which of them the inputs of the fault-free part cannot distinguish."""
         names = [self.space.names[fault.size] for fault in prepared.monitor.faults]
-        text = f"watches for {', '.join(names)}"
+        text = f"watches for {', '.join(map(parameter_words, names))}"
         part = fault_free_part(whole, *self.run.config.fault_free)
         try:
             report = diagnosability(self.plant, names, part, prepared.noise.reading_std, start="free")

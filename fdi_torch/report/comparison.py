@@ -42,10 +42,12 @@ def _section(compared: Comparison, runs: Sequence[Material]) -> Section:
     pictures = [*_convergence(compared, runs), *_residuals(compared, runs)]
     blocks += [pictures] if pictures else []
     for name, entries in compared.differences.items():
+        if name == "result":  # its lists of numbers are the table above
+            entries = {key: texts for key, texts in entries.items() if not any(t.startswith("[") for t in texts)}
         rows = [[key, *(short(text, MOST_LETTERS) for text in texts)] for key, texts in entries.items()]
-        blocks.append(
-            folded(f"{name}: {len(rows)} differ", table(["key", *compared.labels], rows, len(compared.labels) + 1))
-        )
+        if rows:
+            shown = table(["key", *compared.labels], rows, len(compared.labels) + 1)
+            blocks.append(folded(f"{name}: {len(rows)} differ", shown))
     return Section("Comparison", blocks)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import orjson
 
+from fdi_torch.amounts import effect_words
 from fdi_torch.logbook import Comparison
 from fdi_torch.parameters import quantity_text
 from fdi_torch.report.html import short
@@ -120,7 +121,7 @@ def _in_words(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(_in_words(each) for each in value)
     if isinstance(value, dict) and {"effect", "location"} <= value.keys():
-        return f"{value['effect']} at {value['location']}"
+        return effect_words(str(value["effect"]), str(value["location"]))
     if isinstance(value, dict):
         given = {key: each for key, each in value.items() if each is not None}
         return ", ".join(

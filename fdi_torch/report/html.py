@@ -68,6 +68,6 @@ def pairs(entries: Sequence[tuple[Any, Any]]) -> Markup:
     return tag("dl", *rows)
 
 
-def folded(summary: str, *content: Any) -> Markup:
-    """Content that opens on click; it is open in print."""
-    return tag("details", tag("summary", summary), *content)
+def folded(summary: str, *content: Any, printed: bool = True) -> Markup:
+    """Content that opens on click; it is open in print, or left out there."""
+    return tag("details", tag("summary", summary), *content, **({} if printed else {"class_": "raw"}))

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from fdi_torch import amounts
+from fdi_torch.amounts import RAISED
 from fdi_torch.parameters import display_unit, significant
-
-_RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def shown_unit(si_unit: str, name: str = "") -> tuple[str, float]:
@@ -29,7 +28,7 @@ def raised(unit: str) -> str:
     head, *rest = unit.split("^")
     for part in rest:
         digits = len(part) - len(part.lstrip("0123456789-"))
-        head += part[:digits].translate(_RAISED) + part[digits:]
+        head += part[:digits].translate(RAISED) + part[digits:]
     return head
 
 

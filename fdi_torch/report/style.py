@@ -20,6 +20,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from fdi_torch.amounts import RAISED
 from fdi_torch.disk import replacing
 from fdi_torch.report.html import escape, short
 
@@ -94,10 +95,19 @@ def logarithmic(axes: Axes, linear_width: float = 0.0) -> None:
         axes.set_ylim(0.0, 1.3 * high)
         return
     axes.set_yscale("log")
-    axes.yaxis.set_major_formatter(lambda value, place: f"{value:g}")
+    axes.yaxis.set_major_formatter(lambda value, place: power_text(value))
     low, high = axes.get_ylim()
     few = high < 30.0 * low  # so few decades that intermediate ticks need labels too
-    axes.yaxis.set_minor_formatter((lambda value, place: f"{value:g}") if few else NullFormatter())
+    axes.yaxis.set_minor_formatter((lambda value, place: power_text(value)) if few else NullFormatter())
+
+
+def power_text(value: float) -> str:
+    """'0.001', but '10⁻⁵' and '2·10⁻⁵' below it."""
+    if not 0.0 < value < 1e-3:
+        return f"{value:g}"
+    digits, exponent = f"{value:.1e}".split("e")
+    power = f"10{str(int(exponent)).translate(RAISED)}"
+    return power if float(digits) == 1.0 else f"{float(digits):g}·{power}"
 
 
 def label_lines(axes: Axes, columns: int = 4) -> None:

@@ -98,7 +98,8 @@ def monitor_words(material: Material) -> str:
     ended = [f"{m['headline']}" for n, m in last.items() if states[n] == "recovered"]
     parts = [_latest("open alarms", still_open)] if still_open else []
     parts += [f"recovered: {_latest('alarms', ended)}"] if ended else []
-    return "; ".join(parts)
+    text = "; ".join(parts)
+    return text[:1].upper() + text[1:]
 
 
 def _latest(what: str, items: list[str]) -> str:

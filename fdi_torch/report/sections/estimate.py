@@ -53,8 +53,15 @@ def posterior_section(material: Material) -> Section | None:
     pictures = [_ellipse(material, final, covariance, pair, k) for k, pair in enumerate(ranked)]
     words = "Regions with 50 % and 95 % of the probability, most correlated pairs first."
     words += " The green cross marks the simulated values." if material.truth else ""
-    rows = [[names[i], *(_signed(correlation[i, j]) for j in determined)] for i in determined]
-    grid = table(["correlation", *(str(names[j]) for j in determined)], rows)
+    rows = [
+        [
+            f"{k + 1}  {names[i]}",
+            *(_signed(correlation[i, j]) for j in determined[: k + 1]),
+            *[""] * (len(determined) - k - 1),
+        ]
+        for k, i in enumerate(determined)
+    ]
+    grid = table(["correlation with", *(str(k + 1) for k in range(len(determined)))], rows)
     return Section("Uncertainty", [words, pictures, grid]) if pictures else None
 
 

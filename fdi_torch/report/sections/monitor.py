@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from fdi_torch.amounts import parameter_words
 from fdi_torch.clock import clock_text
+from fdi_torch.parameters import is_effect_parameter
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material
@@ -64,7 +66,7 @@ def event_section(material: Material) -> Section | None:
             number(float(m["t"]), 6),
             *([_moment(float(m["t"]))] if dated else []),
             str(m.get("event", "")),
-            str(m.get("channel", "")),
+            " and ".join(map(_words, str(m.get("channel", "")).split(" + "))),
             raised(str(m.get("message", ""))),
             *_onset(m.get("onset"), dated),
         ]
@@ -74,6 +76,11 @@ def event_section(material: Material) -> Section | None:
     header = ("time, s", *clock, "event", "at", "description", "onset, s", *(["onset, clock time"] if dated else []))
     listed = table(header, rows, left=len(header) - 1 - len(clock))
     return Section("Events", [listed])
+
+
+def _words(name: str) -> str:
+    """'leak at A' of 'A.leak.size'; a sensor's name is unchanged."""
+    return parameter_words(name) if is_effect_parameter(name) else name
 
 
 def _onset(onset: Any, dated: bool) -> list[Any]:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from fdi_torch.amounts import parameter_words
 from fdi_torch.effects import build_network, effect
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.effect import Placement
@@ -40,14 +41,14 @@ def summary_section(material: Material) -> Section | None:
     main = [
         [_main_words(row[0]), *row[1:]] for row in rows if row[0].startswith(f"{estimator}.") and _main_words(row[0])
     ]
-    blocks = [table(header, [rows[0], *main]), folded(f"All {len(rows)} numbers of each setting", shown)]
+    blocks = [table(header, [rows[0], *main]), folded(f"All {len(rows)} numbers of each setting", shown, printed=False)]
     return Section("Settings", [f"Estimator: {estimator}.", *blocks] if main else blocks[1:])
 
 
 def _main_words(name: str) -> str:
-    """'A.leak.size: error over the Cramér-Rao bound' of 'free.A.leak.size.over_bound'; empty for a minor number."""
+    """'leak at A: error over the Cramér-Rao bound' of 'free.A.leak.size.over_bound'; empty for a minor number."""
     parameter, _, quantity = name.partition(".")[2].rpartition(".")
-    return f"{parameter}: {MAIN[quantity]}" if quantity in MAIN else ""
+    return f"{parameter_words(parameter)}: {MAIN[quantity]}" if quantity in MAIN else ""
 
 
 def error_section(material: Material) -> Section | None:
@@ -66,7 +67,7 @@ def error_section(material: Material) -> Section | None:
             bounds.append(np.median([float(m["bound"][i]) if "bound" in m else np.nan for m in own]))
         unit, scale = _unit_of(material, name)
         errors, bounds = [scale * e for e in errors], [scale * b for b in bounds]
-        figure = group_panel(name, axis("size of the error", unit), groups, errors)
+        figure = group_panel(parameter_words(name), axis("size of the error", unit), groups, errors)
         if all(np.nanmax(e, initial=0.0) > 0 for e in errors):
             logarithmic(figure.axes[0])
         figure.axes[0].plot(range(len(groups)), bounds, "_", color=MARK, ms=22, mew=2.0)
