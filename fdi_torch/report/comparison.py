@@ -69,8 +69,12 @@ def result_rows(compared: Comparison) -> list[list[str]]:
     for result in compared.results:
         unit, scale = shown_unit(result.unit, result.name)
         values = [with_error(scale * v, scale * s) for v, s in zip(result.values, result.std, strict=True)]
-        rows.append([result.name, unit or "1", *values, number(result.p_value, 2), verdicts[result.agree]])
+        rows.append([result.name, unit or "1", *values, _p_text(result.p_value), verdicts[result.agree]])
     return rows
+
+
+def _p_text(p: float) -> str:
+    return "< 0.0001" if p < 1e-4 else number(p, 2)
 
 
 def _convergence(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:

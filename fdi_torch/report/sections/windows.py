@@ -61,7 +61,7 @@ def _bars(windows: Sequence[dict[str, Any]]) -> Figure:
             ]
             axes.broken_barh(spans, (row - 0.35, 0.7), facecolors=MARK, alpha=strength, edgecolor="none")
         axes.axhline(row, color=FAINT, linewidth=0.5, zorder=0)
-    axes.set_yticks(range(len(suspects)), [short(name) for name in suspects])
+    axes.set_yticks(range(len(suspects)), [short(parameter_words(name)) for name in suspects])
     axes.set_ylim(len(suspects) - 0.5, -0.5)
     axes.set_xlim(float(windows[0]["start"]), max(float(w["stop"]) for w in windows))
     axes.grid(False)
