@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import fdi_torch
-from fdi_torch.cli import COMMANDS
+from fdi_torch.cli import COMMANDS, options_of
 from fdi_torch.config.key_reference import keys
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.logbook.schemas import TOPICS
@@ -35,6 +35,7 @@ def generated() -> dict[str, str]:
     """Markdown of every generated page by its path in docs/."""
     return {
         "reference/commands.md": commands(),
+        "reference/command-paths.md": command_paths(),
         "reference/configuration.md": configuration(),
         "reference/plant-file.md": plant_file(),
         "reference/effects.md": effects(),
@@ -60,7 +61,7 @@ def code(text: str) -> str:
 
 
 def commands() -> str:
-    rows = ((f"[`{name}`](#fdi-{name})", what) for name, what in COMMANDS.items())
+    rows = ((f"[`{name}`](#fdi-{name})", options_of(name).SUMMARY) for name in COMMANDS)
     parts = [
         "# Commands",
         "Generated from the argument parsers. Results go to standard output, progress to standard error. Exit codes: "
@@ -72,6 +73,25 @@ def commands() -> str:
         *(command(name) for name in COMMANDS),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def command_paths() -> str:
+    """The functions of each command in the order of their calls, from the docstrings of its module."""
+    rows = ((code(name), " → ".join(f"`{f}`" for f in path_of(name))) for name in COMMANDS)
+    return "\n\n".join(
+        [
+            "# The path of each command",
+            "Generated from the docstrings of `cli/COMMAND.py`: the main functions (below `fdi_torch.`) in the order "
+            "in which they are called. Every command starts in `cli.main`, which reads the arguments that "
+            "`cli/options/COMMAND.py` declares.",
+            "\n".join(["| command | path |", "|---|---|", *(f"| {a} | {b} |" for a, b in rows)]) + "\n",
+        ]
+    )
+
+
+def path_of(name: str) -> list[str]:
+    text = (import_module(f"fdi_torch.cli.{name}").__doc__ or "").partition("Path: ")[2]
+    return re.findall(r"[a-z_]+(?:\.\w+)+", text)
 
 
 def command(name: str) -> str:

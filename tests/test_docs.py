@@ -37,9 +37,8 @@ def loaded(path: Path) -> ModuleType:
     return module
 
 
-GENERATED: dict[str, str] = {
-    f"docs/{name}": text for name, text in loaded(ROOT / "docs/generate.py").generated().items()
-}
+GENERATE = loaded(ROOT / "docs/generate.py")
+GENERATED: dict[str, str] = {f"docs/{name}": text for name, text in GENERATE.generated().items()}
 WRITTEN = {
     path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")
     for path in [ROOT / "README.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -103,12 +102,9 @@ def test_commands_and_their_options_exist(page: str) -> None:
 
 
 def test_every_command_has_a_path_of_functions_that_exist() -> None:
-    section = PAGES["docs/contributing.md"].partition("## The path of each command")[2].partition("\n## ")[0]
-    rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", section, flags=re.M)
-    assert {command for command, _ in rows} == set(COMMANDS)
-    for command, path in rows:
-        functions = re.findall(r"`([\w.]+)`", path)
-        assert functions[0] == f"cli.{command}.run"
+    for command in COMMANDS:
+        functions = GENERATE.path_of(command)
+        assert functions[:1] == [f"cli.{command}.run"], f"{command}: expected a path in the docstring of its module"
         earlier = ""
         for function in functions:
             module, name = home(function)

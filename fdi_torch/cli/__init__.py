@@ -2,9 +2,10 @@
 
 Exit codes: 0 done, 2 wrong use (explained on standard error), 3 ran but did not converge, 4 converged, but the
 model does not explain the recording, 130 interrupted, 143 terminated.
-A command is one line of `COMMANDS`, a module `options/NAME.py` with its description, EXAMPLES and
-`add_arguments(parser)`, and a module `NAME.py` with `run(arguments, screen) -> exit code`. The latter is imported after
-the arguments are parsed, so that help does not wait for torch.
+A command is a module `options/NAME.py` with its description, its STEP and SUMMARY in the overview, EXAMPLES,
+`add_arguments(parser)` and, if it takes more than a moment to start, LONG = True, and a module `NAME.py` with
+`run(arguments, screen) -> exit code`. The latter is imported after the arguments are parsed, so that help does not wait
+for torch.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from contextvars import copy_context
 from pathlib import Path
+from pkgutil import iter_modules
+from types import ModuleType
 from typing import NoReturn
 
 from fdi_torch.disk import sentence
@@ -25,33 +28,17 @@ from fdi_torch.names import unknown
 
 DONE, MISUSE, NOT_CONVERGED, NOT_EXPLAINED, INTERRUPTED, TERMINATED = 0, 2, 3, 4, 130, 143
 
-COMMANDS = {
-    "train": "estimate the sizes of faults in a recording",
-    "simulate": "generate a recording from a plant, inputs, faults and noise",
-    "check": "examine a plant and a recording before any fit",
-    "effects": "show the catalogue of faults and unmodelled effects",
-    "new": "write a commented minimal file: a plant, run, monitor or study",
-    "monitor": "detect, isolate and size faults along a recording or live",
-    "diagnosability": "which faults an experiment can detect and distinguish, and from which size",
-    "rehearse": "validate a monitor on simulated runs: false alarms, delays, isolation",
-    "export": "export a plant as an FMU for other simulation tools",
-    "report": "make one HTML page of one or more logs",
-    "view": "show the logs of a folder as local pages: list, compare, follow running jobs",
-    "inspect": "show what a log contains and whether it is intact, or export its messages",
-    "replay": "repeat a logged run and compare, or try another setting",
-    "compare": "compare runs: settings, data and results",
-    "recover": "recover a broken or unfinished log",
-    "gap": "find where and by which effect a plant file deviates from a recording",
-    "refit": "fit all effects and constants of a plant file together, without a search",
-    "plan": "tell what planned inputs cannot show before an experiment",
-    "predict": "run a plant freely along a recording and report the error",
-    "completion": "print a script with which a shell completes commands and options",
-    "challenge": "blind benchmark of the gap diagnosis on hidden rigs",
-    "study": "repeat an experiment many times: errors against their bounds, coverage, failures",
+COMMANDS = tuple(sorted(module.name for module in iter_modules([str(Path(__file__).with_name("options"))])))
+STEPS = {
+    "describe": "Describe a rig and its recordings",
+    "diagnose": "Diagnose a recording",
+    "monitor": "Monitor a running plant",
+    "plan": "Plan an experiment",
+    "look": "Look at logs",
+    "validate": "Validate the methods",
+    "use": "Use elsewhere",
 }
-
-LONG = ("train", "study", "gap", "refit", "monitor", "challenge")
-"""Commands that take more than a moment to start, and announce that."""
+"""The parts of the overview in order, by `STEP` of a command's options."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -96,9 +83,11 @@ def _open_standard_streams() -> None:
 
 
 def _overview() -> str:
-    lines = [f"  {name:<16}{what}" for name, what in COMMANDS.items()]
-    ending = "fdi COMMAND --help describes a command and shows examples."
-    return "\n".join(["usage: fdi COMMAND [options]", "       fdi --version", "", *lines, "", ending, ""])
+    lines = ["usage: fdi COMMAND [options]", "       fdi --version", ""]
+    listed = {name: options_of(name) for name in COMMANDS}
+    for step, title in STEPS.items():
+        lines += [f"{title}:", *(f"  {n:<16}{o.SUMMARY}" for n, o in listed.items() if step == o.STEP), ""]
+    return "\n".join([*lines, "fdi COMMAND --help describes a command and shows examples.", ""])
 
 
 def _run(name: str, words: list[str]) -> int:
@@ -155,7 +144,7 @@ def _resource_problem(error: Exception) -> str:
 
 def _say_that_it_began(name: str, quiet: bool) -> None:
     """Announce the start of a job before its libraries load, which takes seconds."""
-    if name in LONG and "torch" not in sys.modules and not quiet:
+    if getattr(options_of(name), "LONG", False) and "torch" not in sys.modules and not quiet:
         with suppress(BrokenPipeError):
             sys.stderr.write(f"fdi {name}: loading\n")
             sys.stderr.flush()
@@ -172,9 +161,14 @@ class _Parser(argparse.ArgumentParser):
         return known, others
 
 
+def options_of(name: str) -> ModuleType:
+    """The module with the options of a command."""
+    return importlib.import_module(f"fdi_torch.cli.options.{name}")
+
+
 def command_parser(name: str) -> argparse.ArgumentParser:
     """The parser of a command's arguments."""
-    options = importlib.import_module(f"fdi_torch.cli.options.{name}")
+    options = options_of(name)
     parser = _Parser(
         prog=f"fdi {name}",
         description=options.__doc__,

@@ -1,4 +1,8 @@
-"""`fdi challenge`: what it does and prints. Its options: `options/challenge.py`."""
+"""`fdi challenge`: what it does and prints. Its options: `options/challenge.py`.
+
+Path: cli.challenge.run → blind.benchmark.blind_benchmark → blind.benchmark.seal → blind.benchmark.answer_all →
+gap.diagnose.diagnose → jobs.blind_results.write_results
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""`fdi check`: what it does and prints. Its options: `options/check.py`."""
+"""`fdi check`: what it does and prints. Its options: `options/check.py`.
+
+Path: cli.check.run → config.plant_file.chosen_plant → config.loaded_recordings.read_recording →
+recordings.check.check_recording → gap.preprocess.acquisition.examined → recordings.plant_units.wrong_units →
+recordings.volume_balance.volumes_along
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`fdi compare`: what it does and prints. Its options: `options/compare.py`."""
+"""`fdi compare`: what it does and prints. Its options: `options/compare.py`.
+
+Path: cli.compare.run → logbook.compare.compare
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`fdi diagnosability`: what it does and prints. Its options: `options/diagnosability.py`."""
+"""`fdi diagnosability`: what it does and prints. Its options: `options/diagnosability.py`.
+
+Path: cli.diagnosability.run → monitor.monitor_setup.usual_faults → monitor.diagnosability.diagnosability
+"""
 
 from __future__ import annotations
 

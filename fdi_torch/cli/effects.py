@@ -1,4 +1,7 @@
-"""`fdi effects`: what it does and prints. Its options: `options/effects.py`."""
+"""`fdi effects`: what it does and prints. Its options: `options/effects.py`.
+
+Path: cli.effects.run → effects.catalogue.effects
+"""
 
 from __future__ import annotations
 

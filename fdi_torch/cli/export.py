@@ -1,4 +1,7 @@
-"""`fdi export`: what it does and prints. Its options: `options/export.py`."""
+"""`fdi export`: what it does and prints. Its options: `options/export.py`.
+
+Path: cli.export.run → jobs.fmu_export.export_fmu → simulate.fmu.write_fmu
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""`fdi gap`: what it does and prints. Its options: `options/gap.py`."""
+"""`fdi gap`: what it does and prints. Its options: `options/gap.py`.
+
+Path: cli.gap.run → config.loaded_recordings.named_recordings → jobs.gap.run_gap → gap.problem.problem_of →
+gap.diagnose.solve_problem → gap.screening.options_of → gap.structure_search.search → gap.posterior.posterior_of →
+gap.hypothesis_search.HypothesisSearch.search → gap.localization.localize.localize → gap.answer_assembly.build_answer
+→ gap.holdout.run_reference_models → jobs.gap.log_answer → cli.gap_text.show
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`fdi inspect`: what it does and prints. Its options: `options/inspect.py`."""
+"""`fdi inspect`: what it does and prints. Its options: `options/inspect.py`.
+
+Path: cli.inspect.run → logbook.inspect.inspect_log → logbook.export.export
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""`fdi monitor`: what it does and prints. Its options: `options/monitor.py`."""
+"""`fdi monitor`: what it does and prints. Its options: `options/monitor.py`.
+
+Path: cli.monitor.run → config.monitor_file.load_monitor → jobs.monitor.run_monitor →
+jobs.logged_monitor.LoggedMonitor.learn → monitor.monitor_setup.prepare_monitor → monitor.noise_model.learn_noise →
+monitor.detection.make_detector → monitor.monitor.Monitor.advance → monitor.isolation.isolate
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""`fdi new`: what it does and prints. Its options: `options/new.py`."""
+"""`fdi new`: what it does and prints. Its options: `options/new.py`.
+
+Path: cli.new.run → config.file_templates.template (or config.plant_from_recording.plant_from_recording)
+"""
 
 from __future__ import annotations
 

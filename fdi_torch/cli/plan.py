@@ -1,4 +1,7 @@
-"""`fdi plan`: what it does and prints. Its options: `options/plan.py`."""
+"""`fdi plan`: what it does and prints. Its options: `options/plan.py`.
+
+Path: cli.plan.run → config.loaded_recordings.named_recordings → gap.identifiability.planned_identifiability
+"""
 
 from __future__ import annotations
 

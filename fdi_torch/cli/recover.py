@@ -1,4 +1,7 @@
-"""`fdi recover`: what it does and prints. Its options: `options/recover.py`."""
+"""`fdi recover`: what it does and prints. Its options: `options/recover.py`.
+
+Path: cli.recover.run → logbook.recover.recover
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""`fdi refit`: what it does and prints. Its options: `options/refit.py`."""
+"""`fdi refit`: what it does and prints. Its options: `options/refit.py`.
+
+Path: cli.refit.run → config.loaded_recordings.named_recordings → gap.free_runs.refit.refit →
+cli.adoption.write_adopted → gap.free_runs.prediction.leave_one_file_out
+"""
 
 from __future__ import annotations
 

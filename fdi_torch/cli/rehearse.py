@@ -1,4 +1,7 @@
-"""`fdi rehearse`: what it does and prints. Its options: `options/rehearse.py`."""
+"""`fdi rehearse`: what it does and prints. Its options: `options/rehearse.py`.
+
+Path: cli.rehearse.run → config.rehearsal_file.load_rehearsal → jobs.rehearsal.rehearse → jobs.rehearsal.result_tables
+"""
 
 from __future__ import annotations
 

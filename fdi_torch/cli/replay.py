@@ -1,4 +1,7 @@
-"""`fdi replay`: what it does and prints. Its options: `options/replay.py`."""
+"""`fdi replay`: what it does and prints. Its options: `options/replay.py`.
+
+Path: cli.replay.run → logbook.replay.replay → jobs.replay.repeat_run → logbook.replay.compare_events
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""`fdi report`: what it does and prints. Its options: `options/report.py`."""
+"""`fdi report`: what it does and prints. Its options: `options/report.py`.
+
+Path: cli.report.run → jobs.report.report → logbook.reader.read_run → report.material.gather → report.page.report_of →
+report.page.page
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""`fdi simulate`: what it does and prints. Its options: `options/simulate.py`."""
+"""`fdi simulate`: what it does and prints. Its options: `options/simulate.py`.
+
+Path: cli.simulate.run → config.run_file.load_run → jobs.run_setup.simulate_recording →
+simulate.simulated_recording.clean_readings → simulate.simulated_recording.with_noise →
+recordings.csv_writing.write_csv
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""`fdi study`: what it does and prints. Its options: `options/study.py`."""
+"""`fdi study`: what it does and prints. Its options: `options/study.py`.
+
+Path: cli.study.run → config.study_file.load_study → jobs.study.run_study → study.monte_carlo.run_blocks (or
+study.cluster.run_on_cluster) → study.trial_readings.make_trials → study.summary.summarise
+"""
 
 from __future__ import annotations
 

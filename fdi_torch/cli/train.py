@@ -1,4 +1,10 @@
-"""`fdi train`: what it does and prints. Its options: `options/train.py`."""
+"""`fdi train`: what it does and prints. Its options: `options/train.py`.
+
+Path: cli.train.run → config.run_file.load_run → jobs.train.train → jobs.run_setup.recordings_of →
+jobs.run_setup.fitting_of → estimate.hybrid.estimate_parameters → estimate.evolution.evolve →
+estimate.levenberg_marquardt.levenberg_marquardt → estimate.uncertainty.make_estimate → estimate.diagnosis.diagnose →
+jobs.train.draw
+"""
 
 from __future__ import annotations
 

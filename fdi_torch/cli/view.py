@@ -1,4 +1,7 @@
-"""`fdi view`: what it does and prints. Its options: `options/view.py`."""
+"""`fdi view`: what it does and prints. Its options: `options/view.py`.
+
+Path: cli.view.run → view.server.bound → view.server.application
+"""
 
 from __future__ import annotations
 

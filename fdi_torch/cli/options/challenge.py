@@ -12,6 +12,8 @@ import math
 
 RIGS = ("cascaded_tanks", "quadruple_tank", "three_tank")
 
+STEP, SUMMARY = "validate", "blind benchmark of the gap diagnosis on hidden rigs"
+LONG = True
 EXAMPLES = """
 kinds of cases:
   single    one effect of usual size              pair      two effects

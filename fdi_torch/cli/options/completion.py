@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 SHELLS = ("bash", "zsh", "fish")
+STEP, SUMMARY = "use", "print a script with which a shell completes commands and options"
 EXAMPLES = """
 examples:
   fdi completion bash > ~/.local/share/bash-completion/completions/fdi    in each new shell from then on

@@ -10,6 +10,7 @@ import argparse
 
 from fdi_torch.cli.options import seconds
 
+STEP, SUMMARY = "plan", "which faults an experiment can detect and distinguish, and from which size"
 EXAMPLES = """
 examples:
   fdi diagnosability --plant three_tank --input '50 cm^3/s,50 cm^3/s'             two constant flows for 1000 s

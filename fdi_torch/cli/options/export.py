@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 
+STEP, SUMMARY = "use", "export a plant as an FMU for other simulation tools"
 EXAMPLES = """
 examples:
   fdi export --plant rig.yaml --fmu rig.fmu                         the plant with the effects in its file

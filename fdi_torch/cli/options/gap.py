@@ -17,6 +17,8 @@ from fdi_torch.cli.options import add_holdout, add_leave_out, add_library, add_p
 
 MOST_CAUSES = 4
 
+STEP, SUMMARY = "diagnose", "find where and by which effect a plant file deviates from a recording"
+LONG = True
 EXAMPLES = """
 examples:
   fdi gap --plant three_tank --recording run.csv                       location and effect

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+STEP, SUMMARY = "look", "show what a log contains and whether it is intact, or export its messages"
 EXAMPLES = """
 examples:
   fdi inspect logs/own.mcap                        contents and integrity

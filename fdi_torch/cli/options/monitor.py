@@ -6,6 +6,8 @@ import argparse
 
 from fdi_torch.cli.options import add_config, add_live, seconds
 
+STEP, SUMMARY = "monitor", "detect, isolate and size faults along a recording or live"
+LONG = True
 EXAMPLES = """
 examples:
   fdi monitor --config monitor.yaml                along a recording

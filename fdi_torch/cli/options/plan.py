@@ -12,6 +12,7 @@ from fdi_torch.cli.options import add_library, add_plant_and_recording
 
 NOISE = 1e-3
 
+STEP, SUMMARY = "plan", "tell what planned inputs cannot show before an experiment"
 EXAMPLES = """
 examples:
   fdi plan --plant rig.yaml --recording planned.csv

@@ -10,6 +10,7 @@ import argparse
 
 from fdi_torch.cli.options import add_start_samples, seconds
 
+STEP, SUMMARY = "diagnose", "run a plant freely along a recording and report the error"
 EXAMPLES = """
 examples:
   fdi predict run.csv --plant better.yaml                    one free run

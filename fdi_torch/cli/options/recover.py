@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+STEP, SUMMARY = "look", "recover a broken or unfinished log"
 EXAMPLES = """
 examples:
   fdi recover logs/own.mcap.partial                writes logs/own.recovered.mcap

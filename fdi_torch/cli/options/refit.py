@@ -11,6 +11,8 @@ import argparse
 
 from fdi_torch.cli.options import add_holdout, add_leave_out, add_plant_and_recording, add_start_samples, add_step
 
+STEP, SUMMARY = "diagnose", "fit all effects and constants of a plant file together, without a search"
+LONG = True
 EXAMPLES = """
 examples:
   fdi refit --plant rig.yaml --recording run.csv --adopt calibrated.yaml --narrow      calibrate the constants

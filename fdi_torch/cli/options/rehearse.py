@@ -9,6 +9,7 @@ import argparse
 
 from fdi_torch.cli.options import add_config, add_live
 
+STEP, SUMMARY = "monitor", "validate a monitor on simulated runs: false alarms, delays, isolation"
 EXAMPLES = """
 examples:
   fdi rehearse --config rehearsal.yaml

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 
+STEP, SUMMARY = "look", "repeat a logged run and compare, or try another setting"
 EXAMPLES = """
 examples:
   fdi replay logs/own.mcap                         repeat and compare

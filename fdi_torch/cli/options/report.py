@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 
+STEP, SUMMARY = "look", "make one HTML page of one or more logs"
 EXAMPLES = """
 examples:
   fdi report logs/own.mcap                         writes logs/own.html

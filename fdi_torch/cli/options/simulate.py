@@ -6,6 +6,7 @@ import argparse
 
 from fdi_torch.cli.options import add_config, add_run
 
+STEP, SUMMARY = "describe", "generate a recording from a plant, inputs, faults and noise"
 EXAMPLES = """
 examples:
   fdi simulate --config rig.yaml --out .           writes rig.csv, or rig_2.csv if rig.csv exists

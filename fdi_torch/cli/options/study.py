@@ -9,6 +9,8 @@ import argparse
 
 from fdi_torch.cli.options import add_config, add_live, add_run
 
+STEP, SUMMARY = "validate", "repeat an experiment many times: errors against their bounds, coverage, failures"
+LONG = True
 EXAMPLES = """
 examples:
   fdi study --config study.yaml

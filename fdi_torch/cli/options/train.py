@@ -9,6 +9,8 @@ import argparse
 
 from fdi_torch.cli.options import add_config, add_live, add_run
 
+STEP, SUMMARY = "diagnose", "estimate the sizes of faults in a recording"
+LONG = True
 EXAMPLES = """
 examples:
   fdi train                                        the built-in example: simulated, then diagnosed

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 
+STEP, SUMMARY = "look", "show the logs of a folder as local pages: list, compare, follow running jobs"
 EXAMPLES = """
 examples:
   fdi view                                         the logs in ./logs
