@@ -13,21 +13,25 @@ from fdi_torch.cli.options import add_start_samples, seconds
 STEP, SUMMARY = "diagnose", "run a plant freely along a recording and report the error"
 EXAMPLES = """
 examples:
-  fdi predict run.csv --plant better.yaml                    one free run
-  fdi predict a.csv b.csv --plant rig.yaml --to 300          several recordings, the first 300 s of each
-  fdi predict runs.yaml --plant rig.yaml                     recordings listed under `recordings`, as in a run file
-  fdi predict run.csv --plant better.yaml --beside rig.yaml --picture run.png
-  fdi predict run.csv --plant rig.yaml --settle 30           estimate what varies by run from the first 30 s
-  fdi predict run.csv --plant rig.yaml --settle 60 --vary 'q?.gain'   and the pumps' gains of this run
-  fdi predict run.csv --plant rig.yaml --constant q1_cmd=0   an input that was not recorded, or '20 cm^3/s'
+  fdi predict --plant better.yaml --recording run.csv        one free run
+  fdi predict --plant better.yaml --recording run.csv --beside rig.yaml --picture run.png
+  fdi predict --plant rig.yaml a.csv b.csv --to 300          several recordings, the first 300 s of each
+  fdi predict --plant rig.yaml --recording runs.yaml         recordings listed under `recordings`, as in a run file
+  fdi predict --plant rig.yaml --recording run.csv --settle 30    estimate what varies by run from the first 30 s
+  fdi predict --plant rig.yaml --recording run.csv --settle 60 --vary 'q?.gain'    and the pumps' gains of this run
+  fdi predict --plant rig.yaml --recording run.csv --constant q1_cmd=0    an input that was not recorded
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recordings", metavar="recording", nargs="*", help="recordings, as --recording FILE")
     parser.add_argument(
-        "recordings", metavar="recording", nargs="*", help="CSV or MCAP file, or a YAML file with `recordings`"
+        "--recording",
+        metavar="FILE",
+        action="append",
+        default=[],
+        help="CSV or MCAP file, or a YAML file with `recordings`; may be repeated",
     )
-    parser.add_argument("--recording", metavar="FILE", action="append", default=[], help="the same, as an option")
     parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
     add_start_samples(parser)
     parser.add_argument(
