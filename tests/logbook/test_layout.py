@@ -123,3 +123,33 @@ def test_the_modelled_series_are_the_readings_less_the_residuals(tmp_path: Path)
         np.testing.assert_allclose(residual[name], np.where(mask[:, k], outputs[:, k] - model[:, k], np.nan))
         np.testing.assert_allclose(residual[f"{name}_high"], 1.96 * (0.1, 0.2)[k])
         np.testing.assert_allclose(residual[f"{name}_low"], -1.96 * (0.1, 0.2)[k])
+
+
+@pytest.mark.parametrize("log", [GOLDEN[0], DATA / "log_format_1_gap.mcap"], ids=lambda path: path.stem)
+def test_the_library_of_the_viewer_accepts_every_panel(log: Path) -> None:
+    """foxglove.layouts has a class for the settings of each panel, which refuses names that the panel does not have."""
+    library = pytest.importorskip("foxglove.layouts")
+    classes = {
+        "Plot": (library.PlotConfig, "paths", library.PlotSeries),
+        "Table": (library.TableConfig, "", None),
+        "RawMessages": (library.RawMessagesConfig, "", None),
+        "RosOut": (library.LogConfig, "", None),
+    }
+    found = foxglove_layout(read_run(log))["configById"]
+    panels = {name: config for name, config in found.items() if not name.startswith("Tab!")}
+    assert panels
+    for name, config in panels.items():
+        untitled = {key: value for key, value in config.items() if key != "title"}  # the title belongs to the panel
+        assert _read(untitled, *classes[name.partition("!")[0]]) == untitled, name
+
+
+def _read(config: dict[str, Any], kind: Any, inner: str, inner_kind: Any) -> dict[str, Any]:
+    """The settings as the library's class writes them again."""
+    settings = {_snake(key): value for key, value in config.items()}
+    if inner:
+        settings[inner] = [inner_kind(**{_snake(k): v for k, v in each.items()}) for each in config[inner]]
+    return dict(json.loads(kind(**settings).to_json()))
+
+
+def _snake(name: str) -> str:
+    return re.sub("([A-Z])", lambda match: f"_{match[1].lower()}", name)
