@@ -171,6 +171,7 @@ def test_a_gap_is_found_closed_and_adopted_in_python(tmp_path: Path) -> None:
     found = fdi_torch.gap(RIG, other, recording, out=tmp_path, library=("pump_gain", "leak"))
     assert found.answer.verdict == "named" and "pump gain at Q" in found.headline
     assert found.table().columns["parameter"] == ["factor"] and len(found.explanations()) >= 1
+    assert "<svg" in found._repr_html_() and "probability, %" in found._repr_html_()
     better = found.adopted()
     before, after = (fdi_torch.predict(plant, other).prediction.rmse["h"] for plant in (RIG, better))
     assert after < 0.5 * before

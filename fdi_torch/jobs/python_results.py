@@ -12,14 +12,17 @@ from fdi_torch.estimate.misfit import Misfit, misfit_of
 from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.free_runs.prediction import Prediction
 from fdi_torch.gap.free_runs.refit import Refit, narrowed
-from fdi_torch.gap.verdict_words import explanation_words, verdict_sentence
+from fdi_torch.gap.verdict_words import explanation_words, probability_words, verdict_sentence
 from fdi_torch.monitor.events import Event
 from fdi_torch.parameters import ParameterName, quantity_text
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure
+from fdi_torch.report.panels import bar_panel
 from fdi_torch.report.style import notebook_svg
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
+
+MOST_BARS = 10
 
 
 @dataclass(frozen=True, repr=False)
@@ -55,6 +58,14 @@ class GapResult(Shown):
         posterior = self.answer.to_dict()["posterior"]
         rows = [(explanation_words(e["causes"]), e["probability"]) for e in posterior]
         return Table.of_rows(("explanation", "probability"), rows)
+
+    def picture(self) -> str:
+        """The probabilities of the explanations, as SVG."""
+        explanations, probabilities = self.explanations().columns.values()
+        percents = [100.0 * p for p in probabilities][:MOST_BARS]
+        texts = [probability_words(p) for p in probabilities][:MOST_BARS]
+        figure = bar_panel("", "probability, %", list(explanations)[:MOST_BARS], percents, texts, [True] * len(texts))
+        return notebook_svg(figure, self.log.stem, self.headline)
 
     def adopted(self, constants: bool = False) -> PlantDescription:
         """The plant with the causes added as effects. constants: also use the constants fitted together with them."""
