@@ -22,7 +22,7 @@ from fdi_torch.blind.plants import RIGS, Rig
 from fdi_torch.blind.scaling import scales_of
 from fdi_torch.blind.score_tables import misses, sheets
 from fdi_torch.cli import DONE
-from fdi_torch.cli.screen import Screen
+from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.library import STANDARD as LIBRARY
@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace, screen: Screen, rivals: Mapping[str, Diag
     else:
         rows, scores = _benchmarked(arguments, out, screen, rivals)
     show(scores, rows, screen)
-    screen.say(f"tables: {out / 'scores.md'}; log: {out / LOG} (fdi report {out / LOG} makes the page)")
+    screen.say(f"tables: {out / 'scores.md'}; {log_words(out / LOG)}")
     screen.result({"format": "fdi_torch.challenge/2", "answers": len(rows), "tables": scores})
     return DONE
 

@@ -19,7 +19,7 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.adoption import write_adopted
 from fdi_torch.cli.gap_text import next_steps, show
 from fdi_torch.cli.options import names
-from fdi_torch.cli.screen import Screen
+from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.clock import show_clock
 from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant_file import chosen_plant
@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     show(answer, plant, next_steps(answer, bool(holdouts), library, planned, adopted_file), screen)
     for line in diff:
         screen.say(line)
-    screen.say(f"log: {log} (fdi report {log} makes the page)")
+    screen.say(log_words(log))
     screen.result(answer.to_dict())
     return DONE
 

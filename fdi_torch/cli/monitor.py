@@ -15,7 +15,7 @@ from typing import Any
 import orjson
 
 from fdi_torch.cli.options import access_text, host_and_port, live
-from fdi_torch.cli.screen import Screen
+from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.clock import clock_text
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         )
         done = run_monitor(monitor_run, callbacks, arguments.follow, arguments.idle, arguments.resume)
     slow = "" if done.spent < done.lasted else "; slower than real time"
-    screen.note(f"{done.lasted:g} s of recording processed in {done.spent:.1f} s{slow}; log: {done.log}")
+    screen.note(f"{done.lasted:g} s of recording processed in {done.spent:.1f} s{slow}; {log_words(done.log)}")
     if not done.events:
         screen.say("no alarm")
     return 0

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 
 from fdi_torch.cli.options import live
-from fdi_torch.cli.screen import Screen
+from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.config.rehearsal_file import load_rehearsal
 from fdi_torch.jobs.rehearsal import RehearsalResult, rehearse
 
@@ -21,7 +21,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     for table in done.tables:
         screen.table(table.title, table.header, table.rows, left=2)
         screen.say()
-    screen.say(f"{done.computed} of {done.tasks} tasks in {done.seconds:.0f} s; log: {done.log}")
+    screen.say(f"{done.computed} of {done.tasks} tasks in {done.seconds:.0f} s; {log_words(done.log)}")
     screen.result(as_json(done))
     return 0
 

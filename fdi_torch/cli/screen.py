@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
 import orjson
@@ -32,6 +33,11 @@ class Advance(Protocol):
     """Reports the progress of a stage (0 to 1) and one line about it."""
 
     def __call__(self, share: float, text: str = "") -> None: ...
+
+
+def log_words(log: Path) -> str:
+    """Where the log is, and how it becomes a page."""
+    return f"log: {log} (fdi report {log} makes the page)"
 
 
 def _shown(text: str) -> Text:

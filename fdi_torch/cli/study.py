@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 
 from fdi_torch.cli.options import live, overrides
-from fdi_torch.cli.screen import Screen
+from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.config.study_file import load_study
 from fdi_torch.jobs.study import StudyResult, run_study
 from fdi_torch.study.mode_isolation import Isolation
@@ -42,7 +42,7 @@ def show(result: StudyResult, screen: Screen) -> None:
         screen.say(isolation_in_words(result.isolation))
     per_trial = f", {1e3 * result.seconds / result.computed:.0f} ms each" if result.computed else ""
     screen.say(f"{result.computed} trials in {result.seconds:.0f} s{per_trial}")
-    screen.say(f"log: {result.log} (fdi report {result.log} makes the page)")
+    screen.say(log_words(result.log))
 
 
 HEADER = (

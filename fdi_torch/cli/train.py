@@ -17,7 +17,7 @@ from fdi_torch.amounts import parameter_words, rounded
 from fdi_torch.cli import DONE, NOT_CONVERGED
 from fdi_torch.cli.explained import exit_code, say_first
 from fdi_torch.cli.options import live, overrides
-from fdi_torch.cli.screen import Screen
+from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.cli.windows import show_windows
 from fdi_torch.clock import clock_unit, show_clock
 from fdi_torch.config.run_file import load_run
@@ -84,7 +84,7 @@ def show(done: TrainResult, screen: Screen) -> None:
     screen.say(f"integration step: {search:g} s in the search, {refinement:g} s in the refinement")
     screen.say(f"simulated by the {done.result.engine}")
     screen.say(f"confidence of the whole statement: {100 * diagnosis.confidence:g} %")
-    screen.say(f"log: {done.log} (fdi report {done.log} makes the page)")
+    screen.say(log_words(done.log))
     for picture in done.pictures:
         screen.say(f"picture: {picture}")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fdi_torch.amounts import parameter_words
-from fdi_torch.cli.screen import Screen
+from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.estimate.stretches import Stretch
 from fdi_torch.estimate.windows import WindowFault
 from fdi_torch.jobs.windowed_fit import WindowedFit
@@ -27,7 +27,7 @@ def show_windows(fit: WindowedFit, screen: Screen) -> None:
         rows.append([_name(s), f"{s.start:g}", f"{s.stop:g}", *_size(s, "> "), flow])
     screen.table("present", ("fault", "from, s", "to, s", "size", "std error", f"flow, {flow_unit}"), rows)
     screen.say(f"step of the simulation: {fit.step:g} s")
-    screen.say(f"log: {fit.log}")
+    screen.say(log_words(fit.log))
     screen.result(
         {
             "format": "fdi_torch.windows/1",
