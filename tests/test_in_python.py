@@ -194,6 +194,7 @@ def test_a_monitor_runs_along_a_recording_in_memory(tmp_path: Path) -> None:
     kinds = [kind for kind in table["kind"] if kind not in ("notice", "watching")]
     assert kinds[:2] == ["alarm", "isolated"]
     assert "isolated" in repr(found) and "stds" not in repr(found)
+    assert found._repr_html_().count("<svg") == 1 and "threshold" in found._repr_html_()
     isolated = table["kind"].index("isolated")
     assert table["onset"][isolated] == pytest.approx(400.0, abs=3.0) and table["units"][isolated] == ("1",)
 

@@ -12,17 +12,18 @@ from fdi_torch.estimate.misfit import Misfit, misfit_of
 from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.free_runs.prediction import Prediction
 from fdi_torch.gap.free_runs.refit import Refit, narrowed
-from fdi_torch.gap.verdict_words import explanation_words, probability_words, verdict_sentence
+from fdi_torch.gap.verdict_words import explanation_words, verdict_sentence
+from fdi_torch.logbook import read_run
 from fdi_torch.monitor.events import Event
 from fdi_torch.parameters import ParameterName, quantity_text
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure
-from fdi_torch.report.panels import bar_panel
+from fdi_torch.report.material import gather
+from fdi_torch.report.sections.gap import posterior_bars
+from fdi_torch.report.sections.monitor import statistic_section
 from fdi_torch.report.style import notebook_svg
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
-
-MOST_BARS = 10
 
 
 @dataclass(frozen=True, repr=False)
@@ -61,11 +62,8 @@ class GapResult(Shown):
 
     def picture(self) -> str:
         """The probabilities of the explanations, as SVG."""
-        explanations, probabilities = self.explanations().columns.values()
-        percents = [100.0 * p for p in probabilities][:MOST_BARS]
-        texts = [probability_words(p) for p in probabilities][:MOST_BARS]
-        figure = bar_panel("", "probability, %", list(explanations)[:MOST_BARS], percents, texts, [True] * len(texts))
-        return notebook_svg(figure, self.log.stem, self.headline)
+        bars = posterior_bars(self.answer.to_dict())
+        return notebook_svg(bars[0][0].figure, self.log.stem, self.headline) if bars else ""
 
     def adopted(self, constants: bool = False) -> PlantDescription:
         """The plant with the causes added as effects. constants: also use the constants fitted together with them."""
@@ -104,6 +102,12 @@ class MonitorResult(Shown):
             name: [tuple(s[k] for s in each) for each in sizes] for k, name in enumerate(("units", "sizes", "stds"))
         }
         return Table(columns | amounts)
+
+    @in_its_units
+    def picture(self) -> str:
+        """The test statistic with its threshold and the alarms, as SVG."""
+        section = statistic_section(gather(read_run(self.log)))
+        return notebook_svg(section.pictures[0].figure, self.log.stem, self.headline) if section else ""
 
     def brief(self) -> Table:
         return Table.of_rows(("time, s", "event", "text"), [(e.time, e.kind, e.text) for e in self.events])

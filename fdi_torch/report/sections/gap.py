@@ -63,7 +63,7 @@ def causes_section(material: Material) -> Section | None:
     certain = apart_from_rounding(answer.get("certain") or [])
     if certain and answer.get("verdict") != "named":
         blocks.append(f"With 95 % probability, whichever explanation is true: {explanation_words(certain)}.")
-    bars = _posterior(answer)
+    bars = posterior_bars(answer)
     plausible = [explanation_words(causes) for causes in answer.get("ambiguity_set") or _content(answer)]
     if len(plausible) > 1 and (not bars or max(map(len, plausible)) > BAR_NAME):
         blocks += ["Explanations with 95 % of the probability together:"]
@@ -103,7 +103,7 @@ def _content(answer: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
     return chosen
 
 
-def _posterior(answer: Mapping[str, Any]) -> list[Any]:
+def posterior_bars(answer: Mapping[str, Any]) -> list[list[Picture]]:
     """Bars of the explanations' probabilities, and of that of unexamined ones."""
     weighted = [item for item in answer.get("posterior", []) if as_float(item.get("probability")) >= LEAST_SHOWN]
     explanations = [causes_of(item) for item in weighted[:MOST_BARS]]
