@@ -27,6 +27,8 @@ from sample_runs import (
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.jobs.report import comparison_of
 from fdi_torch.report.page import RunReport, page, report_of
+from fdi_torch.view.log_list import LogList
+from fdi_torch.view.pages import list_page, query_of
 
 DATA = Path(__file__).parents[1] / "data"
 WRITERS = {
@@ -38,7 +40,7 @@ WRITERS = {
     "rehearsal": (write_rehearsal, "three_tank"),
 }
 LOGS = ("windows", "what_if", "monitor", "gap")
-KINDS = (*WRITERS, *(f"logged_{name}" for name in LOGS), "compare", "nasty")
+KINDS = (*WRITERS, *(f"logged_{name}" for name in LOGS), "compare", "nasty", "view")
 PAPER = 688  # pixels of an A4 page between its margins
 
 # What is wrong with a page, in words. Text on a canvas is not seen; whether it is drawn is.
@@ -121,6 +123,9 @@ def made(kind: str, folder: Path) -> str:
         long = {name: f"[{','.join(f'{name}_{k}.plugging.size' for k in range(30))}]" for name in ("first", "second")}
         both = [report(write_train(folder / f"{name}.mcap", setting=text)) for name, text in long.items()]
         return page(both, [comparison_of(both)])
+    if kind == "view":
+        logs = LogList(DATA)
+        return list_page("data", logs.entries(), ("train", "gap"), query_of({}), len(logs.entries()))
     if kind == "nasty":
         return page([report(write_train(folder / "nasty.mcap", name=f"{NASTY * 4}.leak.size"))])
     if kind.startswith("logged_"):
