@@ -16,6 +16,7 @@ from fdi_torch.monitor.event_text import EventWriter
 from fdi_torch.monitor.events import Event, Kind
 from fdi_torch.monitor.explanations import Explainer
 from fdi_torch.monitor.hypothesis import HypothesisFit, merged
+from fdi_torch.monitor.isolation import SMALLEST_PROBABILITY
 from fdi_torch.monitor.known_faults import (
     STRONG_EVIDENCE,
     effect_of_value,
@@ -37,8 +38,6 @@ from fdi_torch.monitor.monitor_state import (
     adopt_sizes,
     normalized_residuals,
 )
-
-SMALLEST_PROBABILITY = 1e-3  # explanations below it are not fitted again
 
 
 class AlarmHandler:
@@ -109,7 +108,7 @@ class AlarmHandler:
         if change is not None and self.explainer.is_current(state, change):
             # The previous change may have been explained wrongly: one change that explains both alarms is preferred.
             fits = self.explainer.of_change(state, change)
-            if (fits[0].fits and fits[0].hypothesis.columns) or change.best.at_bound:
+            if fits[0].fits and fits[0].hypothesis.columns:
                 return self._same_change(state, change, fits)
         return self._isolate(state)
 

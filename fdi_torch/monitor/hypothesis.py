@@ -90,13 +90,13 @@ class HypothesisFit:
 
     @property
     def fits(self) -> bool:
-        """Whether the innovations are no larger than noise and no estimate stopped at an end of its range."""
-        return 2.0 * self.misfit <= self.noise_limit and not self.at_bound
+        """Whether the innovations are no larger than noise."""
+        return 2.0 * self.misfit <= self.noise_limit
 
     @property
     def misfit_ratio(self) -> float:
         """Misfit relative to the expected misfit of pure noise; 1 if noise alone can explain the residuals."""
-        return max(2.0 * self.misfit / self.noise_level, 1.0) if 2.0 * self.misfit > self.noise_limit else 1.0
+        return 1.0 if self.fits else max(2.0 * self.misfit / self.noise_level, 1.0)
 
 
 NO_CHANGE = Hypothesis(())

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -28,11 +28,12 @@ from fdi_torch.monitor.oscillation import (
     with_phases_at,
     with_wrapped_phases,
 )
-from fdi_torch.parameters import ParameterName
+from fdi_torch.parameters import ParameterName, ParameterSpace
 
 SIZE_STEP = 1e-4  # finite-difference step, as a share of a parameter's range
 ITERATIONS = 12
 DEEPEST = 2  # largest number of simultaneous faults
+SMALLEST_PROBABILITY = 1e-3  # explanations below it are not fitted again
 
 
 def isolate(
@@ -82,7 +83,25 @@ def isolate(
         wider += [b.hypothesis for b in best]
         starts = torch.stack([_point(origin[h]) for h in wider])
         fits = _best_of_each([*fits, *fit(observer, window, believed, wider, starts, _misfit(base), prior)])
-    return with_posterior([*fits, no_change_fit(observer, window, believed, base)])
+    ranked = with_posterior([*fits, no_change_fit(observer, window, believed, base)])
+    return [_beyond_range(observer, window, believed, f, prior) if f.at_bound else f for f in ranked]
+
+
+def _beyond_range(
+    observer: ObserverBank, window: ObserverWindow, believed: Tensor, ended: HypothesisFit, prior: Prior
+) -> HypothesisFit:
+    """A fit that stopped at an end of a range, with the values and the onset that it has without that end.
+
+    Its probability remains that of the range. At the end of the range, an earlier onset would take the place of a
+    larger size.
+    """
+    if ended.probability < SMALLEST_PROBABILITY:
+        return ended
+    space = observer.search_space(ended.value)
+    [free] = fit(observer, window, believed, [ended.hypothesis], _point(ended)[None], 0.0, prior, space=space)
+    wider = free.misfit_ratio**0.5
+    onset = {"onset": free.onset, "onset_std": free.onset_std * wider}
+    return replace(ended, value=free.value, std=free.std * wider, misfit=free.misfit, **onset)
 
 
 @dataclass(frozen=True)
@@ -139,11 +158,13 @@ def fit(
     base: float,
     prior: Prior,
     known_onset: bool = False,
+    space: ParameterSpace | None = None,
 ) -> list[HypothesisFit]:
     """Sizes and onset of each hypothesis by Levenberg-Marquardt on the white innovations, all in parallel.
 
     believed (P,): parameters before the change; starts (H, P+1): initial values and onset (s); base: misfit without a
-    change. known_onset: the onsets of `starts` are exact.
+    change. known_onset: the onsets of `starts` are exact. space: its ranges bound the sizes; those of the observer's
+    `search_space` by default.
     """
     free = torch.zeros(len(hypotheses), len(believed) + 1, dtype=torch.bool)
     free[:, -1] = not known_onset
@@ -160,7 +181,7 @@ def fit(
     fixed[:, -1] = starts[:, -1]
     for i, hypothesis in enumerate(hypotheses):
         fixed[i, list(hypothesis.recovered)] = starts[i, list(hypothesis.recovered)]
-    space = observer.search_space(believed)
+    space = observer.search_space(believed) if space is None else space
     low = torch.where(free, torch.cat([space.low(believed), first[None]]), fixed)
     high = torch.where(free, torch.cat([space.high(believed), last[None]]), fixed)
     starts = with_phases_at(torch.where(free, starts.clamp(low, high), fixed), oscillations, free, middle)
