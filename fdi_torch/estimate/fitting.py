@@ -77,13 +77,13 @@ class Fitting:
         shortened = [r.stretch(0, samples) for r in self.recordings]
         return replace(self, recordings=tuple(shortened))
 
-    def engines(self, step: float, adaptive: bool = False) -> list[Engine]:
-        """A simulation engine for each recording, with its samples.
+    def engines(self, step: float) -> list[Engine]:
+        """A simulation engine for each recording, with its samples, in steps of at most `step` s.
 
-        It takes steps of at most `step` s, or adaptive ones of about the same accuracy. Raises ValueError if step <= 0.
+        Raises ValueError if step <= 0.
         """
         numbers = range(len(self.recordings))
-        return [self._engine(k, self._experiment(k, step, adaptive), step, adaptive) for k in numbers]
+        return [self._engine(k, self._experiment(k, step, False), step, False) for k in numbers]
 
     def _experiment(self, k: int, step: float, adaptive: bool) -> Experiment:
         """Recording k on the grid of its simulation."""

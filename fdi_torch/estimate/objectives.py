@@ -74,9 +74,9 @@ class Problem:
 
     def cost(self, theta: Float[Tensor, "L N P"], lanes: Int[Tensor, " L"]) -> Float[Tensor, "L N"]:
         """Cost (L, N) of the candidates theta (L, N, P) of the problems `lanes` (L,)."""
-        total = self._prior(theta)
+        total = self._prior(theta)[0]
         for term in self.terms:
-            data = of_lanes(term.data, lanes)
+            data = term.data.of(lanes)
             sums = term.engine.moments(term.theta(theta), data)
             if self.objective == "correlation":
                 total = total + correlation_loss(sums, data).sum(-1)
@@ -86,18 +86,15 @@ class Problem:
 
     def correlations(self, theta: Float[Tensor, "L N P"], lanes: Int[Tensor, " L"]) -> Float[Tensor, "L N C"]:
         """Correlation rho (18) of each channel of the first recording, (L, N, C)."""
-        data = of_lanes(self.terms[0].data, lanes)
+        data = self.terms[0].data.of(lanes)
         return 1.0 - correlation_loss(self.terms[0].engine.moments(self.terms[0].theta(theta), data), data)
 
     def linearise(self, theta: Float[Tensor, "L P"], lanes: Int[Tensor, " L"]) -> Linearisation:
         """Cost (L,), gradient (L, P) and Gauss-Newton curvature (L, P, P) at theta (L, P), priors included."""
-        precision = self._precision(theta)
-        deviation = torch.where(precision > 0, theta - self.space.nominal(theta), torch.zeros_like(theta))
-        cost = self._prior(theta)
-        gradient = precision * deviation
+        cost, gradient, precision = self._prior(theta)
         curvature = torch.diag_embed(precision.expand_as(theta))
         for term in self.terms:
-            data = of_lanes(term.data, lanes)
+            data = term.data.of(lanes)
             term_theta = term.theta(theta)
             gram = term.engine.gram(term_theta.unsqueeze(1), data).squeeze(1)
             if self.objective == "correlation":
@@ -119,26 +116,18 @@ class Problem:
         """
         levels = []
         for term in self.terms:
-            data = of_lanes(term.data, lanes)
+            data = term.data.of(lanes)
             squares = term.engine.moments(term.theta(theta.unsqueeze(1)), data)[:, 0, :, 1]
             lost_degrees = theta.shape[-1] / squares.shape[-1] / len(self.terms)
             levels.append(torch.sqrt(squares / (data.degrees - lost_degrees).clamp(min=1.0)))
         return levels
 
-    def _precision(self, theta: Tensor) -> Tensor:
-        return self.space.std(theta) ** -2
-
-    def _prior(self, theta: Tensor) -> Tensor:
-        precision = self._precision(theta)
+    def _prior(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost (*batch) of the priors at theta (*batch, P), its gradient (*batch, P), and the precisions (P,)."""
+        precision = self.space.std(theta) ** -2
         deviation = torch.where(precision > 0, theta - self.space.nominal(theta), torch.zeros_like(theta))
-        return 0.5 * (precision * deviation * deviation).sum(-1)
-
-
-def of_lanes(data: Readings, lanes: Tensor) -> Readings:
-    """The readings of the problems `lanes` (L,); readings that all problems share are returned unchanged."""
-    if data.values.dim() == 2:
-        return data
-    return Readings(data.values[lanes], data.weight[lanes], None if data.ar is None else data.ar[lanes])
+        gradient = precision * deviation
+        return 0.5 * (gradient * deviation).sum(-1), gradient, precision
 
 
 def spread_of(data: Readings) -> Tensor:

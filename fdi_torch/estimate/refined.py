@@ -55,11 +55,6 @@ class Refined:
         """Status of each member by name, flattened."""
         return [STATUSES[code] for code in self.status.flatten().tolist()]
 
-    def member(self, which: int) -> Refined:
-        """One member of a flat batch, as a batch of one."""
-        place = self.status.new_tensor([which])
-        return self._each(lambda value: value[place], None if self.state is None else self.state.lanes(place))
-
     def unflatten(self, shape: torch.Size) -> Refined:
         """Restore the batch shape from one flat leading dimension; `state` remains flat."""
         return self._each(lambda value: value.reshape((*shape, *value.shape[1:])), self.state)

@@ -124,9 +124,7 @@ def window_of(fitting: Fitting, std: Float[Tensor, " C"], suspects: Collection[s
     theta = refined.theta[best]
     residual = (data.values - engine.readings(theta.unsqueeze(0))[0]) * data.weight / std
     misfit = float(torch.sqrt((residual**2).sum() / data.weight.sum()))
-    assert refined.curvature is not None
-    held = None if refined.held is None else refined.held[best]
-    errors = certainty(refined.curvature[best], held=held).std * max(1.0, misfit)
+    errors = certainty(refined.curvature[best], held=refined.held[best]).std * max(1.0, misfit)
     levels = torch.stack([_mean_level(fitting, tank.name, data) for tank in fitting.plant.tanks])
     channels = recording.inputs[:, [recording.input_names.index(c) for c in fitting.plant.channels()]].mean(dim=0)
     faults = []

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.evolution import evolve
+from fdi_torch.estimate.evolution import distant_members, evolve
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
@@ -23,8 +23,6 @@ from fdi_torch.study.trial_readings import limits, make_trials
 STEP_SHARE = 1e-4
 # The sum of correlations has a standard error of 1e-8 at an SNR of 50 dB, a hundred times this tolerance and more.
 CORRELATION_TOLERANCE = 1e-13
-# Starts closer than this share of the box count as one.
-APART = 0.05
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,7 @@ class Fits:
         problem = Problem(self.fitting.space, [Term(engine, thinned)], OBJECTIVES[(first + again) % len(OBJECTIVES)])
         low, high = (bound.expand(len(seeds), -1) for bound in (self.low, self.high))
         result = evolve(problem.cost, low, high, method.search, seeds)
-        return distant(result.population, result.cost, self.high - self.low, method.starts)
+        return distant_members(result.population, result.cost, self.high - self.low, method.starts)
 
     def refined(self, starts: Tensor, lanes: Tensor | None = None) -> Refined:
         """Levenberg-Marquardt within the box from every start (B, K, P); the best result continues at finer steps."""
@@ -137,7 +135,6 @@ class Fits:
 
     def standard_errors(self, fit: Refined) -> Tensor:
         """Standard errors (B, P) from the curvature of the likelihood; 0 where a bound is active."""
-        assert fit.curvature is not None
         return certainty(fit.curvature, held=fit.held).std
 
     def correlations(self, theta: Tensor) -> Tensor:
@@ -177,22 +174,6 @@ class Fits:
 def thinned_fitting(fitting: Fitting, every: int) -> Fitting:
     """The problem with every n-th sample of its recordings."""
     return replace(fitting, recordings=tuple(r.every(every) for r in fitting.recordings))
-
-
-def distant(population: Tensor, cost: Tensor, width: Tensor, count: int) -> Tensor:
-    """The best members (B, K, P) of populations (B, N, P), sorted by cost, that differ from each other.
-
-    If too few differ, the best is repeated.
-    """
-    usable = torch.isfinite(cost) & torch.isfinite(population).all(-1)
-    chosen = [population[:, 0]]
-    for _ in range(count - 1):
-        near = torch.stack([((population - c[:, None]) / width).abs().amax(-1) <= APART for c in chosen]).any(0)
-        differs = usable & ~near
-        index = differs.to(torch.int8).argmax(-1)
-        next_best = population[torch.arange(len(population)), index]
-        chosen.append(torch.where(differs.any(-1)[:, None], next_best, chosen[0]))
-    return torch.stack(chosen, dim=1)
 
 
 def is_converged(status: str) -> bool:
