@@ -28,7 +28,7 @@ _INTEGERS = (
 _ARRAYS = (
     "theta", "nominal", "lifted", "resolution", "starts", "spans", "means", "first_sample", "sample_times",
     "sample_intervals", "sample_shares", "signal_times", "signal_integral", "signal_slopes", "values", "weights",
-    "centres", "memory", "gains", "start", "start_memory", "out", "jacobian",
+    "centres", "gains", "start", "start_memory", "out", "jacobian",
 )  # fmt: skip
 _STEP_CONTROL = ("tolerance", "slope_tolerance", "shortest")
 _MODES = {"levels": 0, "readings": 1, "moments": 2, "linearise": 3, "gram": 4, "observe": 5}
@@ -217,13 +217,7 @@ class CompiledEngine:
         def table(t: Tensor) -> Tensor:
             return t.detach().to(like.dtype).contiguous()
 
-        memory = None if data.ar is None else table(data.ar)
-        return {
-            "values": table(data.known),
-            "weights": table(data.weight),
-            "centres": table(data.centre),
-            "memory": memory,
-        }
+        return {"values": table(data.known), "weights": table(data.weight), "centres": table(data.centre)}
 
 
 @lru_cache(maxsize=128)

@@ -34,7 +34,7 @@ struct Job {
     const int64_t *first_sample;                             // (K + 1): step k holds samples first[k] .. first[k + 1]
     const real *sample_times, *sample_intervals, *sample_shares;
     const real *signal_times, *signal_integral, *signal_slopes;  // (T), (T, CHANNELS), (T + 1, CHANNELS)
-    const real *values, *weights, *centres, *memory;         // (problems, S, SENSORS) twice, (problems, SENSORS) twice
+    const real *values, *weights, *centres;                  // (problems, S, SENSORS) twice, (problems, SENSORS)
     const real *gains, *start, *start_memory;                // (lanes or 1, S, ORDER, SENSORS), (lanes, start_width), (lanes, MEMORY)
     real *out, *jacobian;
     const Python *python;
@@ -99,7 +99,7 @@ struct Block {
     Lane d_command_memory[COLUMNS][SOME(COMMAND_MEMORY)], d_late_channel[COLUMNS][SOME(LATE_ACTUATORS)];
     Lane d_command_delay[COLUMNS][SOME(LATE_ACTUATORS)], d_reading_delay[COLUMNS][SOME(LATE_SENSORS)];
     Lane d_seen[COLUMNS][SENSORS], d_reading[COLUMNS][SENSORS], d_reading_memory[COLUMNS][SOME(READING_MEMORY)];
-    Lane gram[SENSORS][PAIRS], previous[SENSORS][WIDTH], column[WIDTH], previous_weight[SENSORS];
+    Lane gram[SENSORS][PAIRS], column[WIDTH];
 #endif
     real uniform[SOME(UNIFORM_CONSTANTS)], span[SOME(SPANS)];    // span: the steps' lengths that `steady` is of
     int64_t end[SOME(LATE_ACTUATORS)][LANES], past[SOME(LATE_SENSORS)][LANES];
@@ -235,22 +235,6 @@ static void add_moments(const Job &job, Block &b, int64_t s) {
 }
 
 #if TANGENT
-// x_k - phi x_{k-1}, or sqrt(1 - phi^2) x_k where nothing was read before it.
-static void whiten(const Job &job, Block &b, int c) {
-    for (int l = 0; l < LANES; ++l) {
-        const real phi = job.memory[b.problem[l] * SENSORS + c];
-        const bool follows = b.previous_weight[c][l] > 0;
-        b.value[l] = follows ? phi : 0;
-        b.centre[l] = follows ? 1 : std::sqrt(1 - phi * phi);
-    }
-    for (int m = 0; m < WIDTH; ++m) EACH_LANE {
-        const real x = b.column[m][l], earlier = b.value[l] != 0 ? b.value[l] * b.previous[c][m][l] : 0;
-        b.column[m][l] = b.centre[l] * x - earlier;
-        b.previous[c][m][l] = x;
-    }
-    EACH_LANE b.previous_weight[c][l] = b.weight[l];
-}
-
 static void add_gram(const Job &job, Block &b, int64_t s) {
     for (int c = 0; c < SENSORS; ++c) {
         fetch_data(job, b, s, c);
@@ -260,7 +244,6 @@ static void add_gram(const Job &job, Block &b, int64_t s) {
             b.column[COLUMNS + 1][l] = b.value[l] - b.centre[l];
             b.column[COLUMNS + 2][l] = 1;
         }
-        if (job.memory) whiten(job, b, c);
         Lane *sum = b.gram[c];
         for (int m = 0; m < WIDTH; ++m) {
             Lane weighted;
@@ -382,7 +365,6 @@ static void load(const Job &job, Block &b, const Rows &rows) {
     std::memset(b.d_command_memory, 0, sizeof b.d_command_memory);
     std::memset(b.d_reading_memory, 0, sizeof b.d_reading_memory);
     std::memset(b.gram, 0, sizeof b.gram);
-    std::memset(b.previous_weight, 0, sizeof b.previous_weight);
 #endif
 }
 

@@ -275,7 +275,7 @@ class _Run:
                 state.changes["seen", i] = self._late_change(j, right, share, by_delay)
 
     def _late_change(self, j: int, right: Tensor, share: Tensor, by_delay: Tensor) -> Tensor:
-        """Slopes of a delayed level; moved: its slope by the delay."""
+        """Slopes of a delayed level. by_delay: its slope by the delay."""
         past = torch.stack([self.full(row[j][1]) for row in self.history])
         index = right.expand(1, *past.shape[1:])
         first, last = past.gather(0, index - 1)[0], past.gather(0, index)[0]
