@@ -90,7 +90,7 @@ class Fitting:
         if not step > 0.0:
             raise ValueError(f"expected a positive integration step, got {step:g} s")
         recording = self.recordings[k]
-        uses_own_steps = not adaptive and self._takes_own_steps(recording, self.networks[k], step)
+        uses_own_steps = not adaptive and self._takes_own_steps(k, step)
         input_step = commensurate_step(INPUT_STEP * time_scale(self.plant), recording.interval)
         longest = input_step if adaptive or uses_own_steps else step
         step_control = _step_control(step, recording, self.plant) if uses_own_steps else None
@@ -107,17 +107,14 @@ class Fitting:
 
         The cost is then exact only up to the tolerance of the step control.
         """
-        return any(
-            self._takes_own_steps(recording, network, step)
-            for recording, network in zip(self.recordings, self.networks, strict=True)
-        )
+        return any(self._takes_own_steps(k, step) for k in range(len(self.recordings)))
 
-    def _takes_own_steps(self, recording: Recording, network: TankNetwork, step: float) -> bool:
+    def _takes_own_steps(self, k: int, step: float) -> bool:
         """True if step control per lane is cheaper than fixed steps, and the inputs are constant between samples."""
+        recording = self.recordings[k]
         steps = float(recording.time[-1] - recording.time[0]) / step
-        inputs_constant = recording.hold == "zero_order" and all(
-            p.effect.stage is not Stage.COMMAND for p in network.placements
-        )
+        acts_on_commands = any(p.effect.stage is Stage.COMMAND for p in self.networks[k].placements)
+        inputs_constant = recording.hold == "zero_order" and not acts_on_commands
         return inputs_constant and not self.is_slow and steps > OWN_STEP_COST * len(recording)
 
     def problem(

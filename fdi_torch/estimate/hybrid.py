@@ -15,7 +15,7 @@ from torch import Tensor
 from fdi_torch.estimate.diagnosis import Diagnosis, correlation_inflation, diagnose
 from fdi_torch.estimate.evolution import EvolutionResult, Search, evolve
 from fdi_torch.estimate.fitting import Fitting
-from fdi_torch.estimate.hybrid_settings import HybridSettings, sparing
+from fdi_torch.estimate.hybrid_settings import HybridSettings, with_less_effort
 from fdi_torch.estimate.levenberg_marquardt import Progress
 from fdi_torch.estimate.misfit import unexplained_ratio
 from fdi_torch.estimate.objectives import Problem
@@ -76,7 +76,7 @@ def estimate_parameters(
     search continues from it and ends as the uninterrupted one would.
     """
     settings = settings or HybridSettings()
-    settings = sparing(settings) if fitting.is_slow else settings
+    settings = with_less_effort(settings) if fitting.is_slow else settings
     low, high = search_box(fitting)
     coarse, fine = pick_steps(fitting, settings, low, high)
     result = search(fitting.problem(coarse, settings.objectives[0]), low, high, settings, seed, on_generation, resume)

@@ -130,19 +130,21 @@ class Problem:
         return 0.5 * (gradient * deviation).sum(-1), gradient, precision
 
 
-def spread_of(data: Readings) -> Tensor:
-    """Weighted sum of squared deviations of each channel from its mean, (C,) or (L, C)."""
+def spread_of(data: Readings) -> Float[Tensor, "*L C"]:
+    """Weighted sum of squared deviations of each channel from its mean."""
     return (data.weight * (data.known - data.centre.unsqueeze(-2)) ** 2).sum(-2)
 
 
-def known_noise(term: Term, lanes: Tensor) -> Tensor | None:
-    """Noise levels of the problems `lanes` (L,), as (C,) or (L, C); None if unknown."""
+def known_noise(term: Term, lanes: Int[Tensor, " L"]) -> Float[Tensor, "*L C"] | None:
+    """Noise levels of the problems `lanes`, common to all or one set each; None if unknown."""
     std = term.noise_std
     return std if std is None or std.dim() == 1 else std[lanes]
 
 
-def deviance(squares: Tensor, data: Readings, noise_std: Tensor | None) -> Tensor:
-    """Negative log-likelihood of each channel, (L, N, C), from its sum of squared residuals; constants are dropped.
+def deviance(
+    squares: Float[Tensor, "L N C"], data: Readings, noise_std: Float[Tensor, "*L C"] | None
+) -> Float[Tensor, "L N C"]:
+    """Negative log-likelihood of each channel from its sum of squared residuals; constants are dropped.
 
     Known noise: SSR / (2 sigma^2). Unknown noise, profiled out: n/2 log(SSR / n), n being the number of values.
     """
@@ -152,8 +154,10 @@ def deviance(squares: Tensor, data: Readings, noise_std: Tensor | None) -> Tenso
     return 0.5 * count * torch.log(squares / count.clamp(min=1.0) + _per_lane(_rounding_variance(data), squares))
 
 
-def likelihood_expansion(gram: Tensor, data: Readings, noise_std: Tensor | None) -> Linearisation:
-    """Gauss-Newton model of the negative log-likelihood, from the sums of products `Engine.gram` (L, C, P+3, P+3)."""
+def likelihood_expansion(
+    gram: Float[Tensor, "L C W W"], data: Readings, noise_std: Float[Tensor, "*L C"] | None
+) -> Linearisation:
+    """Gauss-Newton model of the negative log-likelihood, from the sums of products `Engine.gram`; W = P + 3."""
     squares = gram[..., -3, -3]
     cost = deviance(squares.unsqueeze(1), data, noise_std).squeeze(1).sum(-1)
     profiled = squares / data.degrees.clamp(min=1.0) + _rounding_variance(data)
@@ -162,8 +166,8 @@ def likelihood_expansion(gram: Tensor, data: Readings, noise_std: Tensor | None)
     return Linearisation(cost, -scaled[..., :-3, -3].sum(1), scaled[..., :-3, :-3].sum(1))
 
 
-def correlation_loss(sums: Tensor, data: Readings) -> Tensor:
-    """1 - rho of each channel (2020 paper, eq. 18) from sums of r, r^2, r y': (L, N, C, 3) -> (L, N, C).
+def correlation_loss(sums: Float[Tensor, "L N C 3"], data: Readings) -> Float[Tensor, "L N C"]:
+    """1 - rho of each channel (2020 paper, eq. 18) from the sums of r, r^2 and r y' (`Engine.moments`).
 
     Computed from 1 - rho^2 = (Syy Srr' - Sry^2) / (Syy Sff), which avoids cancellation as rho approaches 1. A constant
     prediction counts as uncorrelated, with a loss of 1.
@@ -180,10 +184,10 @@ def correlation_loss(sums: Tensor, data: Readings) -> Tensor:
     return torch.where(varies | ~torch.isfinite(ff), loss, torch.ones_like(loss))
 
 
-def correlation_expansion(gram: Tensor, data: Readings) -> Linearisation:
+def correlation_expansion(gram: Float[Tensor, "L C W W"], data: Readings) -> Linearisation:
     """Gauss-Newton model of the sum of 1 - rho = |z - f|^2 / 2; z, f: centred readings and predictions of unit norm.
 
-    gram (L, C, P+3, P+3): sums of products, see `Engine.gram`.
+    gram: sums of products, see `Engine.gram`; W = P + 3.
     """
     count = data.weight.sum(-2).expand(gram.shape[:-2])
     centred = gram - gram[..., :, -1:] * gram[..., -1:, :] / count[..., None, None]

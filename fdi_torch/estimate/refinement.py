@@ -34,8 +34,10 @@ LOOSE_DECREASE, TIGHT_DECREASE = 1e-2, 1e-4
 MOST_MOVES, NEAREST_WITHIN = 10, 0.01
 
 
-def starting_points(search_result: EvolutionResult, low: Tensor, high: Tensor, count: int) -> Tensor:
-    """Starting points (K, P) of the refinement, K <= count: the best distant members of the search, best first."""
+def starting_points(
+    search_result: EvolutionResult, low: Float[Tensor, " P"], high: Float[Tensor, " P"], count: int
+) -> Float[Tensor, "K P"]:
+    """Starting points of the refinement, K <= count: the best distant members of the search, best first."""
     members = distant_members(search_result.population, search_result.cost, high - low, count)[0]
     is_repeated = (members[1:] == members[0]).all(-1)
     return torch.cat([members[:1], members[1:][~is_repeated]])
@@ -44,9 +46,9 @@ def starting_points(search_result: EvolutionResult, low: Tensor, high: Tensor, c
 def refine_to_convergence(
     fitting: Fitting,
     settings: HybridSettings,
-    starts: Tensor,
-    low: Tensor,
-    high: Tensor,
+    starts: Float[Tensor, "K P"],
+    low: Float[Tensor, " P"],
+    high: Float[Tensor, " P"],
     step: float,
     on_iteration: Callable[[Progress], None] | None,
 ) -> tuple[Refined, float]:
@@ -58,7 +60,7 @@ def refine_to_convergence(
 
     def run(theta: Tensor, at: float) -> Refined:
         linearise = fitting.problem(at, settings.objectives[1]).linearise
-        stop = near_enough(settings, TIGHT_DECREASE) if fitting.takes_own_steps(at) else settings.refine
+        stop = stopping_at(settings, TIGHT_DECREASE) if fitting.takes_own_steps(at) else settings.refine
         return levenberg_marquardt(linearise, theta[None], low, high, stop, on_iteration).best()
 
     refinement = run(starts, step)
@@ -78,9 +80,9 @@ def refine_to_convergence(
 def refine_adaptively(
     fitting: Fitting,
     settings: HybridSettings,
-    starts: Tensor,
-    low: Tensor,
-    high: Tensor,
+    starts: Float[Tensor, "K P"],
+    low: Float[Tensor, " P"],
+    high: Float[Tensor, " P"],
     coarse: float,
     on_iteration: Callable[[Progress], None] | None,
 ) -> Refined:
@@ -90,7 +92,7 @@ def refine_adaptively(
     """
 
     def run(problem: Problem, theta: Tensor, decrease: float) -> Refined:
-        stop = near_enough(settings, decrease)
+        stop = stopping_at(settings, decrease)
         return levenberg_marquardt(problem.linearise, theta[None], low, high, stop, on_iteration).best()
 
     refinement = run(fitting.problem(coarse, settings.objectives[1]), starts, LOOSE_DECREASE)
@@ -133,7 +135,7 @@ def unrefined(
     return levenberg_marquardt(problem.linearise, starts[:1], low, high, replace(settings.refine, iterations=0))
 
 
-def near_enough(settings: HybridSettings, decrease: float) -> RefineSettings:
+def stopping_at(settings: HybridSettings, decrease: float) -> RefineSettings:
     """Settings that stop the refinement as soon as the Newton decrement is below `decrease`.
 
     For a negative log-likelihood the decrement is d^2 / 2 with d the distance to the optimum in standard errors.

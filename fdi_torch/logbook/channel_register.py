@@ -32,12 +32,13 @@ class Register:
         topic: str,
         fields: Mapping[str, Any],
         message: Mapping[str, Any],
-        told_units: Mapping[str, str] | None = None,
+        named_units: Mapping[str, str] | None = None,
         about: Mapping[str, str] | None = None,
     ) -> Channel:
         """The topic's channel; a new one if the message has fields that the current one does not describe.
 
-        fields: as given. message: the same as plain values. about: further metadata, used with the first message.
+        fields: as given. message: the same as plain values. named_units: of fields beyond the topic's own. about:
+        further metadata, used with the first message.
         Raises ValueError for field names that the topic does not allow.
         """
         described, channel = self._described.get(topic, (frozenset(), None))
@@ -57,7 +58,7 @@ class Register:
             "unit.t": "s",
             **units,
             **previous,
-            **units_of(told_units),
+            **units_of(named_units),
             **(about or {}),
         }
         schema = json_schema(definition, named)

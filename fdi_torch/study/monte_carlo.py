@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fdi_torch.estimate.evolution import distant_members, evolve
@@ -87,8 +88,10 @@ class Fits:
         self.low, self.high = plan.fitting.space.low(), plan.fitting.space.high()
         self.engines: list[Engine] = [plan.fitting.engines(step)[0] for step in plan.method.steps]
 
-    def searched(self, seeds: Tensor, lanes: Tensor | None = None, again: int = 0) -> Tensor:
-        """Best distant members (B, K, P) of differential evolution for each trial.
+    def searched(
+        self, seeds: Int[Tensor, " B"], lanes: Int[Tensor, " B"] | None = None, again: int = 0
+    ) -> Float[Tensor, "B K P"]:
+        """Best distant members of differential evolution for each trial.
 
         Repeated searches alternate between the objectives, because their best basins may differ: the correlation is
         insensitive to gain and offset.
@@ -103,8 +106,8 @@ class Fits:
         result = evolve(problem.cost, low, high, method.search, seeds)
         return distant_members(result.population, result.cost, self.high - self.low, method.starts)
 
-    def refined(self, starts: Tensor, lanes: Tensor | None = None) -> Refined:
-        """Levenberg-Marquardt within the box from every start (B, K, P); the best result continues at finer steps."""
+    def refined(self, starts: Float[Tensor, "B K P"], lanes: Int[Tensor, " B"] | None = None) -> Refined:
+        """Levenberg-Marquardt within the box from every start; the best result continues at finer steps."""
         best = starts
         for engine in self.engines:
             refined = self._refine(engine, best, self.low, self.high, lanes=lanes)
@@ -124,8 +127,8 @@ class Fits:
             fit = fit.file(lanes[better], **values)
         return fit
 
-    def unbounded(self, theta: Tensor, objective: Objective = "likelihood") -> Refined:
-        """Levenberg-Marquardt at the finest step without bounds, from theta (B, P)."""
+    def unbounded(self, theta: Float[Tensor, "B P"], objective: Objective = "likelihood") -> Refined:
+        """Levenberg-Marquardt at the finest step without bounds, from theta."""
         everywhere = torch.full_like(self.low, torch.inf)
         settings = self.method.refine
         if objective == "correlation":
@@ -133,12 +136,12 @@ class Fits:
         refined = self._refine(self.engines[-1], theta[:, None], -everywhere, everywhere, objective, settings)
         return refined.best()
 
-    def standard_errors(self, fit: Refined) -> Tensor:
-        """Standard errors (B, P) from the curvature of the likelihood; 0 where a bound is active."""
+    def standard_errors(self, fit: Refined) -> Float[Tensor, "B P"]:
+        """Standard errors from the curvature of the likelihood; 0 where a bound is active."""
         return certainty(fit.curvature, held=fit.held).std
 
-    def correlations(self, theta: Tensor) -> Tensor:
-        """Correlation of each channel at theta (B, P), (B, C)."""
+    def correlations(self, theta: Float[Tensor, "B P"]) -> Float[Tensor, "B C"]:
+        """Correlation of each channel at theta."""
         problem = Problem(self.fitting.space, [Term(self.engines[-1], self.data)])
         return problem.correlations(theta[:, None], torch.arange(len(theta)))[:, 0]
 
@@ -162,8 +165,8 @@ class Fits:
             settings or self.method.refine,
         )
 
-    def _unexplained(self, theta: Tensor) -> Tensor:
-        """(B,) bool: whether residuals exceed the sample-to-sample noise in any channel."""
+    def _unexplained(self, theta: Float[Tensor, "B P"]) -> Bool[Tensor, " B"]:
+        """Whether residuals exceed the sample-to-sample noise in any channel."""
         squares = self.engines[-1].moments(theta[:, None], self.data)[:, 0, :, 1]
         count = self.data.count
         noise = torch.stack([sample_noise(v, w) for v, w in zip(self.data.values, self.data.weight, strict=True)])
