@@ -86,14 +86,10 @@ def size_errors(truth: Mapping[str, Any], causes: Iterable[Mapping[str, Any]], p
     scores = []
     for cause in causes:
         for d in truth.get("deviations", ()):
-            here = (d["effect"], d["location"])
-            if (
-                here not in true
-                or here != (cause["effect"], cause["location"])
-                or (d["effect"], d["law"]) not in COMPARABLE
-            ):
+            here, law = (d["effect"], d["location"]), (d["effect"], d["law"])
+            if here not in true or here != (cause["effect"], cause["location"]) or law not in COMPARABLE:
                 continue
-            name, unit, value = COMPARABLE[d["effect"], d["law"]]
+            name, unit, value = COMPARABLE[law]
             amount = (cause.get("parameters") or {}).get(name) or {}
             expected = value(d["numbers"], plant, d["location"], scales)
             if amount.get("std") and math.isfinite(expected):

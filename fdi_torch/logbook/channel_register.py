@@ -24,9 +24,6 @@ class Register:
         self._described: dict[str, tuple[frozenset[str], Channel]] = {}
         self._count: dict[str, int] = {}
 
-    def __contains__(self, topic: str) -> bool:
-        return topic in self._described
-
     def channel(
         self,
         topic: str,
@@ -58,7 +55,7 @@ class Register:
             "unit.t": "s",
             **units,
             **previous,
-            **units_of(named_units),
+            **{f"unit.{name}": unit for name, unit in (named_units or {}).items()},
             **(about or {}),
         }
         schema = json_schema(definition, named)
@@ -88,11 +85,6 @@ class Register:
             properties = orjson.loads(channel.schema_data)["properties"]
             self._described[channel.topic] = (frozenset(properties), channel)
         self._count[channel.topic] = sequence + 1
-
-
-def units_of(units: Mapping[str, str] | None) -> dict[str, str]:
-    """Units as channel metadata: {"h1": "m"} -> {"unit.h1": "m"}."""
-    return {f"unit.{name}": unit for name, unit in (units or {}).items()}
 
 
 def _check_names(topic: str, definition: Topic, named: Mapping[str, Kind]) -> None:

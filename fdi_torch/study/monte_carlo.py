@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from fdi_torch.estimate.evolution import distant_members, evolve
-from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.misfit import UNEXPLAINED_RATIO, sample_noise
@@ -99,7 +98,8 @@ class Fits:
         every, method = self.method.search_every, self.method
         data = self.data if lanes is None else self.data.of(lanes)
         thinned = Readings(data.values[:, ::every], data.weight[:, ::every])
-        engine = thinned_fitting(self.fitting, every).engines(method.search_step)[0]
+        recordings = tuple(r.every(every) for r in self.fitting.recordings)
+        engine = replace(self.fitting, recordings=recordings).engines(method.search_step)[0]
         first = OBJECTIVES.index(method.objective)
         problem = Problem(self.fitting.space, [Term(engine, thinned)], OBJECTIVES[(first + again) % len(OBJECTIVES)])
         low, high = (bound.expand(len(seeds), -1) for bound in (self.low, self.high))
@@ -172,11 +172,6 @@ class Fits:
         noise = torch.stack([sample_noise(v, w) for v, w in zip(self.data.values, self.data.weight, strict=True)])
         allowed = UNEXPLAINED_RATIO * noise + STEP_SHARE * (spread_of(self.data) / count).sqrt()
         return ((squares / count).sqrt() > allowed).any(-1)
-
-
-def thinned_fitting(fitting: Fitting, every: int) -> Fitting:
-    """The problem with every n-th sample of its recordings."""
-    return replace(fitting, recordings=tuple(r.every(every) for r in fitting.recordings))
 
 
 def is_converged(status: str) -> bool:

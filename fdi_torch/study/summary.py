@@ -103,11 +103,6 @@ def column(trials: Sequence[Trial], name: str) -> Float[Tensor, "trials ..."]:
     return torch.tensor([trial.numbers[name] for trial in trials], dtype=torch.float64)
 
 
-def bound_name(estimator: str) -> str:
-    """Name of the bound that applies to an estimator: the correlation is insensitive to a reading's scale."""
-    return "correlation_bound" if estimator == "correlation" else "bound"
-
-
 def _scores(
     name: str, errors: Mapping[str, Tensor], trials: Sequence[Trial], space: ParameterSpace, noisy: bool
 ) -> list[Score]:
@@ -133,8 +128,10 @@ def _scores(
 
 
 def _failures(name: str, error: Tensor, trials: Sequence[Trial], setting: Setting, allowed: Tensor) -> int:
-    if setting.snr_db is not None:
-        allowed = STUCK * column(trials, bound_name(name))
+    if (
+        setting.snr_db is not None
+    ):  # the correlation is insensitive to gain and offset of a reading, and has its own bound
+        allowed = STUCK * column(trials, "correlation_bound" if name == "correlation" else "bound")
     return int((~(error.abs() <= allowed)).any(-1).sum())
 
 
