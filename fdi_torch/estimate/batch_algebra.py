@@ -13,13 +13,14 @@ from torch import Tensor
 
 def row_sum(values: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch"]:
     """Pairwise sum over the last dimension, in an order that depends only on N."""
-    if values.shape[-1] == 0:
+    count, sums = values.shape[-1], values.clone()
+    if count == 0:
         return values.new_zeros(values.shape[:-1])
-    while values.shape[-1] > 1:
-        half = (values.shape[-1] + 1) // 2
-        second_half = torch.nn.functional.pad(values[..., half:], (0, 2 * half - values.shape[-1]))
-        values = values[..., :half] + second_half
-    return values[..., 0]
+    while count > 1:
+        half = (count + 1) // 2
+        sums[..., : count - half] += sums[..., half:count]
+        count = half
+    return sums[..., 0]
 
 
 def dot(a: Float[Tensor, "*batch P"], b: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch"]:

@@ -72,10 +72,11 @@ class Fitting:
         """Whether the engine evaluates every integration step in Python, so that steps are expensive."""
         return self.engine == "reference"
 
-    def beginning(self, samples: int) -> Fitting:
-        """A copy that uses only the first `samples` samples of each recording."""
-        shortened = [r.stretch(0, samples) for r in self.recordings]
-        return replace(self, recordings=tuple(shortened))
+    def beginning(self, k: int, samples: int) -> Fitting:
+        """The problem of the first `samples` samples of recording k alone; `space` remains that of all recordings."""
+        recordings = (self.recordings[k].stretch(0, samples),)
+        own = (self.networks[k],), (self.own_spaces[k],), (self.columns[k],)
+        return replace(self, recordings=recordings, networks=own[0], own_spaces=own[1], columns=own[2])
 
     def engines(self, step: float) -> list[Engine]:
         """A simulation engine for each recording, with its samples, in steps of at most `step` s.

@@ -120,13 +120,12 @@ def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Te
     longest, scale = max(min(spans) / 20.0, 1e-6), time_scale(fitting.plant)
     shortest = min(range(len(spans)), key=spans.__getitem__)
     interval = fitting.recordings[shortest].interval
-    beginning = fitting.beginning(PROBE_SAMPLES)
+    beginning = fitting.beginning(shortest, PROBE_SAMPLES)
 
     def engine_at(step: float) -> Engine:
-        return beginning.engines(step)[shortest]
+        return beginning.engines(step)[0]
 
-    columns = fitting.columns[shortest]
-    recording_points = points[:, columns]
+    recording_points = points[:, fitting.columns[shortest]]
     coarse = settings.search_step
     readings = engine_at(min(longest, FIRST_STEP * scale)).readings(recording_points)
     std = readings.flatten(0, 1).std(dim=0).clamp(min=1e-12)

@@ -74,8 +74,8 @@ def update_memory(
     any_success = success.any(-1)
     at = cell[..., None]
     terminal = (memory_cr.gather(-1, at)[..., 0] == TERMINAL) | (torch.where(success, rate, 0.0).amax(-1) == 0.0)
-    new_cr = torch.where(terminal, TERMINAL, lehmer_mean(rate, weights))
-    new_f = lehmer_mean(factor, weights)
+    new_f, mean_cr = lehmer_mean(torch.stack([factor, rate]), weights.expand(2, *weights.shape))
+    new_cr = torch.where(terminal, TERMINAL, mean_cr)
     memory_f = torch.where(any_success[..., None], memory_f.scatter(-1, at, new_f[..., None]), memory_f)
     memory_cr = torch.where(any_success[..., None], memory_cr.scatter(-1, at, new_cr[..., None]), memory_cr)
     return memory_f, memory_cr, torch.where(any_success, (cell + 1) % memory_f.shape[-1], cell)

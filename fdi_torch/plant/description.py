@@ -150,7 +150,7 @@ class PlantDescription:
     def _of_kind(self, kind: type[Kind], name: str) -> Kind:
         component = self.component(name)
         if not isinstance(component, kind):
-            raise ValueError(f"plant {self.name}: {name}: expected a {kind.__name__}, got a {component.place_kind}")
+            raise ValueError(f"plant {self.name}: expected the name of a {kind.__name__}, got {name}")
         return component
 
     def tank_pairs(self) -> tuple[tuple[str, str], ...]:
