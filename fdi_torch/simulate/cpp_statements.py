@@ -171,7 +171,7 @@ def _literal(value: float | None) -> str:
     return f"real({value!r})" if math.isfinite(value) else f"real({'-' if value < 0 else ''}INFINITY)"
 
 
-def _input_text(kind: str, index: int, varies: Varies) -> str:
+def _input_text(kind: str, index: int, varies: int) -> str:
     if kind == "resolution":
         return "b.resolution"
     if kind in ("clock", "channel"):
