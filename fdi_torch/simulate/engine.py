@@ -63,30 +63,28 @@ class Engine(Protocol):
     why: str  # the reason for the choice of this engine, one sentence
 
     def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
-        """theta (*batch, P) -> readings (*batch, S, C) in SI; differentiable if theta requires a gradient."""
+        """Readings in SI; differentiable if theta requires a gradient."""
         ...
 
     def levels(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S tanks"]:
-        """theta (*batch, P) -> tank levels at the samples (*batch, S, tanks), m."""
+        """Tank levels at the samples, m."""
         ...
 
     def linearise(
         self, theta: Float[Tensor, "*batch P"]
     ) -> tuple[Float[Tensor, "*batch S C"], Float[Tensor, "*batch S C P"]]:
-        """theta (*batch, P) -> readings (*batch, S, C) and their Jacobian (*batch, S, C, P), forward mode."""
+        """Readings and their Jacobian, by forward mode."""
         ...
 
-    def moments(self, theta: Tensor, data: Readings) -> Tensor:
-        """theta (problems, N, P) -> weighted sums of r, r^2 and r y' over the samples, (problems, N, C, 3).
+    def moments(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C 3"]:
+        """Weighted sums of r, r^2 and r y' over the samples.
 
         r = y - prediction, y' = y - mean(y). Likelihood and correlation follow from them and the sums of y.
         """
         ...
 
-    def gram(self, theta: Tensor, data: Readings) -> Tensor:
-        """theta (problems, N, P) -> weighted sums of the products of [d prediction/d theta, r, y', 1], (problems, N, C,
-        P+3, P+3).
-        """
+    def gram(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C W W"]:
+        """Weighted sums of the products of [d prediction/d theta, r, y', 1]; W = P + 3."""
         ...
 
 
@@ -100,7 +98,7 @@ def expect_problems(theta: Float[Tensor, "*problems N P"], data: Readings) -> No
         )
 
 
-def moments_of(readings: Float[Tensor, "*problems N S C"], data: Readings) -> Tensor:
+def moments_of(readings: Float[Tensor, "*problems N S C"], data: Readings) -> Float[Tensor, "*problems N C 3"]:
     """`Engine.moments` from readings (*problems, N, S, sensors)."""
     y, w = data.known.unsqueeze(-3), data.weight.unsqueeze(-3)
     residual = y - readings
@@ -110,7 +108,7 @@ def moments_of(readings: Float[Tensor, "*problems N S C"], data: Readings) -> Te
 
 def gram_of(
     readings: Float[Tensor, "*problems N S C"], jacobian: Float[Tensor, "*problems N S C P"], data: Readings
-) -> Tensor:
+) -> Float[Tensor, "*problems N C W W"]:
     """`Engine.gram` from readings (*problems, N, S, sensors) and their Jacobian (..., P)."""
     y, w = data.known.unsqueeze(-3), data.weight.unsqueeze(-3).expand(readings.shape)
     residual = y - readings
