@@ -12,20 +12,20 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.diagnosis import Diagnosis, diagnose, lasting
+from fdi_torch.estimate.diagnosis import Diagnosis, correlation_inflation, diagnose
 from fdi_torch.estimate.evolution import EvolutionResult, Search, evolve
 from fdi_torch.estimate.fitting import Fitting
-from fdi_torch.estimate.hybrid_settings import HybridSettings, sparing
+from fdi_torch.estimate.hybrid_settings import HybridSettings, with_less_effort
 from fdi_torch.estimate.levenberg_marquardt import Progress
 from fdi_torch.estimate.misfit import unexplained_ratio
 from fdi_torch.estimate.objectives import Problem
 from fdi_torch.estimate.refined import Refined
 from fdi_torch.estimate.refinement import (
     ADAPTIVE_STEPS,
-    distant_members,
     nearest_to_nominal,
     refine_adaptively,
     refine_to_convergence,
+    starting_points,
     status_of,
     unrefined,
 )
@@ -76,11 +76,11 @@ def estimate_parameters(
     search continues from it and ends as the uninterrupted one would.
     """
     settings = settings or HybridSettings()
-    settings = sparing(settings) if fitting.is_slow else settings
+    settings = with_less_effort(settings) if fitting.is_slow else settings
     low, high = search_box(fitting)
     coarse, fine = pick_steps(fitting, settings, low, high)
     result = search(fitting.problem(coarse, settings.objectives[0]), low, high, settings, seed, on_generation, resume)
-    starts = distant_members(result, low, high, settings.starts)
+    starts = starting_points(result, low, high, settings.starts)
     if settings.method == "none":
         refinement = unrefined(fitting, settings, starts, low, high, fine)
     elif settings.adaptive:
@@ -120,13 +120,12 @@ def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Te
     longest, scale = max(min(spans) / 20.0, 1e-6), time_scale(fitting.plant)
     shortest = min(range(len(spans)), key=spans.__getitem__)
     interval = fitting.recordings[shortest].interval
-    beginning = fitting.beginning(PROBE_SAMPLES)
+    beginning = fitting.beginning(shortest, PROBE_SAMPLES)
 
     def engine_at(step: float) -> Engine:
-        return beginning.engines(step)[shortest]
+        return beginning.engines(step)[0]
 
-    columns = fitting.columns[shortest]
-    recording_points = points[:, columns]
+    recording_points = points[:, fitting.columns[shortest]]
     coarse = settings.search_step
     readings = engine_at(min(longest, FIRST_STEP * scale)).readings(recording_points)
     std = readings.flatten(0, 1).std(dim=0).clamp(min=1e-12)
@@ -164,7 +163,8 @@ def conclude(
     """Compute estimate, diagnosis and goodness of fit at the refined optimum.
 
     Standard errors use each channel's noise level times sqrt((1 + a) / (1 - a)), with a the lag-1 correlation of the
-    residuals of each step (see `lasting`), because correlated residuals carry less information than independent ones.
+    residuals of each step, because correlated residuals carry less information than independent ones (see
+    `correlation_inflation`).
     """
     theta = refinement.theta
     lanes = torch.zeros(1, dtype=torch.int64)
@@ -177,7 +177,8 @@ def conclude(
         noise_ratios.append(unexplained_ratio(noise_level[0], term.data.known, term.data.weight))
     for term, noise_level in zip(problem.terms, problem.noise(theta, lanes), strict=True):
         residuals = term.data.known - term.engine.readings(term.theta(theta))[0]
-        inflated_noise.append(noise_level[0] * torch.sqrt(lasting(residuals, (term.data.weight > 0).to(residuals))))
+        inflation = correlation_inflation(residuals, (term.data.weight > 0).to(residuals))
+        inflated_noise.append(noise_level[0] * torch.sqrt(inflation))
     likelihood = problem.at_noise(inflated_noise)
     curvature = likelihood.linearise(theta, lanes).curvature[0]
     estimate = make_estimate(
