@@ -17,8 +17,8 @@ from fdi_torch.parameters import display_unit, displayed_in, displayed_units
 
 MOST_ROWS = 60
 """Number of displayed rows; a data frame has all of them."""
-ERROR = "std error"
-WITH_ERROR = ("value", "estimate", ERROR, "95 % low", "95 % high")
+ERRORS = ("std error", "std")
+WITH_ERROR = ("value", "estimate", "median", *ERRORS, "95 % low", "95 % high")
 """Columns whose displayed digits follow from the standard error in the same row."""
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -39,7 +39,7 @@ class Table:
 
     def rows(self, most: int = MOST_ROWS) -> list[list[str]]:
         """The first rows as text."""
-        errors = self.columns.get(ERROR)
+        errors = next((self.columns[name] for name in ERRORS if name in self.columns), None)
         columns = [
             [
                 _cell(value, errors[k] if errors and name in WITH_ERROR else None)

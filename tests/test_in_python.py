@@ -273,6 +273,17 @@ def test_an_effect_without_a_field_means_its_size() -> None:
         fdi_torch.set_up(RIG, [simulated()], ["A.heigt"])
 
 
+def test_an_initial_level_that_is_free_needs_no_mention() -> None:
+    with pytest.raises(ValueError, match=r"A.start_level: expected no initial level among the parameters, as it is"):
+        fdi_torch.set_up(RIG, [simulated()], ["A.start_level"])
+    assert fdi_torch.set_up(RIG, [simulated()], ["A.start_level"], "equilibrium").space.names == ("A.start_level",)
+
+
+def test_the_catalogue_takes_the_name_of_a_plant() -> None:
+    assert fdi_torch.effects("three_tank").headline == fdi_torch.effects(fdi_torch.load_plant("three_tank")).headline
+    assert len(fdi_torch.effects()) > len(fdi_torch.effects("three_tank"))
+
+
 def test_a_recording_at_hand_is_asked_for_the_plant_s_channels() -> None:
     blank = simulated()
     with pytest.raises(fdi_torch.ConfigError, match=r"expected an output .*got 'h'"):

@@ -37,7 +37,7 @@ from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, Obse
 from fdi_torch.monitor.observer_gain import hand_gain
 from fdi_torch.monitor.samples import ClockState, Samples, samples_of_recording, split_at_gaps, usual_interval
 from fdi_torch.monitor.whitening import Whitening
-from fdi_torch.parameters import ParameterSpace
+from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.equilibrium import equilibrium
@@ -201,7 +201,7 @@ def test_a_size_beyond_its_range_is_told_as_at_least_its_end_and_causes_no_other
     end = SPACE[name].high
     ended = [e for e in events if e.best is not None and e.best.sizes[0].at_end]
     assert ended and {e.faults for e in events if e.faults} == {(name,)}
-    assert all(f"{name} at least {end:g}, the end of its range" in e.text for e in ended)
+    assert all(f"{ParameterName.parse(name).field} at least {end:g}, the end of its range" in e.text for e in ended)
     assert {(e.sizes, e.stds) for e in ended} == {((end,), (float("inf"),))}
     assert [e.sizes for e in events if e.kind == "summary" and e.sizes] == [(end,)]
     assert {e.state for e in ended} == {State.CANNOT_TELL} and sum(e.kind == "alarm" for e in events) == 1

@@ -137,7 +137,10 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
     header = "time_s,FIC-101 PV (l/min),LT-101 (%),PT 7 [kPa],operator,level_mA,valve (%)"
     Path("trend.csv").write_text("\n".join([header, *rows]) + "\n")
     fdi("new", "plant", "--recording", "trend.csv", "--out", "rig.yaml")
-    assert "rig.yaml; next: fdi check --plant rig.yaml --recording trend.csv" in capsys.readouterr().out
+    assert (
+        "rig.yaml; next: correct what follows a !, then fdi check --plant rig.yaml --recording trend.csv"
+        in capsys.readouterr().out
+    )
     assert "# Left out, as their header has no unit: operator\n" in Path("rig.yaml").read_text()
     plant = load_plant(Path("rig.yaml"))
     assert [sensor.column for sensor in plant.sensors] == ["LT-101", "PT 7", "level"]
@@ -148,6 +151,10 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
     ]
     assert plant.pumps[0].max_flow == pytest.approx(4e-3 / 60)
     fdi("check", "--plant", "rig.yaml", "--recording", "trend.csv")
+    fdi("new", "monitor", "--plant", "rig.yaml", "--recording", "trend.csv")
+    fdi("new", "run", "--plant", "rig.yaml", "--recording", "trend.csv")
+    assert load_monitor("monitor.yaml").config.recording.file == "trend.csv"
+    assert load_run("run.yaml").config.recordings[0].file == "trend.csv"
     assert "next: fdi gap --plant rig.yaml --recording trend.csv" in capsys.readouterr().out
     Path("none.csv").write_text("t_s,a,b\n0,1,2\n1,1,2\n")
     assert cli.main(["new", "plant", "--recording", "none.csv", "--out", "none.yaml"]) != cli.DONE

@@ -155,9 +155,12 @@ class _Parser(argparse.ArgumentParser):
 
     def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
         known, others = super().parse_known_args(args, namespace)
-        for option in ("--config", "--recording"):
-            if others and Path(others[0]).suffix and option in self._option_string_actions:
-                self.error(f"unrecognized argument: {others[0]}; name a file by its option: {option} {others[0]}")
+        file = others[0] if others else ""
+        option = "--config" if Path(file).suffix in (".yaml", ".yml") else "--recording"
+        if Path(file).suffix and option in self._option_string_actions:
+            self.error(f"unrecognized argument: {file}; name a file by its option: {option} {file}")
+        if Path(file).suffix and "--config" in self._option_string_actions:
+            self.error(f"unrecognized argument: {file}; a file with --config names it (fdi new --help writes one)")
         return known, others
 
 

@@ -10,7 +10,14 @@ from fdi_torch.amounts import rounded
 from fdi_torch.cli.screen import Screen
 from fdi_torch.clock import clock_unit
 from fdi_torch.gap.answer import UNKNOWN, Answer
-from fdi_torch.gap.verdict_words import causes_of, explanation_words, probability_words, rounds, verdict_sentence
+from fdi_torch.gap.verdict_words import (
+    cause_words,
+    causes_of,
+    explanation_words,
+    probability_words,
+    rounds,
+    verdict_sentence,
+)
 from fdi_torch.parameters import ParameterName, display_unit
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.report.random_flows import flows_that_matter
@@ -86,11 +93,11 @@ def _limits(answer: Answer) -> list[str]:
     sentences = []
     hidden, inseparable = answer.excitation.get("hidden", []), answer.excitation.get("inseparable", [])
     if hidden:
-        shown = ", ".join(f"{c['effect']} at {c['location']}" for c in hidden[:3])
+        shown = ", ".join(cause_words(c) for c in hidden[:3])
         more = f" and {len(hidden) - 3} more" if len(hidden) > 3 else ""
         sentences.append(f"these inputs cannot show at their typical size: {shown}{more}")
     if inseparable:
-        first = " and ".join(f"{c['effect']} at {c['location']}" for c in inseparable[0]["between"])
+        first = " and ".join(cause_words(c) for c in inseparable[0]["between"])
         many = f"{len(inseparable)} pairs of effects, such as {first}" if len(inseparable) > 1 else first
         sentences.append(f"these inputs cannot distinguish {many}")
     return sentences

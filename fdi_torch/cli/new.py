@@ -14,7 +14,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import named_errors
 
 NEXT = {
-    "plant": "fdi check --plant {}{recording}",
+    "plant": "{correct}fdi check --plant {}{recording}",
     "run": "fdi train --config {}",
     "monitor": "fdi monitor --config {}",
     "study": "fdi study --config {}",
@@ -25,15 +25,16 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     path = Path(arguments.out or f"{arguments.kind}.yaml")
     if path.suffix not in (".yaml", ".yml"):
         raise ValueError(f"--out: expected a file that ends in .yaml, got {path}; rename it")
-    if arguments.recording and arguments.kind != "plant":
-        raise ValueError(f"--recording: expected it for a plant only, not for a {arguments.kind}; leave it out")
+    if arguments.recording and arguments.kind == "study":
+        raise ValueError("--recording: expected it for a plant, run or monitor; a study simulates its own")
     text = _text(arguments, path.stem)
     if path.exists():
         raise ValueError(f"{path}: expected a new file, but it exists; choose another name with --out")
     with named_errors(path), path.open("x", encoding="utf-8") as file:
         file.write(text)
     recording = f" --recording {arguments.recording}" if arguments.recording else ""
-    screen.say(f"{path}; next: {NEXT[arguments.kind].format(path, recording=recording)}")
+    correct = "correct what follows a !, then " if recording else ""
+    screen.say(f"{path}; next: {NEXT[arguments.kind].format(path, recording=recording, correct=correct)}")
     screen.result({"format": "fdi_torch.new/1", "file": str(path), "kind": arguments.kind})
     return DONE
 
@@ -44,7 +45,7 @@ def _text(arguments: argparse.Namespace, name: str) -> str:
         from fdi_torch.config.file_templates import template
         from fdi_torch.config.plant_file import chosen_plant
 
-        return template(arguments.kind, chosen_plant(arguments.plant), arguments.plant, name)
+        return template(arguments.kind, chosen_plant(arguments.plant), arguments.plant, name, arguments.recording)
     if arguments.recording:
         from fdi_torch.config.plant_from_recording import plant_from_recording
         from fdi_torch.config.yaml_files import find_data

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from fdi_torch.amounts import effect_words
 from fdi_torch.cli import DONE
 from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
@@ -36,8 +37,9 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 def _show(limits: Identifiability, screen: Screen) -> None:
     for name, place in limits.hidden:
-        screen.say(f"does not show at its typical size: {name} at {place}")
+        screen.say(f"does not show at its typical size: {effect_words(name, place)}")
     for (a, at), (b, there), distance in limits.inseparable:
-        screen.say(f"cannot be distinguished: {a} at {at} and {b} at {there} (chi-square distance {distance:.1f})")
+        both = f"{effect_words(a, at)} and {effect_words(b, there)}"
+        screen.say(f"cannot be distinguished: {both} (chi-square distance {distance:.1f})")
     if not limits.hidden and not limits.inseparable:
         screen.say("every effect of the library shows at its typical size and is distinguishable from every other")

@@ -84,7 +84,7 @@ def show(done: TrainResult, screen: Screen) -> None:
     screen.say(f"integration step: {search:g} s in the search, {refinement:g} s in the refinement")
     screen.say(f"simulated by the {done.result.engine}")
     screen.say(f"confidence of the whole statement: {100 * diagnosis.confidence:g} %")
-    screen.say(f"log: {done.log}")
+    screen.say(f"log: {done.log} (fdi report {done.log} makes the page)")
     for picture in done.pictures:
         screen.say(f"picture: {picture}")
 

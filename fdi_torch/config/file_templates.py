@@ -10,12 +10,14 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recordings.csv_writing import header_of
 
 
-def template(kind: str, plant: PlantDescription, plant_file: str, name: str) -> str:
+def template(kind: str, plant: PlantDescription, plant_file: str, name: str, recording: str | None = None) -> str:
     """The text of a new run, monitor or study.
 
-    plant: the plant of the file; plant_file: its entry under the key `plant`; name: of the run and of the recording
-    that it reads.
+    plant: the plant of the file; plant_file: its entry under the key `plant`; name: of the run. recording: the file
+    that it reads; None for one of the name of the run, whose header is then told.
     """
+    header = header_of(plant.channel_units(), {s.column: s.unit for s in plant.sensors})
+    file = f"{name}.csv             # with the header {header}" if recording is None else f'"{recording}"'
     pipe = plant.pipes[0].name if plant.pipes else plant.tanks[0].name
     plugging = f"{pipe}.plugging" if plant.pipes else f"{pipe}.evaporation"
     constant = f"{pipe}.discharge_coefficient" if plant.pipes else f"{pipe}.area"
@@ -24,7 +26,7 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str) -> 
     ).substitute(
         plant=plant_file,
         name=name,
-        header=header_of(plant.channel_units(), {s.column: s.unit for s in plant.sensors}),
+        file=file,
         output=plant.sensors[0].column,
         leak=f"{plant.tanks[0].name}.leak",
         plugging=plugging,

@@ -172,6 +172,8 @@ def set_up(
     starts = start if isinstance(start, Sequence) and not isinstance(start, str) else [start] * len(recordings)
     for k, (recording, recording_start) in enumerate(zip(recordings, starts, strict=True)):
         levels, free = start_levels(plant, reference, recording, recording_start)
+        if twice := [p.name for p in free if p.name in names]:
+            raise ValueError(f"{twice[0]}: expected no initial level among the parameters, as it is estimated anyway")
         tanks = tuple(replace(t, start_level=float(h)) for t, h in zip(plant.tanks, levels, strict=True))
         networks.append(build_network(replace(plant, tanks=tanks), placements))
         own_spaces.append(ParameterSpace([*common, *free]))

@@ -17,6 +17,8 @@ from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.study_file import Study, build_study, load_study
 from fdi_torch.effects import units_for_display
+from fdi_torch.effects.catalogue import Catalogue
+from fdi_torch.effects.catalogue import effects as catalogue_of
 from fdi_torch.estimate.misfit import misfit_of
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.free_runs.prediction import START_SAMPLES
@@ -195,6 +197,14 @@ def study(
     elif not isinstance(study, Study):
         study = build_study(_keys(study), Path.cwd(), "study")
     return study_job.run_study(study, resume, cluster, tell)
+
+
+def effects(plant: AnyPlant | None = None) -> Catalogue:
+    """The catalogue of faults and unmodelled effects, as `fdi effects` shows it.
+
+    plant: determines places and parameter ranges; None for a generic rig with tanks of 1 m.
+    """
+    return catalogue_of(None if plant is None else plant_of(plant))
 
 
 def plant_of(plant: AnyPlant) -> PlantDescription:

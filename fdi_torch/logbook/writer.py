@@ -243,6 +243,8 @@ def _ending(error: BaseException) -> tuple[str, str]:
         return "interrupted", "SIGTERM"
     if isinstance(error, BrokenPipeError):
         return "interrupted", "standard output was closed by its reader"
+    if isinstance(error, ValueError | OSError):  # sentences for people
+        return "failed", str(error)
     return "failed", f"{type(error).__name__}: {error}"
 
 

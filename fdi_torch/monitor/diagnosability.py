@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fdi_torch.amounts import parameter_words
 from fdi_torch.effects import placements_for
 from fdi_torch.estimate.combinations import undetermined_groups
 from fdi_torch.estimate.fitting import StartLevels, set_up
@@ -170,7 +171,9 @@ def _groups(plant: PlantDescription, faults: Sequence[str], apart: Tensor) -> li
         remaining = [j for j in others if j not in identical]
         if identical:
             members = [faults[first], *(faults[j] for j in identical)]
-            texts.append(f"{' and '.join(members)} cannot be told apart: {_reason(plant, members)}")
+            texts.append(
+                f"{' and '.join(map(parameter_words, members))} cannot be told apart: {_reason(plant, members)}"
+            )
     return texts
 
 

@@ -11,7 +11,7 @@ from fdi_torch.amounts import amount_words, estimate_words, parameter_words, siz
 from fdi_torch.clock import clock_text
 from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.monitor.alarm_state import State
-from fdi_torch.parameters import Parameter, ParameterName, display_unit
+from fdi_torch.parameters import Parameter, ParameterName, display_unit, significant
 
 Kind = Literal[
     "watching",
@@ -91,8 +91,9 @@ class Limit:
 
     @property
     def text(self) -> str:
-        high = f"{self.high:.3g} s" if math.isfinite(self.high) else "never"
-        return f"{self.tank} {self.what} in {self.time:.3g} s (90 %: {self.low:.3g} s to {high}) if nothing changes"
+        median, low = significant(self.time, 3), significant(self.low, 3)
+        high = f"{significant(self.high, 3)} s" if math.isfinite(self.high) else "never"
+        return f"{self.tank} {self.what} in {median} s (90 %: {low} s to {high}) if nothing changes"
 
 
 @dataclass(frozen=True)

@@ -44,10 +44,11 @@ def axis(name: str, unit: str) -> str:
 
 
 def number(value: float, digits: int = 4) -> str:
-    """A number with the given significant digits; a dash for NaN."""
+    """A number with the given significant digits, '2·10⁻⁵' where it needs an exponent; a dash for NaN."""
     if not math.isfinite(value):
         return "–" if math.isnan(value) else ("∞" if value > 0 else "−∞")
-    return _minus(significant(value, digits))
+    factor, _, exponent = significant(value, digits).partition("e")
+    return _minus(factor) + (f"·10{str(int(exponent)).translate(RAISED)}" if exponent else "")
 
 
 def with_error(value: float, std: float) -> str:

@@ -9,8 +9,8 @@ EXAMPLES = """
 examples:
   fdi new plant --out rig.yaml                     then fdi check --plant rig.yaml
   fdi new plant --recording trend.xlsx --out rig.yaml      pumps and sensors from the columns of a recording
-  fdi new run --plant rig.yaml                     writes run.yaml; then fdi train --config run.yaml
-  fdi new monitor --plant rig.yaml --out watch.yaml
+  fdi new run --plant rig.yaml --recording trend.xlsx      writes run.yaml; then fdi train --config run.yaml
+  fdi new monitor --plant rig.yaml --recording trend.xlsx --out watch.yaml
   fdi new study --plant three_tank
 """
 
@@ -18,5 +18,7 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("kind", choices=("plant", "run", "monitor", "study"), help="kind of file")
     parser.add_argument("--plant", metavar="NAME|FILE", default="three_tank", help="its plant (three_tank)")
-    parser.add_argument("--recording", metavar="FILE", help="of a plant: a recording whose columns it takes over")
+    parser.add_argument(
+        "--recording", metavar="FILE", help="a recording: its columns make the plant; a run or monitor reads it"
+    )
     parser.add_argument("--out", metavar="FILE", help="the new file (KIND.yaml); existing files are never replaced")

@@ -8,7 +8,14 @@ const element = (name, kind, text = "") => {
   made.textContent = text;
   return made;
 };
-const text = (value, digits = 5) => String(Number(value.toPrecision(digits))).replace("-", "\u2212");
+const raised = power => [...power].map(sign => "⁰¹²³⁴⁵⁶⁷⁸⁹"["0123456789".indexOf(sign)] || "⁻").join("");
+// "0.5", and "2·10⁻⁵" below a thousandth.
+const text = (value, digits = 5) => {
+  const number = Number(value.toPrecision(digits)), [factor, power] = number.toExponential().split("e");
+  const plain = !number || Math.abs(number) >= 1e-3;
+  const shown = plain ? String(number) : (Math.abs(factor) === 1 ? factor.replace("1", "") : `${factor}·`) + `10${raised(power)}`;
+  return shown.replace("-", "\u2212");
+};
 const decoded = (code, Kind) => new Kind(Uint8Array.from(atob(code), letter => letter.charCodeAt(0)).buffer);
 const unit = label => (label.includes(", ") ? " " + label.slice(label.lastIndexOf(", ") + 2) : "");
 
