@@ -80,7 +80,13 @@ class AlarmHandler:
         """Handle a crossing of the detector's threshold.
 
         It is a new alarm unless the latest change still explains the residual, or a known fault only changed its size.
+        It ends one that chance explains.
         """
+        if state.pending is not None:
+            number = state.pending.number
+            state, retired = self.retire(state, number, "the residual left its range again", announced=False)
+            state, events = self.on_threshold(state)
+            return state, [retired, *events]
         change = state.change
         if change is not None and self.explainer.is_current(state, change):
             fits = self.explainer.of_change(state, change)
@@ -187,7 +193,9 @@ class AlarmHandler:
         number, attempts = state.pending.number, state.pending.attempts + 1
         waiting, events = replace(state, pending=PendingAlarm(number, attempts)), []
         if attempts == 1:
-            waiting = waiting.with_alarm(waiting.alarm(number).with_state(State.CANNOT_TELL))
+            waiting = replace(waiting, detector_memory=None).with_alarm(
+                waiting.alarm(number).with_state(State.CANNOT_TELL)
+            )
             events = [self.writer.unexplained(waiting, number, self.explainer.reported(fits))]
         if self.next_fit(waiting) - state.alarm(number).last <= self.settings.longest:
             return waiting, events

@@ -59,6 +59,11 @@ class Hypothesis:
         """The columns that are sizes of faults."""
         return tuple(c for c in self.columns if c not in self.shape)
 
+    @property
+    def count(self) -> int:
+        """Number of faults that change, where simultaneous recoveries count as one."""
+        return len(set(self.sizes) - set(self.recovered)) + bool(self.recovered)
+
     def with_fault(self, fault: Fault) -> Hypothesis:
         """The same with a further fault at the same onset."""
         columns, shape = {*self.columns, *fault.columns}, {*self.shape, *fault.shape}

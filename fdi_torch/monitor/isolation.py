@@ -72,7 +72,7 @@ def isolate(
     hypotheses = [*plain, *oscillating, *recoveries, *(f.hypothesis for f in earlier)]
     fits = _best_of_each(fit(observer, window, believed, hypotheses, starts, _misfit(base), prior))
     for _ in range(1, deepest):
-        best = fits[:2]
+        best = [f for f in fits if f.hypothesis.count < deepest][:2]
         origin = {b.hypothesis.with_fault(f): b for b in best for f in faults if f.size not in b.hypothesis.columns}
         wider = [h for h in origin if h not in {f.hypothesis for f in fits}]
         if not wider:
@@ -84,7 +84,38 @@ def isolate(
         starts = torch.stack([_point(origin[h]) for h in wider])
         fits = _best_of_each([*fits, *fit(observer, window, believed, wider, starts, _misfit(base), prior)])
     ranked = with_posterior([*fits, no_change_fit(observer, window, believed, base)])
+    if ranked[0].hypothesis.columns and ranked[0].fits:
+        observer, ranked = _with_flows_of_window(observer, window, believed, ranked, prior)
     return [_beyond_range(observer, window, believed, f, prior) if f.at_bound else f for f in ranked]
+
+
+def _with_flows_of_window(
+    observer: ObserverBank, window: ObserverWindow, believed: Tensor, ranked: Sequence[HypothesisFit], prior: Prior
+) -> tuple[ObserverBank, list[HypothesisFit]]:
+    """The fits again, with random flows learnt from the window too: a short fault-free part leaves them uncertain.
+
+    Those whose odds may rise above the smallest that counts, if the flows halve the differences of log evidence, are
+    fitted with the flows that are most likely under the likeliest hypothesis. The evidence of each plausible one then
+    gains what flows of its own add to the likelihood.
+    """
+    observer, _ = observer.learning_from(window, believed, _change_of(ranked[0]))
+    base = observer.white_innovations(window, believed, no_change(believed))
+    changes = [f for f in ranked if f.hypothesis.columns and f.probability > SMALLEST_PROBABILITY**2]
+    starts, hypotheses = torch.stack([_point(f) for f in changes]), [f.hypothesis for f in changes]
+    fits = fit(observer, window, believed, hypotheses, starts, _misfit(base), prior)
+    fits.append(no_change_fit(observer, window, believed, base))
+    likely = {f.hypothesis for f in (*ranked, *with_posterior(fits)) if f.probability > SMALLEST_PROBABILITY}
+    for i, f in enumerate(fits):
+        if f.hypothesis in likely:
+            gain = observer.learning_from(window, believed, _change_of(f))[1]
+            fits[i] = replace(f, evidence=f.evidence + gain)
+    return observer, with_posterior(fits)
+
+
+def _change_of(fit: HypothesisFit) -> ChangeHypotheses:
+    """A fit as the single lane of a bank of observers."""
+    incipient = torch.tensor([fit.hypothesis.incipient])
+    return ChangeHypotheses(fit.value[None], fit.value.new_tensor([fit.onset]), incipient)
 
 
 def _beyond_range(
@@ -112,11 +143,10 @@ class Prior:
     single_changes: int
 
     def __call__(self, hypothesis: Hypothesis) -> float:
-        """Log of the odds against no change. Simultaneous recoveries count as one event."""
+        """Log of the odds against no change."""
         new = [c for c in hypothesis.sizes if c not in hypothesis.recovered]
-        count = len(new) + bool(hypothesis.recovered)
         places = len({ParameterName.parse(self.names[c]).place for c in new}) + bool(hypothesis.recovered)
-        return log_prior(count, places, max(self.single_changes, 1))
+        return log_prior(hypothesis.count, places, max(self.single_changes, 1))
 
 
 def no_change_fit(observer: ObserverBank, window: ObserverWindow, believed: Tensor, base: Tensor) -> HypothesisFit:
