@@ -10,7 +10,8 @@ import torch
 
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.study_file import Study, load_study
-from fdi_torch.estimate.evolution import distant_members
+from fdi_torch.estimate.evolution import EvolutionResult, distant_members
+from fdi_torch.estimate.refinement import starting_points
 from fdi_torch.jobs.study import TRIAL, progress, run_study
 from fdi_torch.logbook import read_run
 from fdi_torch.study.mode_isolation import count_modes
@@ -230,6 +231,13 @@ def test_distant_members_are_apart_or_the_best_again() -> None:
     assert distant_members(population, torch.zeros(1, 4), torch.ones(1), 3)[0, :, 0].tolist() == pytest.approx(
         [0.0, 0.5, 0.9]
     )
+
+
+def test_the_refinement_starts_once_from_each_distant_member() -> None:
+    population = torch.tensor([[[0.0], [0.01], [0.5], [0.52]]])
+    count, cost = torch.ones(1, dtype=torch.int64), torch.arange(4.0)[None]
+    found = EvolutionResult(population[:, 0], cost[:, 0], population, cost, count, count, count)
+    assert starting_points(found, torch.zeros(1), torch.ones(1), 4)[:, 0].tolist() == [0.0, 0.5]
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.estimate.diagnosis import Diagnosis, correlation_inflation, diagnose
@@ -79,7 +80,8 @@ def estimate_parameters(
     settings = with_less_effort(settings) if fitting.is_slow else settings
     low, high = search_box(fitting)
     coarse, fine = pick_steps(fitting, settings, low, high)
-    result = search(fitting.problem(coarse, settings.objectives[0]), low, high, settings, seed, on_generation, resume)
+    cost, box = fitting.problem(coarse, settings.objectives[0]).cost, (low[None], high[None])
+    result = evolve(cost, *box, settings.search, seed, on_generation=on_generation, resume=resume)
     starts = starting_points(result, low, high, settings.starts)
     if settings.method == "none":
         refinement = unrefined(fitting, settings, starts, low, high, fine)
@@ -93,8 +95,8 @@ def estimate_parameters(
     return conclude(fitting, settings, result, refinement, (coarse, fine))
 
 
-def search_box(fitting: Fitting) -> tuple[Tensor, Tensor]:
-    """Bounds low, high (P,) of the search: each parameter's range, cut to four prior standard deviations about nominal.
+def search_box(fitting: Fitting) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
+    """Bounds low, high of the search: each parameter's range, cut to four prior standard deviations about nominal.
 
     Raises ValueError for an infinite or empty range.
     """
@@ -109,11 +111,13 @@ def search_box(fitting: Fitting) -> tuple[Tensor, Tensor]:
     return low, high
 
 
-def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Tensor) -> tuple[float, float]:
+def pick_steps(
+    fitting: Fitting, settings: HybridSettings, low: Float[Tensor, " P"], high: Float[Tensor, " P"]
+) -> tuple[float, float]:
     """Integration steps (s) of search and refinement.
 
     Prescribed steps are taken as given. Otherwise this is the longest step whose integration error, probed at points of
-    the box from low (P,) to high (P,), is within the tolerance.
+    the box from low to high, is within the tolerance.
     """
     points = probe_points(low, high)
     spans = [float(r.time[-1] - r.time[0]) for r in fitting.recordings]
@@ -137,20 +141,6 @@ def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Te
         ladder = step_ladder(interval, scale, coarse)
         fine = choose_step(engine_at, recording_points, settings.refine_tolerance * std, ladder, 0.9)
     return coarse, fine
-
-
-def search(
-    problem: Problem,
-    low: Tensor,
-    high: Tensor,
-    settings: HybridSettings,
-    seed: int,
-    on_generation: Callable[[Search], None] | None,
-    resume: Search | None = None,
-) -> EvolutionResult:
-    """Differential evolution on one problem in the box from low (P,) to high (P,), started afresh or resumed."""
-    low, high = low.unsqueeze(0), high.unsqueeze(0)
-    return evolve(problem.cost, low, high, settings.search, seed, on_generation=on_generation, resume=resume)
 
 
 def conclude(
