@@ -95,7 +95,8 @@ class HypothesisSearch:
         weight = explanation.log_weight + at.gain
         if not here:
             return [CauseHypothesis(explanation, causes, weight + self._log_odds, at)]
-        error = relative_size(self.pool.fitter, explanation.fit, at.size, here)
+        # A random process has no size; it may be small at any intensity.
+        error = relative_size(self.pool.fitter, explanation.fit, at.size, here) if at.predicted is not None else None
         law, other = _shares([self._log_odds_of_law(error)])
         other += sum(self._log_selection(place) for _, place in here)  # they describe a part of the other law
         return [
@@ -107,7 +108,7 @@ class HypothesisSearch:
         """Log probability of one of the effects at a place, if it is not a cause but describes a part of one."""
         return -math.log(len({o.cause for o in self.options if o.cause[1] == place}))
 
-    def _log_odds_of_law(self, error: float) -> float:
+    def _log_odds_of_law(self, error: float | None) -> float:
         return log_odds_of_law(error, self.pool.choices, len(self.places))
 
     def _climbed(self, best: CauseHypothesis) -> list[CauseHypothesis]:
@@ -194,15 +195,15 @@ class HypothesisSearch:
 
     def _law_error(
         self, known: RankedExplanation, explanation: RankedExplanation, unknown: LocalizedDiscrepancy
-    ) -> float:
+    ) -> float | None:
         """Relative error of the law of an effect if the unknown at its place is true.
 
-        It is 0 if the effect predicts as well by Akaike's criterion (1974), which costs one nat for each parameter.
+        None if the effect predicts as well by Akaike's criterion (1974), which costs one nat for each parameter.
         """
         fitter, fit = self.pool.fitter, known.fit
         better = self._log_likelihood(explanation) + unknown.log_likelihood - self._log_likelihood(known)
         if better <= unknown.parameters + len(explanation.fit.space) - len(fit.space):
-            return 0.0
+            return None
         if unknown.predicted is None:
             return math.inf
         difference = unknown.predicted - fit.linearised.readings[0]
