@@ -145,11 +145,6 @@ class FlowFilter:
         information[:tanks, :tanks] += (eye - 1.0 / tanks) / (2.0 * SCATTER) ** 2
         return torch.linalg.inv(information + torch.eye(len(information), dtype=eye.dtype) / (2.0 * LOG_BOUND) ** 2)
 
-    @property
-    def intensity_error(self) -> Tensor:
-        """Standard error of ln of the intensity of each tank's flow, (tanks,)."""
-        return 0.5 * torch.diagonal(self.covariance_of_variances)[: len(self.noise.intensity)].sqrt()
-
     def error_of_sums(self, length: int) -> Tensor:
         """Standard error (sensors,) of ln of the standard deviation of sums of `length` innovations.
 

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.uncertainty import end_reached
-from fdi_torch.monitor.observer import initial_levels
+from fdi_torch.monitor.observer import initial_levels, run_observers
 from fdi_torch.monitor.observer_gain import Gain
-from fdi_torch.monitor.observer_run import run_observers
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.monitor.switched_plant import ONSET, RAMP, SwitchedNetwork
