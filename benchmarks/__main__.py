@@ -45,17 +45,18 @@ One command compares fdi_torch with other tools on the same work, on one machine
 
     pip install -e '.[benchmarks]' && python -m benchmarks --write benchmarks/README.md
 
-The peers' equations are written by hand in `physics.py` and give the same levels to 1e-9 m, which each run checks.
-`numba, blocks of lanes` is no tool of its own: it is our kernel's layout (trajectories side by side) written by hand,
-and shows what a compiler makes of it. What is left between the two is the root, refined from the processor's own
-rough one without divisions, the weirs that are skipped where no level stands above a rim, and what is computed once a
-lane or once a length of step. What bounds the kernel is the processor's products: with its roots unrefined, which
-would be wrong, it would be twice as fast. With steps of its own a trajectory takes few: short ones where a root has its
-kink, elsewhere as long as its stiffness allows. Errors are against SciPy's LSODA at a tolerance of 1e-12, on equations
-as sharp as for steps of 1 ms. The SciPy search is stopped after 120 generations, those of evosax and EvoX after 1500;
-all start from the tools' own defaults. Logging is timed within the log's own methods, on each thread, with the
-process that asks git; the job's seconds do not hold the imports, those of the whole command do. A sample's message
-costs half a microsecond; what is written once a generation finds the caches cold and costs sixty times as much.
+The peers' equations are written by hand in `physics.py`; each run checks that they give the same levels to 1e-9 m.
+`numba, blocks of lanes` is no separate tool: it is the layout of our kernel (trajectories side by side), written by
+hand. Our kernel is faster for three reasons: it refines the processor's approximate square root without divisions, it
+skips the weirs where no level is above a rim, and it computes once per lane, or once per step length, what does not
+change more often. Multiplications bound the kernel: with unrefined roots, which would be wrong, it would be twice as
+fast. With individual step control a trajectory takes few steps: short ones at the kink of a root, elsewhere as long as
+its stiffness allows. Errors are relative to SciPy's LSODA at a tolerance of 1e-12, on equations as sharp as for steps
+of 1 ms. The SciPy search is stopped after 120 generations, those of evosax and EvoX after 1500; all start from the
+tools' own defaults. The time of logging is measured in the log's own methods, on each thread, and in the process that
+asks git; a job's seconds do not include its imports, those of the whole command do. The message of a sample costs half
+a microsecond. One that is written once per generation costs sixty times as much, because the processor's caches no
+longer hold what it needs.
 
 """
 

@@ -34,7 +34,6 @@ from fdi_torch.gap.diagnose import diagnose
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
-CERTAIN = 0.95
 SHOWN = 1e-5  # m: the last digit of a level in the file
 
 

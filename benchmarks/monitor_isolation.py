@@ -102,13 +102,14 @@ def scored_oracle(case: Case, posteriors: Sequence[Mapping[str, float]]) -> dict
 
 
 def scored(case: Case, events: Sequence[Event]) -> dict[str, float]:
-    """Counts of events after the onset."""
+    """Counts of events after the onset. "Nothing beside": the observer uses one fault at most."""
     count: dict[str, float] = defaultdict(float)
     count["runs"], count["early"] = 1, sum(e.kind == "alarm" and e.time < case.onset for e in events)
     count["detected"] = any(e.kind == "alarm" and e.time >= case.onset for e in events)
     for e in answers_of(case, events):
         held = any(is_true(x.names, case.name) for x in e.explanations)
         count["events"] += 1
+        count["nothing beside"] += len(e.believed) <= 1
         count["in set"] += held
         count["top"] += is_true(e.faults, case.name)
         first = [
@@ -122,6 +123,7 @@ def scored(case: Case, events: Sequence[Event]) -> dict[str, float]:
             [size] = first[0].sizes
             count["sizes"] += 1
             count["sizes within three standard errors"] += abs(size.size - case.size_at(e.time)) <= 3.0 * size.std
+    count["runs with nothing beside"] = count["events"] == count["nothing beside"]
     return count
 
 

@@ -26,7 +26,7 @@ from fdi_torch.blind.plants import RIGS
 from fdi_torch.blind.scaling import Scales
 from fdi_torch.blind.scored_rows import scores_of
 from fdi_torch.blind.sealed_files import lines_of, manifest, open_key, read_plant, read_recording
-from fdi_torch.blind.sizes import SAME
+from fdi_torch.blind.sizes import COMPARABLE
 from fdi_torch.blind.statistics import clopper_pearson
 from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.diagnose import diagnose, recalibrate
@@ -84,8 +84,8 @@ def _starts(
     library with each deviation multiplied by a log-normal factor of one e-fold."""
     rng, (d, *_) = np.random.default_rng(len(options)), truth["deviations"]
     starts: list[Mapping[str, float]] = []
-    if (d["effect"], d["law"]) in SAME:
-        name, _, value = SAME[d["effect"], d["law"]]
+    if (d["effect"], d["law"]) in COMPARABLE:
+        name, _, value = COMPARABLE[d["effect"], d["law"]]
         true = value(d["numbers"], plant, d["location"], Scales())
         parameter = f"{d['location']}.{d['effect']}.{name}"
         if np.isfinite(true) and parameter in explanation.fit.effect_values:

@@ -16,7 +16,7 @@ from fdi_torch.simulate.midpoint import newton_step
 from fdi_torch.simulate.output_map import SampleGrid
 from fdi_torch.simulate.pointwise import Partials
 from fdi_torch.simulate.reference_engine import ReferenceEngine
-from fdi_torch.simulate.scan import linear_scan, scan_in_time
+from fdi_torch.simulate.scan import scan_in_time
 from tests.rigs import constant_inputs, three_tank
 
 
@@ -34,7 +34,7 @@ def stepped(duration: float = 200.0) -> Recording:
 def loop(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """Both ways through a recurrence: compiled where there is a compiler, and torch's."""
     if request.param == "torch":
-        monkeypatch.setattr("fdi_torch.simulate.recurrence._library", lambda tanks: None)
+        monkeypatch.setattr("fdi_torch.simulate.scan._library", lambda tanks: None)
     return request.param
 
 
@@ -52,7 +52,7 @@ def test_both_ways_through_a_newton_step_are_one(tanks: int, monkeypatch: pytest
     path[1, 0, 5] = torch.nan
     given = (draw(steps).abs(), path, rates, by_level, by_theta, start, slopes)
     found = newton_step(*given)
-    monkeypatch.setattr("fdi_torch.simulate.recurrence._library", lambda tanks: None)
+    monkeypatch.setattr("fdi_torch.simulate.scan._library", lambda tanks: None)
     for ours, torchs in zip(found, newton_step(*given), strict=True):
         torch.testing.assert_close(ours, torchs, rtol=1e-10, atol=1e-10, equal_nan=True)
 
@@ -62,11 +62,11 @@ def test_both_ways_through_a_newton_step_are_one(tanks: int, monkeypatch: pytest
 def test_the_scan_is_the_recurrence(count: int) -> None:
     generator = torch.Generator().manual_seed(1)
     draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
-    a, b, first = 0.5 * draw(2, count, 3, 3), draw(2, count, 3, 4), draw(2, 3, 4)
+    a, b, first = 0.5 * draw(2, 3, 3, count), draw(2, 3, 4, count), draw(2, 3, 4)
     expected = [first]
     for k in range(count):
-        expected.append(a[:, k] @ expected[-1] + b[:, k])
-    torch.testing.assert_close(linear_scan(a, b, first), torch.stack(expected, dim=1), rtol=1e-12, atol=1e-12)
+        expected.append(a[..., k] @ expected[-1] + b[..., k])
+    torch.testing.assert_close(scan_in_time(a, b, first), torch.stack(expected, dim=-1), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("columns", [1, 3, 21])

@@ -36,11 +36,14 @@ def test_two_effects_at_one_place_are_less_likely_than_at_two() -> None:
     assert apart - together == pytest.approx(-math.log(ODDS.same_place))
 
 
-def test_all_errors_of_a_law_together_have_the_prior_odds_of_the_effect() -> None:
+def test_all_errors_of_a_law_together_have_the_prior_odds_of_an_effect_with_an_inexact_law() -> None:
     """Differences of another law are uniform up to two: the mean of the odds over them is that of the priors."""
     choices, places, errors = 7, 5, torch.linspace(0.0, 2.0, 20001).tolist()
     odds = [math.exp(log_odds_of_law(error, choices, places)) for error in errors]
-    assert sum(odds) / len(odds) == pytest.approx((ODDS.effect / choices) / (ODDS.unknown / places), rel=1e-3)
+    prior = ODDS.inexact * (ODDS.effect / choices) / (ODDS.unknown / places)
+    assert sum(odds) / len(odds) == pytest.approx(prior, rel=1e-3)
+    exact = math.exp(log_odds_of_law(None, choices, places))
+    assert odds[0] / exact == pytest.approx(ODDS.inexact / (1.0 - ODDS.inexact))
 
 
 def test_probabilities_follow_from_differences_of_logarithms_alone() -> None:

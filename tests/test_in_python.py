@@ -285,6 +285,17 @@ def test_the_catalogue_takes_the_name_of_a_plant() -> None:
     assert len(fdi_torch.effects()) > len(fdi_torch.effects("three_tank"))
 
 
+def test_the_beginning_of_one_of_several_recordings_has_its_own_start_level() -> None:
+    long, short = simulated(), simulated().stretch(0, 120)
+    both = fdi_torch.set_up(RIG, [long, short], ["A.leak", "Q.gain"], "free")
+    assert both.space.names == ("A.leak.size", "Q.gain", "A.start_level", "A.start_level@1")
+    beginning = both.beginning(1, 50)
+    (engine,), theta = beginning.engines(1.0), both.space.nominal()[None] + 0.01
+    own = theta[:, beginning.columns[0]]
+    assert beginning.columns[0].tolist() == [0, 1, 3] and len(beginning.recordings[0]) == 50
+    assert torch.equal(engine.readings(own), both.engines(1.0)[1].readings(own)[:, :50])
+
+
 def test_a_recording_at_hand_is_asked_for_the_plant_s_channels() -> None:
     blank = simulated()
     with pytest.raises(fdi_torch.ConfigError, match=r"expected an output .*got 'h'"):

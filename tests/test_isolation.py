@@ -77,10 +77,6 @@ def test_the_credible_set_has_95_percent_and_every_indistinguishable_fit() -> No
     assert len(credible_set([found((0,), 0.0, mass=0.96), rival, twin])) == 2, "no reading tells the twin apart"
 
 
-def test_an_estimate_at_its_bound_never_fits() -> None:
-    assert found((0,), 0.0).fits and not replace(found((0,), 0.0), at_bound=(0,)).fits
-
-
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
 def test_the_volume_at_an_end_of_a_range_is_that_of_a_truncated_posterior(correlation: float) -> None:
     """Against sums over a grid: one parameter that the end holds back, one inside its range; widths 2 and 5."""

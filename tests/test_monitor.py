@@ -20,6 +20,7 @@ from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, place
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
+from fdi_torch.monitor.alarm_state import State
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.fault_free_checks import residual_warnings
@@ -203,6 +204,8 @@ def test_a_size_beyond_its_range_is_told_as_at_least_its_end_and_causes_no_other
     assert all(f"{ParameterName.parse(name).field} at least {end:g}, the end of its range" in e.text for e in ended)
     assert {(e.sizes, e.stds) for e in ended} == {((end,), (float("inf"),))}
     assert [e.sizes for e in events if e.kind == "summary" and e.sizes] == [(end,)]
+    assert {e.state for e in ended} == {State.CANNOT_TELL} and sum(e.kind == "alarm" for e in events) == 1
+    assert all(abs(e.onset - 200.0) <= 3.0 * e.onset_std for e in ended if e.onset is not None and e.onset_std)
 
 
 def test_a_fault_with_an_inexact_law_is_one_event_until_it_ends() -> None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from fdi_torch.monitor.hypothesis import Hypothesis, HypothesisFit, credible_set, merged
-from fdi_torch.monitor.isolation import isolate
-from tests.test_monitor import FAULTS, followed, monitor, recorded, step_to
+from fdi_torch.monitor.isolation import Prior, fit, isolate
+from tests.test_monitor import FAULTS, SPACE, STD, followed, from_rest, monitor, recorded, step_to
 
 
 def explanation(column: int, misfit: float, probability: float) -> HypothesisFit:
@@ -32,8 +33,48 @@ def test_every_fault_is_fitted_when_a_wrong_explanation_no_longer_holds() -> Non
     watch = monitor()
     state, _ = followed(watch, recorded(step_to("T3.leak.size", 0.05, 200.0), 320))
     assert state.change is not None
-    fits = isolate(watch.observer, state.window(100.0), state.change.before, FAULTS, incipient=False, deepest=1)
-    wrong = next(f for f in fits if f.hypothesis.columns == (3,))
+    window, before = state.window(100.0), state.change.before
+    start = torch.cat([before, before.new_tensor([200.0])])[None]
+    [wrong] = fit(watch.observer, window, before, [Hypothesis((3,))], start, 0.0, Prior(SPACE.names, 5))
     misled = replace(state, change=replace(state.change, explanations=(wrong,)))
     [event] = watch.alarms.on_threshold(misled)[1]
     assert event.kind in ("isolated", "revised") and event.faults == ("T3.leak.size",)
+
+
+def test_no_explanation_has_more_simultaneous_faults_than_allowed_however_often_it_is_fitted_again() -> None:
+    def truth(time: float) -> Tensor:
+        return SPACE.vector(
+            {"T1.leak.size": 0.05, "P13.plugging.size": 0.1, "h3.sensor_bias.bias": 0.01} if time > 100.0 else {}
+        )
+
+    bank, window = monitor().observer, from_rest(recorded(truth, 260))
+    fits: list[HypothesisFit] = []
+    for _ in range(2):
+        fits = isolate(bank, window, SPACE.nominal(), FAULTS, incipient=False, deepest=2, earlier=fits)
+        assert max(len(f.hypothesis.sizes) for f in fits) == 2
+
+
+def test_a_fault_that_grew_before_the_search_window_is_found_with_its_onset() -> None:
+    """Within the window alone, the growing fault starts at zero, and a sudden one is likelier."""
+
+    def truth(time: float) -> Tensor:
+        return SPACE.vector({"T3.leak.size": 2e-4 * max(time - 150.0, 0.0)})
+
+    _, events = followed(monitor(lookback=40.0, confirm=20.0, incipient=True), recorded(truth, 240))
+    first = next(e for e in events if e.faults)
+    assert first.faults == ("T3.leak.size",) and first.growing
+    assert abs(float(first.onset or 0.0) - 150.0) < 2.0 * float(first.onset_std or 0.0)
+    assert abs(first.sizes[0] - 2e-4 * (first.time - 150.0)) < 3.0 * first.stds[0]
+
+
+def test_a_fault_after_an_alarm_by_chance_is_told_as_soon_as_without_that_alarm() -> None:
+    """An alarm that chance explains is fitted again for a whole longest window; the detector goes on meanwhile."""
+    watch, run = monitor(lookback=60.0, confirm=20.0), recorded(step_to("T3.leak.size", 0.05, 300.0), 360)
+    readings = run.readings.clone()
+    readings[200:203, 0] += 6.0 * STD
+    _, events = followed(watch, replace(run, readings=readings))
+    kinds = [(e.kind, e.alarm) for e in events]
+    assert kinds[:2] == [("alarm", 1), ("cannot tell", 1)] and events[0].time < 210.0
+    assert ("retired", 1) in kinds and ("isolated", 2) in kinds
+    told = next(e for e in events if e.faults)
+    assert told.faults == ("T3.leak.size",) and told.time < 340.0

@@ -19,9 +19,9 @@ from fdi_torch.cli import INTERRUPTED, main
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.jobs.live_batches import DelayWatch, LiveBatches
+from fdi_torch.jobs.monitor_rows import rows_until
 from fdi_torch.jobs.replay import repeat_run
-from fdi_torch.jobs.row_buffer import rows_until
-from fdi_torch.logbook import RunLog, follow, read_run
+from fdi_torch.logbook import RunLog, follow, read_run, series
 from tests.test_monitor import recorded, step_to
 
 FAULT, ONSET, SAMPLES = "T3.leak.size", 200.0, 300
@@ -400,6 +400,21 @@ def test_a_monitors_log_is_replayed_to_the_same_events(tmp_path: Path, capsys: p
     assert capsys.readouterr().out.startswith("bit-equal")
     with pytest.raises(ValueError, match="a key other than those of the data"):
         repeat_run(read_run(log), tmp_path / "again.mcap", ["recording.file=other.csv"])
+
+
+@pytest.mark.parametrize("last", [230, 231, 232])
+def test_no_logged_mean_of_an_input_depends_on_where_the_recording_ends(
+    last: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = [row(k, levels).replace(",50,", f",{45 + k % 7},", 1) for k, levels in enumerate(readings())]
+    pumped = []
+    for count in (last, SAMPLES):
+        (tmp_path / "rig.csv").write_text(HEADER + "".join(lines[:count]))
+        thinned = {"recording": {"file": "rig.csv", "every": 3}, "output": {"folder": str(tmp_path / str(count))}}
+        monitored(["--config", config(tmp_path, **thinned)], capsys)
+        [log] = (tmp_path / str(count)).glob("*.mcap")
+        pumped.append(series(read_run(log), "/plant/input")["Q1"].tolist())
+    assert pumped[0] == pumped[1][: len(pumped[0])] and len(pumped[0]) > 70
 
 
 def test_a_fault_below_its_smallest_size_is_logged_and_not_said_aloud(

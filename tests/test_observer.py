@@ -12,9 +12,8 @@ from scipy.linalg import solve_discrete_are
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, place
 from fdi_torch.monitor.noise_model import learn_noise, operating_point
-from fdi_torch.monitor.observer import Observer, bind_parameters, initial_levels
+from fdi_torch.monitor.observer import Observer, bind_parameters, initial_levels, run_observers
 from fdi_torch.monitor.observer_gain import hand_gain, kalman_gain, linearised, riccati, spectral_radius, timed_gain
-from fdi_torch.monitor.observer_run import run_observers
 from fdi_torch.monitor.samples import Samples, samples_of_recording
 from fdi_torch.monitor.stepper import PlantState, Stepper
 from fdi_torch.parameters import ParameterSpace

@@ -59,6 +59,18 @@ def torricelli_rates(levels: list[float], theta: tuple[float, ...], flow: float 
     ]
 
 
+def test_a_component_is_looked_up_by_its_name_and_kind() -> None:
+    plant = three_tank()
+    assert plant.tank("T2") is plant.tanks[1] and plant.sensor("h3") is plant.sensors[2]
+    assert plant.pipe("P13") is plant.flow("P13") is plant.pipes[0] and plant.metered_flow("Q2") is plant.pumps[1]
+    with pytest.raises(ValueError, match="expected the name of a Tank, got P13"):
+        plant.tank("P13")
+    with pytest.raises(ValueError, match="expected the name of a MeteredFlow, got OUT2"):
+        plant.metered_flow("OUT2")
+    with pytest.raises(ValueError, match="expected one of T1, T2, T3"):
+        plant.pipe("nowhere")
+
+
 def test_an_emptying_tank_follows_torricelli() -> None:
     plant = PlantDescription(
         "one", (Tank("T", 0.02, 1.0, 0.8),), (Pipe("O", "T", OUTSIDE, 1e-4, 0.6),), (), (Sensor("h", "T"),)

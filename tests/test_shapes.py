@@ -1,4 +1,4 @@
-"""The shapes in the signatures of plant, simulate and estimate, checked while a share of the tests runs."""
+"""The shapes in the signatures of plant, simulate, estimate and study, checked while a share of the tests runs."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ import torch
 from jaxtyping import TypeCheckError, install_import_hook
 
 sys.path.insert(0, "tests")
-install_import_hook(["fdi_torch.plant", "fdi_torch.simulate", "fdi_torch.estimate"], "shapes.checked")
-from fdi_torch.simulate.scan import linear_scan
+install_import_hook([f"fdi_torch.{room}" for room in ("plant", "simulate", "estimate", "study")], "shapes.checked")
+from fdi_torch.simulate.scan import scan_in_time
 
-with pytest.raises(TypeCheckError, match="forcing"):
-    linear_scan(torch.zeros(1, 3, 2, 2), torch.zeros(1, 4, 2, 1), torch.zeros(1, 2, 1))
+with pytest.raises(TypeCheckError, match="parameter 'b'"):
+    scan_in_time(torch.zeros(1, 2, 2, 3), torch.zeros(1, 2, 1, 4), torch.zeros(1, 2, 1))
 sys.exit(pytest.main(sys.argv[1:]))
 """
 RUN = (
@@ -32,6 +32,9 @@ RUN = (
     "test_step_control.py::test_sums_are_those_of_readings_and_jacobian",
     "test_step_control.py::test_a_lane_depends_on_no_neighbour",
     "test_joint_collocation.py::test_each_recording_is_simulated_as_if_it_were_alone",
+    "test_study.py::test_bounds_are_those_of_central_differences_at_tight_steps",
+    "test_study.py::test_uniform_faults_fill_the_box",
+    "test_study.py::test_intervals_hold_the_truth_as_often_as_they_say",
     "test_evolution.py::test_interrupted_search_resumes_bit_for_bit",
 )
 

@@ -10,10 +10,12 @@ import torch
 
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.study_file import Study, load_study
+from fdi_torch.estimate.evolution import EvolutionResult, distant_members
+from fdi_torch.estimate.refinement import starting_points
 from fdi_torch.jobs.study import TRIAL, progress, run_study
 from fdi_torch.logbook import read_run
 from fdi_torch.study.mode_isolation import count_modes
-from fdi_torch.study.monte_carlo import Trial, distant, run_block, run_blocks
+from fdi_torch.study.monte_carlo import Trial, run_block, run_blocks
 from fdi_torch.study.study_plan import Block, Plan, Setting, fault_modes, fixed_faults, mode_faults, uniform_faults
 from fdi_torch.study.summary import column, covered, rms_ratio, rms_with_error, share, summarise
 from fdi_torch.study.trial_readings import limits, make_trials
@@ -223,10 +225,19 @@ def test_each_estimator_fails_beyond_six_of_its_own_bounds(plan: Plan) -> None:
 
 def test_distant_members_are_apart_or_the_best_again() -> None:
     population = torch.tensor([[[0.0], [0.01], [0.5]], [[0.0], [0.01], [0.02]]])
-    taken = distant(population, torch.zeros(2, 3), torch.ones(1), 2)
+    taken = distant_members(population, torch.zeros(2, 3), torch.ones(1), 2)
     assert taken[..., 0].tolist() == [[0.0, 0.5], [0.0, 0.0]]
     population = torch.tensor([[[0.0], [0.5], [0.52], [0.9]]])
-    assert distant(population, torch.zeros(1, 4), torch.ones(1), 3)[0, :, 0].tolist() == pytest.approx([0.0, 0.5, 0.9])
+    assert distant_members(population, torch.zeros(1, 4), torch.ones(1), 3)[0, :, 0].tolist() == pytest.approx(
+        [0.0, 0.5, 0.9]
+    )
+
+
+def test_the_refinement_starts_once_from_each_distant_member() -> None:
+    population = torch.tensor([[[0.0], [0.01], [0.5], [0.52]]])
+    count, cost = torch.ones(1, dtype=torch.int64), torch.arange(4.0)[None]
+    found = EvolutionResult(population[:, 0], cost[:, 0], population, cost, count, count, count)
+    assert starting_points(found, torch.zeros(1), torch.ones(1), 4)[:, 0].tolist() == [0.0, 0.5]
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:

@@ -9,8 +9,7 @@ import torch
 
 from fdi_torch.config.plant_file import build_plant
 from fdi_torch.config.run_file import Run, build_run
-from fdi_torch.estimate.stretches import stretches_of
-from fdi_torch.estimate.windows import Window, WindowFault, cut_up, noise_of, state_of
+from fdi_torch.estimate.windows import Window, WindowFault, cut_up, noise_of, state_of, stretches_of
 from fdi_torch.jobs.windowed_fit import fit_windows
 from fdi_torch.recording import Recording
 

@@ -30,6 +30,7 @@ from fdi_torch.blind.sealed_files import (
     read_recording,
     write_cases,
 )
+from fdi_torch.estimate.uncertainty import plain_value
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
@@ -154,16 +155,8 @@ def answer(diagnoses: Mapping[str, Diagnosis], out: Path, task: Task) -> Done:
         result = diagnoses[name](plant, recording, holdout, **options)
     except Exception as error:  # scored, not raised: one crash must not end the benchmark
         result = {"verdict": "crash", "error": f"{type(error).__name__}: {error}"}
-    return name, {"case": line["case"], "sec": round(time.perf_counter() - start, 3), "answer": without_nan(result)}
-
-
-def without_nan(value: Any) -> Any:
-    """The value with NaN and infinities replaced by None, because JSON has none."""
-    if isinstance(value, Mapping):
-        return {k: without_nan(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [without_nan(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    sec = round(time.perf_counter() - start, 3)
+    return name, {"case": line["case"], "sec": sec, "answer": plain_value(result, name)}
 
 
 def always_null(plant: PlantDescription, recording: Recording, holdout: Recording, **options: Any) -> dict[str, Any]:

@@ -31,7 +31,8 @@ from fdi_torch.blind.simulator import SimulatedRun
 VISIBLE = 0.5
 """A cause is visible if, without it, some reading moves by this root mean square, in units of the noise including that
 of random flows."""
-LARGEST_TRIALS = 8
+MOST_DRAWS = 8
+"""Number of draws of the causes of one case, after which they are kept although one is not visible."""
 
 
 @dataclass(frozen=True)
@@ -173,10 +174,10 @@ def _with_visible_causes(
     """Draw causes again where the kind requires visible ones and they are not."""
     result = list(drafts)
     todo = [i for i, draft in enumerate(result) if draft.kind.shows]
-    for trial in range(1, LARGEST_TRIALS + 1):
+    for trial in range(1, MOST_DRAWS + 1):
         todo = [i for i, visible in zip(todo, _all_visible([result[i] for i in todo]), strict=True) if not visible]
         for i in todo:
-            if trial == LARGEST_TRIALS:
+            if trial == MOST_DRAWS:
                 result[i] = replace(result[i], shows=False)
                 continue
             draft = result[i]

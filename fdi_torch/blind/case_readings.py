@@ -35,8 +35,7 @@ def noisy_readings(c: Conditions, run: SimulatedRun, part: int, deviations: Devi
 
 def _measured_levels(rig: Rig, built: PlantDescription, levels: Array, deviations: Sequence[Deviation]) -> Array:
     """(T, N) m -> (T, S) m: the level that follows from each reading with the sensor's nominal constants."""
-    tanks = [t.name for t in rig.plant.tanks]
-    sensed = _with_laws(SENSOR_LAWS, rig, levels[:, [tanks.index(s.tank) for s in rig.plant.sensors]], deviations)
+    sensed = _with_laws(SENSOR_LAWS, rig, levels[:, rig.measured_tanks], deviations)
     pairs = list(zip(built.sensors, rig.plant.sensors, strict=True))
     gain = np.array([true.gain / nominal.gain for true, nominal in pairs])
     return sensed * gain + np.array([(true.offset - nominal.offset) / nominal.gain for true, nominal in pairs])

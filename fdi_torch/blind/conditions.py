@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -12,31 +13,36 @@ from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.inputs import (
     DECIMALS,
     FACTORS,
+    as_printed,
     channel_limits,
     command_unit,
     commanded,
     drawn,
-    in_print,
+    pumps_of_channels,
     with_standstills,
 )
 from fdi_torch.blind.plants import Rig
 from fdi_torch.blind.random_flows import Disturbance
-from fdi_torch.blind.scaling import SAME, Scales, on_bench
+from fdi_torch.blind.scaling import BENCH, Scales, on_bench
 from fdi_torch.blind.sensor_noise import WHITE, NoiseCorrelation, draw_correlation
 from fdi_torch.blind.simulator import Drive, HiddenRigs, SimulatedRun, simulate
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 
 RECORDED, HELD_OUT = 3601, 2401
+"""Samples of the recording and of the hold-out, one per second."""
 COARSE = 0.25
-WIDEST = 2.5
-"""Largest deviation of a constant, in standard deviations."""
-_LEAST = 0.2
+"""Integration step of preliminary simulations, s."""
+WIDEST, _LEAST = 2.5, 0.2
+"""Largest deviation of a constant, in standard deviations, and its least value, as a share of the nominal one."""
 _MOST_TRIALS = 12
+"""Number of adjustments of the inputs after which a rig counts as one that no inputs keep within its tanks."""
 LOW, HIGH = 0.13, 0.8
+"""Range of the commanded flow, as a share of a pump's max_flow, of a rig that only its plant file describes."""
 FULL, LEAST = 0.5, 0.02
+"""Highest resting level, as a share of the height, for which the inputs of such a rig are reduced; the least HIGH."""
 NOISE = 1 / 35
-"""Measurement noise over the mean level at equilibrium, times 0.05, 0.1 or 0.2: 0.14, 0.29 or 0.57 % of that level."""
+"""Unit of the measurement noise over the mean level at equilibrium: 0.05, 0.1 or 0.2 of it are 0.14, 0.29 or 0.57 %."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +70,7 @@ class Conditions:
     def drive(self, part: int, disturbed: bool) -> Drive:
         """Inputs of the simulation of the recording (part 0) or the hold-out (part 1)."""
         asked, control = asked_of_pumps(self.built, self.commands[part]), self.control[part] if self.control else None
-        error = None
-        if control is not None:
-            tanks = [t.name for t in self.rig.plant.tanks]
-            read = [tanks.index(s.tank) for s in self.rig.plant.sensors]
-            error = self.errors[part][:, read.index(control.tank)]
+        error = None if control is None else self.errors[part][:, self.rig.measured_tanks.index(control.tank)]
         disturbance = self.disturbances[part] if disturbed and self.disturbances else None
         return Drive(asked, self.starts[part], disturbance, control, error)
 
@@ -77,19 +79,19 @@ def as_built(plant: PlantDescription, rng: np.random.Generator) -> PlantDescript
     """The rig as built, with constants drawn within their tolerances: x (1 + s z), or x + s z for an offset, with z
     standard normal and clipped.
     """
-    off: dict[str, dict[str, float]] = {}
+    drawn: dict[str, dict[str, Any]] = {}
     for constant, tolerance in plant.tolerances.items():
         name = ParameterName.parse(constant)
         z = float(np.clip(rng.normal(), -WIDEST, WIDEST))
         nominal = float(getattr(plant.component(name.place), name.field))
-        drawn = nominal + tolerance * z if name.field == "offset" else nominal * max(1 + tolerance * z, _LEAST)
-        off.setdefault(name.place, {})[name.field] = drawn
+        value = nominal + tolerance * z if name.field == "offset" else nominal * max(1 + tolerance * z, _LEAST)
+        drawn.setdefault(name.place, {})[name.field] = value
     return replace(
         plant,
-        tanks=tuple(replace(t, **off.get(t.name, {})) for t in plant.tanks),  # type: ignore[arg-type]
-        pipes=tuple(replace(p, **off.get(p.name, {})) for p in plant.pipes),  # type: ignore[arg-type]
-        pumps=tuple(replace(p, **off.get(p.name, {})) for p in plant.pumps),  # type: ignore[arg-type]
-        sensors=tuple(replace(s, **off.get(s.name, {})) for s in plant.sensors),  # type: ignore[arg-type]
+        tanks=tuple(replace(t, **drawn.get(t.name, {})) for t in plant.tanks),
+        pipes=tuple(replace(p, **drawn.get(p.name, {})) for p in plant.pipes),
+        pumps=tuple(replace(p, **drawn.get(p.name, {})) for p in plant.pumps),
+        sensors=tuple(replace(s, **drawn.get(s.name, {})) for s in plant.sensors),
     )
 
 
@@ -124,17 +126,18 @@ def asked_of_pumps(plant: PlantDescription, commands: Array) -> Array:
 
 def commands_of_pumps(plant: PlantDescription, asked: Array) -> Array:
     """(T, M) m^3/s -> (T, C) in the header's unit, each channel from its first pump."""
-    first = {p.channel: i for i, p in reversed(list(enumerate(plant.pumps)))}
-    pumps = [plant.pumps[first[channel]] for channel in plant.channels()]
-    units = [(first[p.channel], p.gain * FACTORS[command_unit(p)], DECIMALS[command_unit(p)]) for p in pumps]
-    return np.stack([np.round(asked[:, i] / factor, decimals) for i, factor, decimals in units], axis=1)
+    columns = []
+    for p in pumps_of_channels(plant):
+        requested, unit = asked[:, plant.pumps.index(p)], command_unit(p)
+        columns.append(np.round(requested / (p.gain * FACTORS[unit]), DECIMALS[unit]))
+    return np.stack(columns, axis=1)
 
 
 def levels_at_rest(rig: Rig) -> Array:
     """Equilibrium levels (N,) m of the rig without any effect at medium inputs."""
     if rig.rest is not None:
         return np.array(rig.rest)
-    middle = in_print(rig, np.tile(channel_limits(rig).mean(axis=1), (4001, 1)))
+    middle = as_printed(rig, np.tile(channel_limits(rig).mean(axis=1), (4001, 1)))
     start = np.array([0.4 * t.height for t in rig.plant.tanks])
     (ran,) = simulate(HiddenRigs([rig.plant], [()]), [Drive(asked_of_pumps(rig.plant, middle), start)], COARSE)
     return ran.levels[-1]
@@ -175,9 +178,9 @@ def kept_within(conditions: Sequence[Conditions]) -> list[Conditions]:
 
 def _moved(rig: Rig, commands: Array, low: bool, high: bool) -> Array:
     if not low:
-        return in_print(rig, 0.85 * commands)
+        return as_printed(rig, 0.85 * commands)
     middle = commands.mean(axis=0)
-    return in_print(rig, middle + 0.85 * (commands - middle) if high else 0.9 * commands + 0.1 * commands.max(axis=0))
+    return as_printed(rig, middle + 0.85 * (commands - middle) if high else 0.9 * commands + 0.1 * commands.max(axis=0))
 
 
 def controlled(c: Conditions, rng: np.random.Generator, runs: Sequence[SimulatedRun]) -> Conditions:
@@ -217,12 +220,10 @@ def disturbed(
 
 def moved_by(c: Conditions, levels: Array, others: Array) -> float:
     """Root mean square difference of the measured levels, in units of each sensor's noise."""
-    tanks = [t.name for t in c.rig.plant.tanks]
-    read = [tanks.index(s.tank) for s in c.rig.plant.sensors]
-    return float(np.sqrt(np.mean(((levels - others)[:, read] / c.noise) ** 2)))
+    return float(np.sqrt(np.mean(((levels - others)[:, c.rig.measured_tanks] / c.noise) ** 2)))
 
 
-def exercised(plant: PlantDescription, scales: Scales = SAME) -> Rig:
+def exercised(plant: PlantDescription, scales: Scales = BENCH) -> Rig:
     """A rig that is described only by its plant file, with the widest inputs at whose middle no tank is above half its
     height in equilibrium.
 

@@ -11,10 +11,9 @@ from fdi_torch.blind.deviation import Array
 from fdi_torch.plant.description import PlantDescription
 
 LAWS = ("two_point", "proportional_integral")
-SHORTEST_SETTING, LONGEST_SETTING = 200, 500
-BAND = 0.01
-INTERVAL = 5
-RESET = 120.0
+SHORTEST_SETTING, LONGEST_SETTING = 200, 500  # s for which a set point is held
+BAND = 0.01  # of the two-point law, as a share of the tank's height
+INTERVAL, RESET = 5, 120.0  # s; sampling interval and reset time of the proportional-integral law
 
 
 @dataclass(frozen=True)

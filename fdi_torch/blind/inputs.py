@@ -11,7 +11,8 @@ from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.plants import Rig
 from fdi_torch.plant.description import PlantDescription, Pump
 
-SHORTEST_HOLD, LONGEST_HOLD = 40, 220
+SHORTEST_HOLD, LONGEST_HOLD = 40, 220  # s
+# Unit of a command in the recording's header -> its printed decimals, and its SI value.
 DECIMALS = {"cm3_s": 1, "V": 3, "1": 4}
 FACTORS = {"cm3_s": 1e-6, "V": 1.0, "1": 1.0}
 
@@ -21,20 +22,24 @@ def command_unit(pump: Pump) -> str:
     return "cm3_s" if pump.gain_unit == "1" else "V" if pump.gain_unit.endswith("/V") else "1"
 
 
+def pumps_of_channels(plant: PlantDescription) -> list[Pump]:
+    """The first pump of each input channel."""
+    return [next(p for p in plant.pumps if p.channel == channel) for channel in plant.channels()]
+
+
 def channel_limits(rig: Rig) -> Array:
     """(C, 2): lowest and highest command of each channel, in the header's unit."""
     rows = []
-    for channel in rig.plant.channels():
-        pump = next(p for p in rig.plant.pumps if p.channel == channel)
+    for pump in pumps_of_channels(rig.plant):
         full = pump.max_flow / pump.gain / FACTORS[command_unit(pump)]
         rows.append((rig.input_low * full, rig.input_high * full))
     return np.array(rows)
 
 
-def in_print(rig: Rig, commands: Array) -> Array:
+def as_printed(rig: Rig, commands: Array) -> Array:
     """Commands rounded as the recording prints them, so that the rig gets the recorded values."""
-    units = [command_unit(next(p for p in rig.plant.pumps if p.channel == c)) for c in rig.plant.channels()]
-    return np.stack([np.round(commands[:, i], DECIMALS[u]) for i, u in enumerate(units)], axis=1)
+    decimals = [DECIMALS[command_unit(pump)] for pump in pumps_of_channels(rig.plant)]
+    return np.stack([np.round(commands[:, i], d) for i, d in enumerate(decimals)], axis=1)
 
 
 # A signal is f(rng, samples) -> (samples,): shares of the way from the lowest to the highest command. Rich ones:
@@ -112,7 +117,7 @@ def commanded(rig: Rig, rng: np.random.Generator, samples: int, signal: Signal =
     """(T, C) in the header's unit, with a signal of this kind for every channel."""
     limits = channel_limits(rig)
     shares = np.stack([signal(rng, samples) for _ in limits], axis=1)
-    return in_print(rig, limits[:, 0] + (limits[:, 1] - limits[:, 0]) * shares)
+    return as_printed(rig, limits[:, 0] + (limits[:, 1] - limits[:, 0]) * shares)
 
 
 def with_standstills(rig: Rig, rng: np.random.Generator, samples: int, resting: str) -> Array:
@@ -128,7 +133,7 @@ def with_standstills(rig: Rig, rng: np.random.Generator, samples: int, resting: 
 
 def channel_to_rest(plant: PlantDescription, pipe: str) -> str:
     """The channel whose rest reverses the flow of a pipe: it feeds the pipe's source, or at least not its target."""
-    p = next(p for p in plant.pipes if p.name == pipe)
+    p = plant.pipe(pipe)
     feeding = [q.channel for q in plant.pumps if q.target == p.source]
     others = [q.channel for q in plant.pumps if q.target != p.target]
     return (*feeding, *others, plant.channels()[0])[0]

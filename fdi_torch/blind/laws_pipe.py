@@ -118,25 +118,8 @@ def gulping(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Facto
 
 
 HEAD_LAWS = {"down_pipe": down_pipe}
-PIPE_LAWS = {
-    law.__name__: law
-    for law in (
-        viscous_and_inertial,
-        reynolds_blend,
-        sharp_transition,
-        other_power,
-        drifting_evenly,
-        drifting_to_rest,
-        drifting_as_sine,
-        drifting_unevenly,
-        narrowed,
-        check_valve,
-        silting,
-        two_regimes,
-        fluttering,
-        choked,
-        blocked_at_times,
-        lopsided,
-        gulping,
-    )
-}
+PIPE_LAWS = {law.__name__: law for law in (
+    viscous_and_inertial, reynolds_blend, sharp_transition, other_power, drifting_evenly, drifting_to_rest,
+    drifting_as_sine, drifting_unevenly, narrowed, check_valve, silting, two_regimes, fluttering, choked,
+    blocked_at_times, lopsided, gulping
+)}  # fmt: skip

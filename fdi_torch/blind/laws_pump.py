@@ -152,29 +152,8 @@ def _irregular(time: float, period: Array) -> npt.NDArray[np.bool_]:
 
 
 # In the order in which they act: what replaces the command comes first.
-PUMP_LAWS = {
-    law.__name__: law
-    for law in (
-        late,
-        late_and_smeared,
-        late_and_slow,
-        slewing,
-        sticking,
-        backlash,
-        soft_threshold,
-        threshold,
-        bent,
-        scaled,
-        slow,
-        slow_in_two_poles,
-        shut_off_head,
-        falling,
-        drooping,
-        pulsating,
-        sputtering,
-        tiring,
-        stalling,
-        hard_limit,
-        rounded_limit,
-    )
-}
+PUMP_LAWS = {law.__name__: law for law in (
+    late, late_and_smeared, late_and_slow, slewing, sticking, backlash, soft_threshold, threshold, bent, scaled,
+    slow, slow_in_two_poles, shut_off_head, falling, drooping, pulsating, sputtering, tiring, stalling,
+    hard_limit, rounded_limit
+)}  # fmt: skip

@@ -126,25 +126,9 @@ def bursting(x: Array, time: Array, p: Numbers) -> Array:
     return out
 
 
-SENSOR_LAWS = {
-    law.__name__: law
-    for law in (
-        late_reading,
-        damped,
-        damped_twice,
-        bowed,
-        sticking_float,
-        leading,
-        kinked,
-        stretched,
-        offset,
-        jumped,
-        wandering,
-        creeping,
-        humming,
-        freezing,
-        clipped,
-    )
-} | {"clipped_reading": clipped}
+SENSOR_LAWS = {law.__name__: law for law in (
+    late_reading, damped, damped_twice, bowed, sticking_float, leading, kinked, stretched, offset, jumped, wandering,
+    creeping, humming, freezing, clipped,
+)} | {"clipped_reading": clipped}  # fmt: skip
 # A transmitter's own limit clips the noise with the level: it acts twice, on either side of the noise.
 READOUT_LAWS = {"bursting": bursting, "clipped_reading": clipped, "rounded": rounded}

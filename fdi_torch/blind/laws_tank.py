@@ -125,22 +125,8 @@ def heap(level: Array, p: Numbers) -> Array:
     return 1 - np.where((x >= 0) & (x <= 1), p["share"] * (1 - 0.5 * x), 0.0)
 
 
-TANK_LAWS = {
-    law.__name__: law
-    for law in (
-        hole,
-        floor_hole,
-        slot,
-        window,
-        tapped,
-        rectangular_weir,
-        notched_weir,
-        brim,
-        siphon,
-        cycling_user,
-        float_valve,
-        side_chamber,
-        splashing_in,
-    )
-}
+TANK_LAWS = {law.__name__: law for law in (
+    hole, floor_hole, slot, window, tapped, rectangular_weir, notched_weir, brim, siphon, cycling_user,
+    float_valve, side_chamber, splashing_in
+)}  # fmt: skip
 STORAGE_LAWS = {"cone": cone, "wedge": wedge, "block": block, "barrel": barrel, "heap": heap}

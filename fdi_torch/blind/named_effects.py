@@ -11,7 +11,7 @@ import numpy as np
 
 from fdi_torch.blind.deviation import Deviation
 from fdi_torch.blind.nominal_run import NominalRun
-from fdi_torch.plant.description import Tank
+from fdi_torch.blind.places import EFFECTS
 
 Draw = Callable[[NominalRun, str], Deviation]
 
@@ -111,8 +111,7 @@ def unmetered_flow(s: NominalRun, at: str) -> Deviation:
 def area_taper(s: NominalRun, at: str) -> Deviation:
     """The nominal cross-section is that at the floor, or that at half height."""
     slope = ((1 + s.either(0.15, 0.4)) ** 0.5 - 1) / s.tank(at, 0.98)
-    tank = s.plant.component(at)
-    half = 0.5 * tank.height if isinstance(tank, Tank) and s.rng.random() < 0.5 else 0.0
+    half = 0.5 * s.plant.tank(at).height if s.rng.random() < 0.5 else 0.0
     return Deviation("area_taper", at, s.one_of("cone", "wedge"), {"slope": slope, "reference": half})
 
 
@@ -164,32 +163,5 @@ def sensor_saturation(s: NominalRun, at: str) -> Deviation:
     return Deviation("sensor_saturation", at, s.one_of("clipped", "clipped_reading"), {"ceiling": ceiling})
 
 
-NAMED: dict[str, Draw] = {
-    draw.__name__: draw
-    for draw in (
-        pump_gain,
-        pump_dead_zone,
-        pump_saturation,
-        pump_lag,
-        pump_delay,
-        pump_back_pressure,
-        laminar_flow,
-        flow_exponent,
-        outlet_drop,
-        coefficient_drift,
-        plugging,
-        cross_flow,
-        leak,
-        unmetered_flow,
-        area_taper,
-        internal_body,
-        overflow,
-        sensor_bias,
-        sensor_gain,
-        sensor_lag,
-        sensor_drift,
-        sensor_quantization,
-        sensor_delay,
-        sensor_saturation,
-    )
-}
+NAMED: dict[str, Draw] = {name: globals()[name] for name in EFFECTS}
+"""The function of this file that draws each effect, by its name."""

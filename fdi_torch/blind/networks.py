@@ -16,12 +16,12 @@ from fdi_torch.blind.plants import CM, CM2, CM3, Rig
 from fdi_torch.blind.simulator import conductance
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 
-FEWEST, MOST = 3, 12
-LOWEST, HIGHEST = 0.15, 0.9
-INPUT_LOW, INPUT_HIGH = 0.1, 0.6
-_REACH = 3  # a tank joins one of so many before it: neither a star nor a row
+FEWEST, MOST = 3, 12  # tanks
+LOWEST, HIGHEST = 0.15, 0.9  # levels without any effect, relative to the rim
+INPUT_LOW, INPUT_HIGH = 0.1, 0.6  # commanded flow, as a share of max_flow
+_REACH = 3  # a tank is joined to one of the three before it, so that the network is neither a star nor a row
 _DISCHARGE, _TOLERANCE, _GRAVITY = 0.6, 0.03, 9.81
-_RESTING_HIGH, _RESTING_LOW = 0.62, 0.24  # of the rim: start levels are a quarter more or less than that
+_RESTING_HIGH, _RESTING_LOW = 0.62, 0.24  # resting levels relative to the rim; starts are up to a quarter off these
 _MOST_DRAWS = 1000
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.simulator import conductance
-from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
+from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class NominalRun:
 
     def area(self, tank: str) -> float:
         """Cross-section of the tank, m^2."""
-        return next(t.area for t in self.plant.tanks if t.name == tank)
+        return self.plant.tank(tank).area
 
     def tank(self, name: str, share: float) -> float:
         """The level below which the tank is for this share of the time, m."""
@@ -63,7 +63,7 @@ class NominalRun:
         return float(np.quantile(column, share))
 
     def span(self, tank: str) -> float:
-        """Lowest and highest level of the tank, m."""
+        """Range of the tank's level without its lowest and highest 2 %, m."""
         return self.tank(tank, 0.98) - self.tank(tank, 0.02)
 
     def tank_of(self, location: str) -> str:
@@ -78,18 +78,17 @@ class NominalRun:
     def head(self, pipe: str, share: float) -> float:
         """The driving head below which the pipe is for this share of the time, m."""
         tanks = [t.name for t in self.plant.tanks]
-        p = next(p for p in self.plant.pipes if p.name == pipe)
+        p = self.plant.pipe(pipe)
         head = self.levels[:, tanks.index(p.source)] - p.elevation
         if not p.is_outlet:
             head = head - (self.levels[:, tanks.index(p.target)] - p.elevation)
         return float(np.quantile(np.abs(head), share))
 
     def conductance_of(self, pipe: str) -> float:
+        """Discharge coefficient x bore x sqrt(2 g) of a pipe, m^2.5/s."""
         return float(conductance(self.plant)[[p.name for p in self.plant.pipes].index(pipe)])
 
     def conductance_at(self, tank: str) -> float:
-        """That of the pipe a leak of this tank is compared with."""
-        component = self.plant.component(tank)
-        reference = component.leak_reference if isinstance(component, Tank) else None
+        """Conductance of the pipe with which a leak of this tank is compared, m^2.5/s."""
         touching = [p.name for p in self.plant.pipes if tank in (p.source, p.target)]
-        return self.conductance_of(reference or touching[0])
+        return self.conductance_of(self.plant.tank(tank).leak_reference or touching[0])

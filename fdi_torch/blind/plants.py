@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fdi_torch.blind.scaling import SAME, Scales
+from fdi_torch.blind.scaling import BENCH, Scales
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 
 CM, CM2, CM3 = 1e-2, 1e-4, 1e-6
@@ -26,7 +26,7 @@ class Rig:
     input_high: float = 0.8
     noise_unit: float = 1.0 * CM
     full_size: PlantDescription | None = None
-    scales: Scales = SAME
+    scales: Scales = BENCH
     lowest: float = 0.0
     highest: float = 0.85
     rest: tuple[float, ...] | None = None
@@ -39,6 +39,12 @@ class Rig:
     def believed(self) -> PlantDescription:
         """The plant file for the diagnosis."""
         return self.full_size or self.plant
+
+    @property
+    def measured_tanks(self) -> list[int]:
+        """Index of the tank that each sensor measures."""
+        tanks = [t.name for t in self.plant.tanks]
+        return [tanks.index(s.tank) for s in self.plant.sensors]
 
     def __post_init__(self) -> None:
         if not 0 <= self.input_low < self.input_high <= 1:

@@ -17,9 +17,9 @@ import numpy as np
 from fdi_torch.blind.deviation import Array
 
 KINDS = ("white", "held", "slow")
-HOLDS = (15, 60)
-SHORTEST_TIME, LONGEST_TIME = 100.0, 600.0
-LEAST, MOST = 0.3, 3.0
+HOLDS = (15, 60)  # s
+SHORTEST_TIME, LONGEST_TIME = 100.0, 600.0  # correlation time, s
+LEAST, MOST = 0.3, 3.0  # root mean square change of the levels, over the sensors' noise
 
 
 @dataclass(frozen=True)

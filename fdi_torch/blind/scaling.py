@@ -42,7 +42,7 @@ class Scales:
         return {"time_s": self.time, "length_m": self.length, "area_m2": self.area}
 
 
-SAME = Scales()
+BENCH = Scales()
 
 
 def scales_of(plant: PlantDescription, time_scale: float) -> Scales:

@@ -60,7 +60,7 @@ def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> 
     kind, true = truth["kind"], _causes(truth["causes"], plant)
     causes = _causes(answer.get("causes"), plant)
     sets = [_causes(s, plant) for s in answer.get("ambiguity_set") or []] or ([causes] if causes else [])
-    verdict, denied = answer.get("verdict"), kind == "left_out"
+    verdict, is_left_out = answer.get("verdict"), kind == "left_out"
     row: Row = {
         "kind": kind,
         "truth": true,
@@ -70,16 +70,16 @@ def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> 
         "set_size": len(sets),
         "crash": verdict == "crash",
         **_stated(kind, true, answer, plant),
-        "utility": expected_utility(answer, sets, [] if denied else _with_names(true), plant),
+        "utility": expected_utility(answer, sets, [] if is_left_out else _with_names(true), plant),
     }
     if not true:
         alarm = verdict != "no_gap"
         return row | {"right": not alarm, "false_alarm": alarm, "named_wrong": verdict == "named"}
     row |= {"detected": verdict not in ("no_gap", "crash")} | judge_closure(truth, answer, plant)
-    outside_library = [("unknown", true[0][1])] if denied else [cause for cause in true if cause[0] == "unknown"]
+    outside_library = [("unknown", true[0][1])] if is_left_out else [cause for cause in true if cause[0] == "unknown"]
     if outside_library:
         where = [w["location"] for w in answer.get("where") or []]
-        named = [] if denied else _with_names(true)
+        named = [] if is_left_out else _with_names(true)
         return row | _judge_unknown(outside_library[0], named, causes, sets, verdict, where)
     row |= {"z": size_errors(truth, answer.get("causes") or (), plant)} if verdict in ("named", "ambiguous") else {}
     if kind == "messy":

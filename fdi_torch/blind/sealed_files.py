@@ -24,7 +24,7 @@ import numpy as np
 from fdi_torch.blind.case_readings import PARTS
 from fdi_torch.blind.cases import Case
 from fdi_torch.blind.deviation import Array
-from fdi_torch.blind.inputs import DECIMALS, command_unit
+from fdi_torch.blind.inputs import DECIMALS, command_unit, pumps_of_channels
 from fdi_torch.blind.plants import Rig
 from fdi_torch.blind.scaling import decimals
 from fdi_torch.plant.description import FLOW_KINDS, FaultPriority, PlantDescription, Sensor, Tank
@@ -41,10 +41,9 @@ def as_csv(rig: Rig, commands: Array, readings: Array, seal: str) -> str:
     commands (T, C) in the header's unit, readings (T, S) as levels in m, both of the simulated rig, one per second.
     """
     header, columns, places = ["t_s"], [np.arange(len(commands)) * rig.scales.time], [decimals(0, rig.scales.time)]
-    for i, channel in enumerate(rig.plant.channels()):
-        pump = next(p for p in rig.plant.pumps if p.channel == channel)
+    for i, pump in enumerate(pumps_of_channels(rig.plant)):
         unit, scale = command_unit(pump), rig.scales.command(pump)
-        header.append(f"{channel}_{unit}")
+        header.append(f"{pump.channel}_{unit}")
         columns.append(commands[:, i] * scale)
         places.append(decimals(DECIMALS[unit], scale))
     for i, sensor in enumerate(rig.plant.sensors):

@@ -12,7 +12,7 @@ from fdi_torch.blind.scaling import Scales
 from fdi_torch.blind.simulator import conductance
 from fdi_torch.blind.statistics import clopper_pearson, root_mean_square_interval
 from fdi_torch.parameters import unit_factor
-from fdi_torch.plant.description import PlantDescription, Pump, Sensor
+from fdi_torch.plant.description import PlantDescription
 
 NORMAL_95 = 1.96
 
@@ -35,8 +35,7 @@ def _reading(parameter: str, unit: str, number: str) -> Quantity:
     name, _, level = _number(parameter, unit, lambda n: n[number])
 
     def at_the_rig(numbers: Mapping[str, float], plant: PlantDescription, at: str, scales: Scales) -> float:
-        sensor = plant.component(at)
-        assert isinstance(sensor, Sensor)
+        sensor = plant.sensor(at)
         plain = sensor.unit == "m" and sensor.gain == 1 and sensor.offset == 0
         return level(numbers, plant, at, scales) if plain else math.nan
 
@@ -44,20 +43,19 @@ def _reading(parameter: str, unit: str, number: str) -> Quantity:
 
 
 def _dead_zone(numbers: Mapping[str, float], plant: PlantDescription, at: str, scales: Scales) -> float:
-    pump = plant.component(at)
-    assert isinstance(pump, Pump)
-    return numbers["zone"] * scales.flow if pump.gain_unit == "1" else math.nan
+    return numbers["zone"] * scales.flow if plant.metered_flow(at).gain_unit == "1" else math.nan
 
 
 def _leak(numbers: Mapping[str, float], plant: PlantDescription, at: str, scales: Scales) -> float:
     """Leak conductance as a share of the nominal capacity of the tank's reference pipe."""
     pipes = [p.name for p in plant.pipes]
-    reference = next((t.leak_reference for t in plant.tanks if t.name == at), None)
     first = next((p.name for p in plant.pipes if at in (p.source, p.target)), pipes[0])
-    return numbers["conductance"] * scales.bore / float(conductance(plant)[pipes.index(reference or first)])
+    reference = pipes.index(plant.tank(at).leak_reference or first)
+    return numbers["conductance"] * scales.bore / float(conductance(plant)[reference])
 
 
-SAME: dict[tuple[str, str], Quantity] = {
+# (effect, law of the hidden rig) -> the number of the law that is the same quantity as a parameter of the effect.
+COMPARABLE: dict[tuple[str, str], Quantity] = {
     ("pump_gain", "scaled"): _number("factor", "1", lambda n: n["gain"]),
     ("pump_dead_zone", "threshold"): ("dead_zone", "m^3/s", _dead_zone),
     ("pump_saturation", "hard_limit"): _number("limit", "m^3/s", lambda n: n["limit"]),
@@ -88,10 +86,10 @@ def size_errors(truth: Mapping[str, Any], causes: Iterable[Mapping[str, Any]], p
     scores = []
     for cause in causes:
         for d in truth.get("deviations", ()):
-            here = (d["effect"], d["location"])
-            if here not in true or here != (cause["effect"], cause["location"]) or (d["effect"], d["law"]) not in SAME:
+            here, law = (d["effect"], d["location"]), (d["effect"], d["law"])
+            if here not in true or here != (cause["effect"], cause["location"]) or law not in COMPARABLE:
                 continue
-            name, unit, value = SAME[d["effect"], d["law"]]
+            name, unit, value = COMPARABLE[law]
             amount = (cause.get("parameters") or {}).get(name) or {}
             expected = value(d["numbers"], plant, d["location"], scales)
             if amount.get("std") and math.isfinite(expected):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from fdi_torch.amounts import parameter_words
 from fdi_torch.cli.screen import Screen, log_words
-from fdi_torch.estimate.stretches import Stretch
-from fdi_torch.estimate.windows import WindowFault
+from fdi_torch.estimate.windows import Stretch, WindowFault
 from fdi_torch.jobs.windowed_fit import WindowedFit
 from fdi_torch.parameters import display_unit
 

@@ -1,108 +1,42 @@
-"""The effects: faults and unmodelled effects, one file each. A new effect needs its file and one entry in `EFFECTS`."""
+"""The effects: faults and unmodelled effects, one file each. A new effect needs its file and its name in `EFFECTS`."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 from difflib import get_close_matches
+from importlib import import_module
 
-from fdi_torch.effects.actuator_slew import ActuatorSlew
-from fdi_torch.effects.actuator_stuck import ActuatorStuck
-from fdi_torch.effects.area_taper import AreaTaper
-from fdi_torch.effects.coefficient_drift import CoefficientDrift
-from fdi_torch.effects.cross_flow import CrossFlow
-from fdi_torch.effects.evaporation import Evaporation
-from fdi_torch.effects.flow_exponent import FlowExponent
-from fdi_torch.effects.internal_body import InternalBody
-from fdi_torch.effects.laminar_flow import LaminarFlow
-from fdi_torch.effects.leak import Leak
-from fdi_torch.effects.net_outlet import NetOutlet
-from fdi_torch.effects.openness import Openness
-from fdi_torch.effects.outlet_drop import OutletDrop
-from fdi_torch.effects.overflow import Overflow
-from fdi_torch.effects.pipe_inertia import PipeInertia
-from fdi_torch.effects.plugging import Plugging
-from fdi_torch.effects.pump_back_pressure import PumpBackPressure
-from fdi_torch.effects.pump_curve import PumpCurve
-from fdi_torch.effects.pump_cut_out import PumpCutOut
-from fdi_torch.effects.pump_dead_zone import PumpDeadZone
-from fdi_torch.effects.pump_delay import PumpDelay
-from fdi_torch.effects.pump_gain import PumpGain
-from fdi_torch.effects.pump_lag import PumpLag
-from fdi_torch.effects.pump_offset import PumpOffset
-from fdi_torch.effects.pump_oscillation import PumpOscillation
-from fdi_torch.effects.pump_priming import PumpPriming
-from fdi_torch.effects.pump_saturation import PumpSaturation
-from fdi_torch.effects.sensor_bias import SensorBias
-from fdi_torch.effects.sensor_curvature import SensorCurvature
-from fdi_torch.effects.sensor_delay import SensorDelay
-from fdi_torch.effects.sensor_drift import SensorDrift
-from fdi_torch.effects.sensor_floor import SensorFloor
-from fdi_torch.effects.sensor_gain import SensorGain
-from fdi_torch.effects.sensor_hysteresis import SensorHysteresis
-from fdi_torch.effects.sensor_lag import SensorLag
-from fdi_torch.effects.sensor_oscillation import SensorOscillation
-from fdi_torch.effects.sensor_quantization import SensorQuantization
-from fdi_torch.effects.sensor_saturation import SensorSaturation
-from fdi_torch.effects.sensor_stuck import SensorStuck
-from fdi_torch.effects.unmetered_flow import UnmeteredFlow
-from fdi_torch.effects.valve_authority import ValveAuthority
-from fdi_torch.effects.valve_characteristic import ValveCharacteristic
-from fdi_torch.effects.valve_dead_zone import ValveDeadZone
-from fdi_torch.effects.valve_lag import ValveLag
-from fdi_torch.effects.valve_leak import ValveLeak
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription, with_tolerances
 from fdi_torch.plant.effect import Effect, Placement, fits, place_kind, place_kinds_of
 from fdi_torch.plant.network import TankNetwork
 
+
+def _loaded(name: str) -> Effect:
+    """The effect of a file: pump_lag.py holds the class PumpLag."""
+    found: Effect = getattr(import_module(f"fdi_torch.effects.{name}"), name.title().replace("_", ""))()
+    return found
+
+
 # Of two effects at one place, the earlier one acts first.
-EFFECTS: tuple[Effect, ...] = (
-    ActuatorStuck(),
-    ActuatorSlew(),
-    PumpLag(),
-    PumpDelay(),
-    PumpDeadZone(),
-    PumpPriming(),
-    ValveLag(),
-    ValveDeadZone(),
-    ValveCharacteristic(),
-    ValveAuthority(),
-    ValveLeak(),
-    PumpGain(),
-    PumpCurve(),
-    PumpBackPressure(),
-    PumpOscillation(),
-    PumpOffset(),
-    PumpCutOut(),
-    PumpSaturation(),
-    LaminarFlow(),
-    FlowExponent(),
-    OutletDrop(),
-    CoefficientDrift(),
-    Plugging(),
-    NetOutlet(),
-    Openness(),
-    PipeInertia(),
-    CrossFlow(),
-    Leak(),
-    UnmeteredFlow(),
-    Evaporation(),
-    Overflow(),
-    AreaTaper(),
-    InternalBody(),
-    SensorLag(),
-    SensorDelay(),
-    SensorHysteresis(),
-    SensorCurvature(),
-    SensorGain(),
-    SensorBias(),
-    SensorDrift(),
-    SensorOscillation(),
-    SensorStuck(),
-    SensorFloor(),
-    SensorSaturation(),
-    SensorQuantization(),
+EFFECTS: tuple[Effect, ...] = tuple(
+    _loaded(name)
+    for name in (
+        # of commands
+        *("actuator_stuck", "actuator_slew", "pump_lag", "pump_delay", "pump_dead_zone", "pump_priming"),
+        *("valve_lag", "valve_dead_zone", "valve_characteristic", "valve_authority", "valve_leak"),
+        # of flows
+        *("pump_gain", "pump_curve", "pump_back_pressure", "pump_oscillation", "pump_offset", "pump_cut_out"),
+        *("pump_saturation", "laminar_flow", "flow_exponent", "outlet_drop", "coefficient_drift", "plugging"),
+        *("net_outlet", "openness", "pipe_inertia", "cross_flow", "leak", "unmetered_flow", "evaporation", "overflow"),
+        # of cross-sections
+        *("area_taper", "internal_body"),
+        # of readings
+        *("sensor_lag", "sensor_delay", "sensor_hysteresis", "sensor_curvature", "sensor_gain", "sensor_bias"),
+        *("sensor_drift", "sensor_oscillation", "sensor_stuck", "sensor_floor", "sensor_saturation"),
+        "sensor_quantization",
+    )
 )
 
 

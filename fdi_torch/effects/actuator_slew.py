@@ -5,12 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.effect import Clock, Effect, Memory, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.plant.scales import time_scale
-from fdi_torch.plant.signals import Clock
 
 SLOWNESS_UNITS = {"m^3/s": "s^2/m^3", "V": "s/V", "A": "s/A", "1/s": "s^2", "1": "s"}
 
@@ -30,10 +27,9 @@ class ActuatorSlew(Effect):
     mistaken_for = ("pump_lag", "pump_delay", "valve_lag", "actuator_stuck")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        component = plant.component(place)
-        unit = component.command_unit if isinstance(component, MeteredFlow) else "1"
-        full = component.max_flow / component.gain if isinstance(component, MeteredFlow) else 1.0
-        slowest = 120.0 * time_scale(plant) / full
+        actuator = plant.flow(place)
+        unit = actuator.command_unit if isinstance(actuator, MeteredFlow) else "1"  # a valve's opening is 0 to 1
+        slowest = 120.0 * time_scale(plant) / actuator.full_command
         return (Parameter("slowness", SLOWNESS_UNITS[unit], 0.0, 0.0, slowest, meaning="time to move by one unit"),)
 
     def steady_memory(self, value: Tensor, p: Values) -> Memory:

@@ -1,25 +1,52 @@
-"""Clipping of noisy readings, for sensors with a lower or upper limit."""
+"""Base of the sensors with a lower or an upper limit, and the clipping of noisy readings there."""
 
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.effect import Values
+from fdi_torch.plant.constants import reading_at
+from fdi_torch.plant.effect import Effect, OperatingRange, Parameter, PlantDescription, Stage, Values
+from fdi_torch.plant.operating_range import interior_points
 
 LOGISTIC = math.sqrt(3.0) / math.pi  # scale of a logistic noise over its standard deviation
 LEAST = 1e-12
+NOISE_MEANING = "standard deviation of the noise that is clipped with the level"
 
 
-def noise_parameters(unit: str) -> tuple[Parameter, Parameter]:
-    """The standard deviation of the clipped noise, and the share of it that is added after the first limit."""
-    return (
-        Parameter("noise", unit, 0.0, 0.0, meaning="standard deviation of the noise that is clipped with the level"),
-        Parameter("behind", "1", 0.0, 0.0, 1.0, meaning="share of the noise added after a first limit"),
-    )
+class ReadingLimit(Effect):
+    """A limit of the reading, which is absent at its nominal value far outside the sensor's range.
+
+    upper: whether it is the greatest reading, or the least one. noise: standard deviation of the noise that is clipped
+    with the level. behind: share of it that is added after a first limit.
+    """
+
+    stage = Stage.READING
+    places = ("sensor",)
+    smooth = False
+    upper: ClassVar[bool]
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        sensor = plant.sensor(place)
+        outer, inner = (max, min) if self.upper else (min, max)
+        absent = outer(reading_at(plant, sensor, share) for share in (-1.0, 2.0))
+        furthest = inner(reading_at(plant, sensor, share) for share in (0.0, 1.0))
+        low, high = sorted((absent, furthest))
+        meaning = f"{'greatest' if self.upper else 'least'} reading"
+        return (
+            Parameter("limit", sensor.unit, absent, low, high, meaning=meaning),
+            Parameter("noise", sensor.unit, 0.0, 0.0, meaning=NOISE_MEANING),
+            Parameter("behind", "1", 0.0, 0.0, 1.0, meaning="share of the noise added after a first limit"),
+        )
+
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
+        low, high = operating_range.readings[place]
+        middle = 0.5 * (low + high)
+        half = (middle, high) if self.upper else (low, middle)
+        return [{"limit": limit} for limit in interior_points(half, 5)]
 
 
 def clipping_bias(beyond: Tensor, p: Values) -> Tensor:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import time_scale
 
 SMALL = 1e-4

@@ -6,10 +6,8 @@ import torch
 from torch import Tensor
 
 from fdi_torch.effects.laminar_flow import torricelli_share
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.operating_range import OperatingRange, interior_points
+from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
+from fdi_torch.plant.operating_range import interior_points
 
 VISCOUS = 0.75  # softness of a transition where viscous and inertial losses add up
 NARROWEST = 0.1  # largest transition head, as a share of the height

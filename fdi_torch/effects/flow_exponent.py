@@ -5,10 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import source_height
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
 
 TYPICAL, LEAST, MOST = 0.2, 0.02, 2.0  # reference head, as a share of the tank's height
 

@@ -5,10 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription, Tank
-from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.operating_range import OperatingRange
+from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
 
 EDGE_SHARE = 0.01
 LEAST_SHARE = 0.05
@@ -28,8 +25,7 @@ class InternalBody(Effect):
     mistaken_for = ("area_taper",)
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        tank = plant.component(place)
-        assert isinstance(tank, Tank)
+        tank = plant.tank(place)
         return (
             Parameter("area", "m^2", 0.0, 0.0, 0.9 * tank.area, meaning="cross-section of the body"),
             Parameter("bottom", "m", 0.2 * tank.height, 0.0, tank.height, meaning="level of the body's bottom"),
@@ -38,8 +34,7 @@ class InternalBody(Effect):
         )
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        tank = plant.component(place)
-        assert isinstance(tank, Tank)
+        tank = plant.tank(place)
         low, high = operating_range.levels[place]
         span = high - low
         sections = [(k / 4, 1 / 4) for k in range(4)] + [(k / 4, 1 / 2) for k in range(3)]

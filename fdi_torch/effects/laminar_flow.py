@@ -5,11 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import source_height
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.operating_range import OperatingRange, head_range
+from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
+from fdi_torch.plant.operating_range import head_range
 
 LEAST_RATIO = 1e-6  # transition head / head, below which the flow follows Torricelli's law for any softness
 SHARPEST = 0.002

@@ -5,10 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription, Tank
-from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.operating_range import OperatingRange, interior_points, onset_grid
+from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
+from fdi_torch.plant.operating_range import interior_points, onset_grid
 
 
 class Leak(Effect):
@@ -25,8 +23,7 @@ class Leak(Effect):
     mistaken_for = ("plugging", "net_outlet", "valve_leak", "unmetered_flow", "cross_flow", "overflow", "evaporation")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        tank = plant.component(place)
-        assert isinstance(tank, Tank)
+        tank = plant.tank(place)
         return (
             Parameter("size", "1", 0.0, 0.0, 1.0, meaning="capacity of the hole relative to the reference pipe"),
             Parameter("height", "m", 0.0, 0.0, 0.95 * tank.height, meaning="height of the hole above the floor"),

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Local, Stage, Values
+from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
 
 
 class Openness(Effect):

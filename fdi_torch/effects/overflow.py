@@ -6,10 +6,8 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription, Tank
-from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.operating_range import OperatingRange, interior_points
+from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
+from fdi_torch.plant.operating_range import interior_points
 from fdi_torch.plant.orifice import rim_strength, weir_flow
 
 
@@ -27,8 +25,7 @@ class Overflow(Effect):
     mistaken_for = ("pump_cut_out", "sensor_saturation", "leak", "pump_saturation")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        tank = plant.component(place)
-        assert isinstance(tank, Tank)
+        tank = plant.tank(place)
         into = [
             Parameter(
                 f"to_{t.name}",
@@ -48,8 +45,7 @@ class Overflow(Effect):
         )
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        tank = plant.component(place)
-        assert isinstance(tank, Tank)
+        tank = plant.tank(place)
         low, high = operating_range.levels[place]
         depths = [tank.height - level for level in (*interior_points((low, high), 6), high)]
         above = _above(place, plant)

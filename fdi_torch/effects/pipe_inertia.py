@@ -8,11 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import source_height
-from fdi_torch.plant.description import Pipe, PlantDescription
-from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.operating_range import OperatingRange
+from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import time_scale
 
 NO_FLOW = 1e-3  # share of the smoothed root's flow at its width, below which ratios of flows are not formed
@@ -110,6 +107,5 @@ def _flow_of_unit_state(local: Local) -> Tensor:
 
 def _length_per_second(plant: PlantDescription, place: str) -> float:
     """Length of a column whose time constant at the full head is 1 s, sqrt(2 g h) / C_d, m/s."""
-    pipe = plant.component(place)
-    assert isinstance(pipe, Pipe)
+    pipe = plant.pipe(place)
     return math.sqrt(2.0 * plant.gravity * source_height(plant, place)) / pipe.discharge_coefficient

@@ -5,11 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.constants import target_height
-from fdi_torch.plant.description import PlantDescription, Pump
-from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.operating_range import OperatingRange, interior_points
+from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
+from fdi_torch.plant.operating_range import interior_points
 
 EDGE_SHARE = 0.02
 
@@ -28,14 +25,13 @@ class PumpCutOut(Effect):
     mistaken_for = ("overflow", "pump_saturation", "sensor_saturation", "pump_back_pressure")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        height = target_height(plant, place)
+        height = plant.tank(plant.flow(place).target).height
         return (Parameter("level", "m", 2.0 * height, 0.05 * height, 2.0 * height, meaning="cut-off level"),)
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        pump = plant.component(place)
-        assert isinstance(pump, Pump)
-        low, high = operating_range.levels[pump.target]
-        least = 0.05 * target_height(plant, place)
+        tank = plant.tank(plant.flow(place).target)
+        low, high = operating_range.levels[tank.name]
+        least = 0.05 * tank.height
         return [{"level": max(level, least)} for level in interior_points((0.5 * (low + high), high), 4)]
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:

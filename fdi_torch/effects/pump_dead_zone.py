@@ -5,12 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.metered_flow import MeteredFlow
-from fdi_torch.plant.operating_range import OperatingRange
-from fdi_torch.plant.signals import Clock
+from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
 
 
 class PumpDeadZone(Effect):
@@ -26,15 +21,12 @@ class PumpDeadZone(Effect):
     mistaken_for = ("pump_offset", "evaporation", "unmetered_flow", "pump_gain", "pump_curve", "flow_exponent")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        pump = plant.component(place)
-        assert isinstance(pump, MeteredFlow)
-        full = pump.max_flow / pump.gain
+        pump = plant.metered_flow(place)
+        full = pump.full_command
         return (Parameter("dead_zone", pump.command_unit, 0.0, 0.0, full, meaning="command at which the pump starts"),)
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        pump = plant.component(place)
-        assert isinstance(pump, MeteredFlow)
-        full = pump.max_flow / pump.gain
+        full = plant.metered_flow(place).full_command
         return [{"dead_zone": share * full} for share in (0.03, 0.1, 0.25, 0.5, 0.9)]
 
     def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:

@@ -6,11 +6,8 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.effect import Clock, Effect, Memory, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import time_scale
-from fdi_torch.plant.signals import Clock
 
 
 class PumpLag(Effect):

@@ -5,10 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.metered_flow import MeteredFlow
+from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
 
 
 class PumpOffset(Effect):
@@ -24,8 +21,7 @@ class PumpOffset(Effect):
     mistaken_for = ("pump_dead_zone", "evaporation", "unmetered_flow", "pump_gain", "pump_curve", "flow_exponent")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        pump = plant.component(place)
-        assert isinstance(pump, MeteredFlow)
+        pump = plant.metered_flow(place)
         far = 0.5 * pump.max_flow
         return (Parameter("offset", "m^3/s", 0.0, -far, far, meaning="additional flow"),)
 

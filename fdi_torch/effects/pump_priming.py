@@ -5,12 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription, Pump
-from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.operating_range import OperatingRange
+from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import time_scale
-from fdi_torch.plant.signals import Clock
 
 # Hose volume as seconds at full command, for a time scale of 1 s: the upper bound, and the starting points of a fit.
 FULL_FOR = 20.0
@@ -39,7 +35,7 @@ class PumpPriming(Effect):
     mistaken_for = ("pump_delay", "unmetered_flow", "pump_dead_zone")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        pump = _pump(plant, place)
+        pump = plant.metered_flow(place)
         unit = {"m^3/s": "m^3", "1": "s"}.get(pump.command_unit, f"{pump.command_unit}*s")
         high = FULL_FOR * time_scale(plant) * pump.max_flow / pump.gain
         return (
@@ -62,7 +58,7 @@ class PumpPriming(Effect):
         )
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        pump = _pump(plant, place)
+        pump = plant.metered_flow(place)
         return [{"volume": seconds * time_scale(plant) * pump.max_flow / pump.gain} for seconds in STARTS]
 
     def steady_memory(self, value: Tensor, p: Values) -> Memory:
@@ -75,9 +71,3 @@ class PumpPriming(Effect):
         filling = (1.0 - p["passed"]) * value * clock.step
         taken = torch.where(value > 0.0, torch.minimum(missing, filling), torch.zeros_like(missing * filling))
         return value - taken / clock.step, (memory[0] + taken,)
-
-
-def _pump(plant: PlantDescription, place: str) -> Pump:
-    pump = plant.component(place)
-    assert isinstance(pump, Pump)
-    return pump

@@ -5,11 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.metered_flow import MeteredFlow
-from fdi_torch.plant.operating_range import OperatingRange, interior_points
+from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
+from fdi_torch.plant.operating_range import interior_points
 
 DRY = 1e-12  # m^3/s, or relative: counts as no flow
 SHARPEST = 1e-3  # rounding below which the limit is a kink
@@ -29,8 +26,7 @@ class PumpSaturation(Effect):
     mistaken_for = ("pump_gain", "actuator_stuck", "pump_curve", "pump_back_pressure", "pump_cut_out")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        pump = plant.component(place)
-        assert isinstance(pump, MeteredFlow)
+        pump = plant.metered_flow(place)
         full = pump.max_flow
         return (
             Parameter("limit", "m^3/s", full, 0.0, full, meaning="greatest flow of the pump"),
@@ -38,8 +34,7 @@ class PumpSaturation(Effect):
         )
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        pump = plant.component(place)
-        assert isinstance(pump, MeteredFlow)
+        pump = plant.metered_flow(place)
         commanded = tuple(min(max(pump.gain * u, 0.0), pump.max_flow) for u in operating_range.commands[pump.channel])
         return [{"limit": limit, "knee": 0.1} for limit in interior_points((commanded[0], commanded[1]), 7)]
 

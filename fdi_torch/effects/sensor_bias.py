@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import reading_span
-from fdi_torch.plant.description import PlantDescription, Sensor
-from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.operating_range import OperatingRange
-from fdi_torch.plant.signals import Clock
+from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
 
 
 class SensorBias(Effect):
@@ -26,8 +22,7 @@ class SensorBias(Effect):
     mistaken_for = ("sensor_gain", "laminar_flow", "flow_exponent", "outlet_drop", "sensor_drift")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        sensor = plant.component(place)
-        assert isinstance(sensor, Sensor)
+        sensor = plant.sensor(place)
         largest = 0.5 * reading_span(plant, sensor)
         return (
             Parameter("bias", sensor.unit, 0.0, -largest, largest, meaning="constant error of the reading"),
@@ -36,8 +31,7 @@ class SensorBias(Effect):
         )
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        sensor = plant.component(place)
-        assert isinstance(sensor, Sensor)
+        sensor = plant.sensor(place)
         bias = 0.02 * reading_span(plant, sensor)
         return [{"bias": bias}, {"bias": -bias}]
 

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import reading_at, reading_span
-from fdi_torch.plant.description import PlantDescription, Sensor
-from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.operating_range import OperatingRange
-from fdi_torch.plant.signals import Clock
+from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
 
 
 class SensorCurvature(Effect):
@@ -25,8 +21,7 @@ class SensorCurvature(Effect):
     mistaken_for = ("sensor_gain", "sensor_stuck", "sensor_bias", "sensor_saturation")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        sensor = plant.component(place)
-        assert isinstance(sensor, Sensor)
+        sensor = plant.sensor(place)
         far = 1.0 / reading_span(plant, sensor)  # beyond it, two levels would have the same reading
         unit = "1" if sensor.unit == "1" else f"1/{sensor.unit}"
         middle = reading_at(plant, sensor, 0.5)
@@ -38,8 +33,7 @@ class SensorCurvature(Effect):
         )
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        sensor = plant.component(place)
-        assert isinstance(sensor, Sensor)
+        sensor = plant.sensor(place)
         return [{"bend": share / reading_span(plant, sensor)} for share in (0.1, -0.1)]
 
     def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Stage, Values
+from fdi_torch.plant.effect import Effect, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import time_scale
 
 

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import reading_span
-from fdi_torch.plant.description import PlantDescription, Sensor
-from fdi_torch.plant.effect import Effect, Memory, Stage, Values
+from fdi_torch.plant.effect import Clock, Effect, Memory, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import time_scale
-from fdi_torch.plant.signals import Clock
 
 
 class SensorDrift(Effect):
@@ -24,8 +21,7 @@ class SensorDrift(Effect):
     mistaken_for = ("sensor_bias", "coefficient_drift", "sensor_curvature")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        sensor = plant.component(place)
-        assert isinstance(sensor, Sensor)
+        sensor = plant.sensor(place)
         rate = 3e-4 / time_scale(plant) * reading_span(plant, sensor)
         return (
             Parameter("rate", f"{sensor.unit}/s", 0.0, -rate, rate, meaning="rate of change of the reading's error"),

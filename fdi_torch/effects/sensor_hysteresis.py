@@ -5,11 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import reading_span
-from fdi_torch.plant.description import PlantDescription, Sensor
-from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.signals import Clock
+from fdi_torch.plant.effect import Clock, Effect, Memory, Parameter, PlantDescription, Stage, Values
 
 
 class SensorHysteresis(Effect):
@@ -26,8 +23,7 @@ class SensorHysteresis(Effect):
     mistaken_for = ("sensor_lag", "sensor_delay", "sensor_quantization")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        sensor = plant.component(place)
-        assert isinstance(sensor, Sensor)
+        sensor = plant.sensor(place)
         high = 0.1 * reading_span(plant, sensor)
         return (Parameter("play", sensor.unit, 0.0, 0.0, high, meaning="half the width of the band"),)
 

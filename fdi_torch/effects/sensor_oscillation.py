@@ -7,13 +7,9 @@ import math
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import reading_span
-from fdi_torch.plant.description import PlantDescription, Sensor
-from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.operating_range import OperatingRange
+from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import time_scale
-from fdi_torch.plant.signals import Clock
 
 
 class SensorOscillation(Effect):
@@ -29,8 +25,7 @@ class SensorOscillation(Effect):
     mistaken_for = ("pump_oscillation", "sensor_bias")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        sensor = plant.component(place)
-        assert isinstance(sensor, Sensor)
+        sensor = plant.sensor(place)
         high = 0.3 * reading_span(plant, sensor)
         scale = time_scale(plant)
         return (
@@ -40,8 +35,7 @@ class SensorOscillation(Effect):
         )
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        sensor = plant.component(place)
-        assert isinstance(sensor, Sensor)
+        sensor = plant.sensor(place)
         amplitude = 0.01 * reading_span(plant, sensor)
         periods = [time_scale(plant) * seconds for seconds in (5.0, 10.0, 30.0, 60.0, 120.0, 300.0)]
         return [{"amplitude": amplitude, "period": t, "phase": phase} for t in periods for phase in (-1.5, 1.5)]

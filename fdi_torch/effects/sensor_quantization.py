@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import reading_span
-from fdi_torch.plant.description import PlantDescription, Sensor
-from fdi_torch.plant.effect import Effect, Stage, Values
-from fdi_torch.plant.operating_range import OperatingRange
+from fdi_torch.plant.effect import Effect, OperatingRange, Parameter, PlantDescription, Stage, Values
 
 
 class SensorQuantization(Effect):
@@ -27,14 +24,12 @@ class SensorQuantization(Effect):
     mistaken_for = ("sensor_hysteresis",)
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        sensor = plant.component(place)
-        assert isinstance(sensor, Sensor)
+        sensor = plant.sensor(place)
         step = 0.1 * reading_span(plant, sensor)
         return (Parameter("step", sensor.unit, 0.0, 0.0, step, meaning="resolution of the reading"),)
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        sensor = plant.component(place)
-        assert isinstance(sensor, Sensor)
+        sensor = plant.sensor(place)
         return [{"step": share * reading_span(plant, sensor)} for share in (0.001, 0.003, 0.01, 0.03)]
 
     def resolution(self, p: Values) -> Tensor:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from fdi_torch.effects.stuck import Stuck
-from fdi_torch.plant.effect import Memory, Stage, Values
-from fdi_torch.plant.signals import Clock
+from fdi_torch.plant.effect import Clock, Memory, Stage, Values
 
 
 class SensorStuck(Stuck):

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Memory, Values
-from fdi_torch.plant.operating_range import OperatingRange, interior_points
+from fdi_torch.plant.effect import Effect, Memory, OperatingRange, Parameter, PlantDescription, Values
+from fdi_torch.plant.operating_range import interior_points
 
 
 class Stuck(Effect):

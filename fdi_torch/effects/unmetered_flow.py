@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
 from fdi_torch.plant.constants import flow_scale
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Local, Stage, Values
-from fdi_torch.plant.operating_range import OperatingRange
+from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import time_scale
 
 

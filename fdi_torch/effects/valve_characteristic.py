@@ -5,10 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import Parameter
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Memory, Stage, Values
-from fdi_torch.plant.signals import Clock
+from fdi_torch.plant.effect import Clock, Effect, Memory, Parameter, PlantDescription, Stage, Values
 
 LEAST_OPENING = 1e-6
 

@@ -1,41 +1,45 @@
 """Linear algebra of small vectors and matrices with results that are bit-for-bit independent of the batch size.
 
 All functions use elementwise operations in a fixed order, because library products and factorisations choose their
-order of summation by the shape of the whole batch. Leading dimensions (...) are batch dimensions.
+order of summation by the shape of the whole batch.
 """
 
 from __future__ import annotations
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 
-def row_sum(values: Tensor) -> Tensor:
-    """Pairwise sum over the last dimension, (..., N) -> (...), in an order that depends only on N."""
-    if values.shape[-1] == 0:
+def row_sum(values: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch"]:
+    """Pairwise sum over the last dimension, in an order that depends only on N."""
+    count, sums = values.shape[-1], values.clone()
+    if count == 0:
         return values.new_zeros(values.shape[:-1])
-    while values.shape[-1] > 1:
-        half = (values.shape[-1] + 1) // 2
-        second_half = torch.nn.functional.pad(values[..., half:], (0, 2 * half - values.shape[-1]))
-        values = values[..., :half] + second_half
-    return values[..., 0]
+    while count > 1:
+        half = (count + 1) // 2
+        sums[..., : count - half] += sums[..., half:count]
+        count = half
+    return sums[..., 0]
 
 
-def dot(a: Tensor, b: Tensor) -> Tensor:
-    """Inner product of vectors, (..., P), (..., P) -> (...)."""
+def dot(a: Float[Tensor, "*batch P"], b: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch"]:
+    """Inner product of vectors."""
     return row_sum(a * b)
 
 
-def apply(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Matrix times vector, (..., M, P), (..., P) -> (..., M)."""
+def apply(matrix: Float[Tensor, "*#batch M P"], vector: Float[Tensor, "*#batch P"]) -> Float[Tensor, "*#batch M"]:
+    """Matrix times vector."""
     return row_sum(matrix * vector[..., None, :])
 
 
-def solve_positive(matrix: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-    """Solve matrix x = right, (..., P, P), (..., P) -> (..., P), for positive definite matrices, by Gauss-Jordan.
+def solve_positive(
+    matrix: Float[Tensor, "*batch P P"], right: Float[Tensor, "*batch P"]
+) -> tuple[Float[Tensor, "*batch P"], Bool[Tensor, "*batch"]]:
+    """Solve matrix x = right for positive definite matrices, by Gauss-Jordan.
 
     There is no pivoting, which positive definite matrices of unit diagonal do not need. Also returns whether each
-    matrix is positive definite, (...) bool; if it is not, x is meaningless.
+    matrix is positive definite; if it is not, x is meaningless.
     """
     rows = torch.cat((matrix, right[..., None]), -1)
     is_positive = torch.ones(rows.shape[:-2], dtype=torch.bool, device=rows.device)

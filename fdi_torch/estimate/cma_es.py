@@ -113,8 +113,8 @@ class CmaEs:
         candidates = low + width * (state.mean[..., None, :] + state.step[..., None, None] * moved)
         candidates = reflected(candidates, low, state.high[..., None, :])
         if state.generation == 0 and state.guess.shape[-2]:
-            known = ((state.guess - low) / width - state.mean[..., None, :]) / state.step[..., None, None]
-            normal, moved = with_first_guess(normal, known), with_first_guess(moved, known)
+            given = ((state.guess - low) / width - state.mean[..., None, :]) / state.step[..., None, None]
+            normal, moved = with_first_guess(normal, given), with_first_guess(moved, given)
             candidates = with_first_guess(candidates, state.guess)
         return CmaTrial(candidates, normal, moved)
 
@@ -128,14 +128,14 @@ class CmaEs:
             earlier[..., None, None], torch.cat((state.population[..., :1, :], population[..., :-1, :]), -2), population
         )
         cost = torch.where(earlier[..., None], torch.cat((state.cost[..., :1], cost[..., :-1]), -1), cost)
-        told = replace(
+        after = replace(
             updated,
             population=population,
             cost=cost,
             generation=state.generation + 1,
             evaluations=state.evaluations + cost.shape[-1],
         )
-        return told.with_progress_counters(settings)
+        return after.with_progress_counters(settings)
 
 
 STRATEGY = CmaEs()
@@ -167,14 +167,14 @@ def _adapted(state: CmaState, normal: Tensor, moved: Tensor, cost: Tensor) -> Cm
     exponent = (k.c_step / k.damping * (length / k.length - 1)).clamp(max=1.0)
     # Factor by factor: the vectorised exponential rounds differently at the end of a tensor.
     factor = length.new_tensor([math.exp(e) for e in exponent.flatten().tolist()]).reshape(length.shape)
-    seen = total > 0
+    judged = total > 0
     return replace(
         state,
-        mean=torch.where(seen[..., None], state.mean + state.step[..., None] * shift, state.mean),
-        step=torch.where(seen, state.step * factor, state.step),
-        covariance=torch.where(seen[..., None, None], covariance, state.covariance),
-        step_path=torch.where(seen[..., None], step_path, state.step_path),
-        path=torch.where(seen[..., None], path, state.path),
+        mean=torch.where(judged[..., None], state.mean + state.step[..., None] * shift, state.mean),
+        step=torch.where(judged, state.step * factor, state.step),
+        covariance=torch.where(judged[..., None, None], covariance, state.covariance),
+        step_path=torch.where(judged[..., None], step_path, state.step_path),
+        path=torch.where(judged[..., None], path, state.path),
     )
 
 

@@ -30,19 +30,19 @@ class Quadratic:
     high: Tensor
 
     @property
-    def unit(self) -> Tensor:
-        """Scale of each parameter, 1 / sqrt(H_ii), (L, P); one where the cost has no curvature."""
+    def unit(self) -> Float[Tensor, "L P"]:
+        """Scale of each parameter, 1 / sqrt(H_ii); one where the cost has no curvature."""
         diagonal = self.curvature.diagonal(dim1=-2, dim2=-1)
         return torch.where(diagonal > 0, 1.0 / torch.where(diagonal > 0, diagonal, 1.0).sqrt(), 1.0)
 
-    def damped(self, damping: Tensor) -> Tensor:
-        """The scaled curvature with `damping` (L,) added to its diagonal, (L, P, P)."""
+    def damped(self, damping: Float[Tensor, " L"]) -> Float[Tensor, "L P P"]:
+        """The scaled curvature with `damping` added to its diagonal."""
         unit = self.unit
         eye = torch.eye(unit.shape[-1], dtype=unit.dtype, device=unit.device)
         return self.curvature * unit[..., :, None] * unit[..., None, :] + damping[..., None, None] * eye
 
-    def held(self) -> Tensor:
-        """Parameters at an active bound, (L, P) bool."""
+    def held(self) -> Bool[Tensor, "L P"]:
+        """Parameters at an active bound."""
         return held_back(self.theta, self.gradient, self.low, self.high)
 
 

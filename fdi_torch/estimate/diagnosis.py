@@ -197,7 +197,7 @@ def _inflows(
     return network.less_overflow(point, network.net_inflows(point, network.flows(point)))
 
 
-def lasting(residual: Float[Tensor, "S C"], weight: Float[Tensor, "S C"]) -> Float[Tensor, " C"]:
+def correlation_inflation(residual: Float[Tensor, "S C"], weight: Float[Tensor, "S C"]) -> Float[Tensor, " C"]:
     """Variance inflation of each channel due to correlated residuals, (C,): (1 + a) / (1 - a), a: lag-1 correlation.
 
     This is the ratio of an AR(1) spectrum at frequency zero to white noise of the same variance (Box & Jenkins 1970). A

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from fdi_torch.capacity import expect_room
@@ -19,10 +19,11 @@ from fdi_torch.estimate.draws import problem_seeds
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.strategy import SearchState, Strategy, state_from_dict, strategy_named
 
-__all__ = ["REASONS", "EvolutionResult", "EvolutionSettings", "Search", "evolve", "snapshot"]
+__all__ = ["REASONS", "EvolutionResult", "EvolutionSettings", "Search", "distant_members", "evolve", "snapshot"]
 
 Cost = Callable[[Tensor, Tensor], Tensor]
 
+APART = 0.05  # share of the box's width, see `distant_members`
 REASONS = ("running", "target", "converged", "stalled", "budget", "failed")
 _RUNNING, _TARGET, _CONVERGED, _STALLED, _BUDGET, _FAILED = range(len(REASONS))
 
@@ -118,6 +119,24 @@ def snapshot(search: Search) -> EvolutionResult:
     return EvolutionResult(
         **{name: value.unflatten(0, search.shape) if search.shape else value[0] for name, value in vars(flat).items()}
     )
+
+
+def distant_members(
+    population: Float[Tensor, "B N P"], cost: Float[Tensor, "B N"], width: Float[Tensor, " P"], count: int
+) -> Float[Tensor, "B K P"]:
+    """The best members (B, K, P) of populations (B, N, P), sorted by cost, that differ from each other; K = count.
+
+    Two members differ if they are further apart than `APART` times the box's width in some parameter. If too few
+    differ, the best is repeated.
+    """
+    usable = torch.isfinite(cost) & torch.isfinite(population).all(-1)
+    chosen = [population[:, 0]]
+    for _ in range(count - 1):
+        near = torch.stack([((population - c[:, None]) / width).abs().amax(-1) <= APART for c in chosen]).any(0)
+        differs = usable & ~near
+        next_best = population[torch.arange(len(population)), differs.to(torch.int8).argmax(-1)]
+        chosen.append(torch.where(differs.any(-1)[:, None], next_best, chosen[0]))
+    return torch.stack(chosen, dim=1)
 
 
 def stop_reason(state: SearchState, settings: EvolutionSettings) -> Int[Tensor, "*problems"]:

@@ -20,7 +20,8 @@ class EvolutionSettings:
 
     population: number of members N; None: that of `STRATEGIES`. More are safer where the cost has several minima.
     evaluations: budget of cost evaluations per problem.
-    parameter_tolerance: relative to the box's width; cost_tolerance: relative to the scale of the costs, `State.scale`.
+    parameter_tolerance: relative to the box's width; cost_tolerance: relative to the scale of the costs,
+    `SearchState.scale`.
     patience: number of generations without improvement after which a problem has stalled.
     target: cost at which the search stops. factor, rate: F and CR.
     memory, best_share, archive_share, smallest: H, p, r_arc and N_min of Tanabe & Fukunaga (2014).

@@ -72,25 +72,26 @@ class Fitting:
         """Whether the engine evaluates every integration step in Python, so that steps are expensive."""
         return self.engine == "reference"
 
-    def beginning(self, samples: int) -> Fitting:
-        """A copy that uses only the first `samples` samples of each recording."""
-        shortened = [r.stretch(0, samples) for r in self.recordings]
-        return replace(self, recordings=tuple(shortened))
+    def beginning(self, k: int, samples: int) -> Fitting:
+        """The problem of the first `samples` samples of recording k alone; `space` remains that of all recordings."""
+        recordings = (self.recordings[k].stretch(0, samples),)
+        own = (self.networks[k],), (self.own_spaces[k],), (self.columns[k],)
+        return replace(self, recordings=recordings, networks=own[0], own_spaces=own[1], columns=own[2])
 
-    def engines(self, step: float, adaptive: bool = False) -> list[Engine]:
-        """A simulation engine for each recording, with its samples.
+    def engines(self, step: float) -> list[Engine]:
+        """A simulation engine for each recording, with its samples, in steps of at most `step` s.
 
-        It takes steps of at most `step` s, or adaptive ones of about the same accuracy. Raises ValueError if step <= 0.
+        Raises ValueError if step <= 0.
         """
         numbers = range(len(self.recordings))
-        return [self._engine(k, self._experiment(k, step, adaptive), step, adaptive) for k in numbers]
+        return [self._engine(k, self._experiment(k, step, False), step, False) for k in numbers]
 
     def _experiment(self, k: int, step: float, adaptive: bool) -> Experiment:
         """Recording k on the grid of its simulation."""
         if not step > 0.0:
             raise ValueError(f"expected a positive integration step, got {step:g} s")
         recording = self.recordings[k]
-        uses_own_steps = not adaptive and self._takes_own_steps(recording, self.networks[k], step)
+        uses_own_steps = not adaptive and self._takes_own_steps(k, step)
         input_step = commensurate_step(INPUT_STEP * time_scale(self.plant), recording.interval)
         longest = input_step if adaptive or uses_own_steps else step
         step_control = _step_control(step, recording, self.plant) if uses_own_steps else None
@@ -107,17 +108,14 @@ class Fitting:
 
         The cost is then exact only up to the tolerance of the step control.
         """
-        return any(
-            self._takes_own_steps(recording, network, step)
-            for recording, network in zip(self.recordings, self.networks, strict=True)
-        )
+        return any(self._takes_own_steps(k, step) for k in range(len(self.recordings)))
 
-    def _takes_own_steps(self, recording: Recording, network: TankNetwork, step: float) -> bool:
+    def _takes_own_steps(self, k: int, step: float) -> bool:
         """True if step control per lane is cheaper than fixed steps, and the inputs are constant between samples."""
+        recording = self.recordings[k]
         steps = float(recording.time[-1] - recording.time[0]) / step
-        inputs_constant = recording.hold == "zero_order" and all(
-            p.effect.stage is not Stage.COMMAND for p in network.placements
-        )
+        acts_on_commands = any(p.effect.stage is Stage.COMMAND for p in self.networks[k].placements)
+        inputs_constant = recording.hold == "zero_order" and not acts_on_commands
         return inputs_constant and not self.is_slow and steps > OWN_STEP_COST * len(recording)
 
     def problem(

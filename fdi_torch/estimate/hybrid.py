@@ -10,22 +10,23 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from fdi_torch.estimate.diagnosis import Diagnosis, diagnose, lasting
+from fdi_torch.estimate.diagnosis import Diagnosis, correlation_inflation, diagnose
 from fdi_torch.estimate.evolution import EvolutionResult, Search, evolve
 from fdi_torch.estimate.fitting import Fitting
-from fdi_torch.estimate.hybrid_settings import HybridSettings, sparing
+from fdi_torch.estimate.hybrid_settings import HybridSettings, with_less_effort
 from fdi_torch.estimate.levenberg_marquardt import Progress
 from fdi_torch.estimate.misfit import unexplained_ratio
 from fdi_torch.estimate.objectives import Problem
 from fdi_torch.estimate.refined import Refined
 from fdi_torch.estimate.refinement import (
     ADAPTIVE_STEPS,
-    distant_members,
     nearest_to_nominal,
     refine_adaptively,
     refine_to_convergence,
+    starting_points,
     status_of,
     unrefined,
 )
@@ -76,11 +77,12 @@ def estimate_parameters(
     search continues from it and ends as the uninterrupted one would.
     """
     settings = settings or HybridSettings()
-    settings = sparing(settings) if fitting.is_slow else settings
+    settings = with_less_effort(settings) if fitting.is_slow else settings
     low, high = search_box(fitting)
     coarse, fine = pick_steps(fitting, settings, low, high)
-    result = search(fitting.problem(coarse, settings.objectives[0]), low, high, settings, seed, on_generation, resume)
-    starts = distant_members(result, low, high, settings.starts)
+    cost, box = fitting.problem(coarse, settings.objectives[0]).cost, (low[None], high[None])
+    result = evolve(cost, *box, settings.search, seed, on_generation=on_generation, resume=resume)
+    starts = starting_points(result, low, high, settings.starts)
     if settings.method == "none":
         refinement = unrefined(fitting, settings, starts, low, high, fine)
     elif settings.adaptive:
@@ -93,8 +95,8 @@ def estimate_parameters(
     return conclude(fitting, settings, result, refinement, (coarse, fine))
 
 
-def search_box(fitting: Fitting) -> tuple[Tensor, Tensor]:
-    """Bounds low, high (P,) of the search: each parameter's range, cut to four prior standard deviations about nominal.
+def search_box(fitting: Fitting) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
+    """Bounds low, high of the search: each parameter's range, cut to four prior standard deviations about nominal.
 
     Raises ValueError for an infinite or empty range.
     """
@@ -109,24 +111,25 @@ def search_box(fitting: Fitting) -> tuple[Tensor, Tensor]:
     return low, high
 
 
-def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Tensor) -> tuple[float, float]:
+def pick_steps(
+    fitting: Fitting, settings: HybridSettings, low: Float[Tensor, " P"], high: Float[Tensor, " P"]
+) -> tuple[float, float]:
     """Integration steps (s) of search and refinement.
 
     Prescribed steps are taken as given. Otherwise this is the longest step whose integration error, probed at points of
-    the box from low (P,) to high (P,), is within the tolerance.
+    the box from low to high, is within the tolerance.
     """
     points = probe_points(low, high)
     spans = [float(r.time[-1] - r.time[0]) for r in fitting.recordings]
     longest, scale = max(min(spans) / 20.0, 1e-6), time_scale(fitting.plant)
     shortest = min(range(len(spans)), key=spans.__getitem__)
     interval = fitting.recordings[shortest].interval
-    beginning = fitting.beginning(PROBE_SAMPLES)
+    beginning = fitting.beginning(shortest, PROBE_SAMPLES)
 
     def engine_at(step: float) -> Engine:
-        return beginning.engines(step)[shortest]
+        return beginning.engines(step)[0]
 
-    columns = fitting.columns[shortest]
-    recording_points = points[:, columns]
+    recording_points = points[:, fitting.columns[shortest]]
     coarse = settings.search_step
     readings = engine_at(min(longest, FIRST_STEP * scale)).readings(recording_points)
     std = readings.flatten(0, 1).std(dim=0).clamp(min=1e-12)
@@ -140,20 +143,6 @@ def pick_steps(fitting: Fitting, settings: HybridSettings, low: Tensor, high: Te
     return coarse, fine
 
 
-def search(
-    problem: Problem,
-    low: Tensor,
-    high: Tensor,
-    settings: HybridSettings,
-    seed: int,
-    on_generation: Callable[[Search], None] | None,
-    resume: Search | None = None,
-) -> EvolutionResult:
-    """Differential evolution on one problem in the box from low (P,) to high (P,), started afresh or resumed."""
-    low, high = low.unsqueeze(0), high.unsqueeze(0)
-    return evolve(problem.cost, low, high, settings.search, seed, on_generation=on_generation, resume=resume)
-
-
 def conclude(
     fitting: Fitting,
     settings: HybridSettings,
@@ -164,7 +153,8 @@ def conclude(
     """Compute estimate, diagnosis and goodness of fit at the refined optimum.
 
     Standard errors use each channel's noise level times sqrt((1 + a) / (1 - a)), with a the lag-1 correlation of the
-    residuals of each step (see `lasting`), because correlated residuals carry less information than independent ones.
+    residuals of each step, because correlated residuals carry less information than independent ones (see
+    `correlation_inflation`).
     """
     theta = refinement.theta
     lanes = torch.zeros(1, dtype=torch.int64)
@@ -177,7 +167,8 @@ def conclude(
         noise_ratios.append(unexplained_ratio(noise_level[0], term.data.known, term.data.weight))
     for term, noise_level in zip(problem.terms, problem.noise(theta, lanes), strict=True):
         residuals = term.data.known - term.engine.readings(term.theta(theta))[0]
-        inflated_noise.append(noise_level[0] * torch.sqrt(lasting(residuals, (term.data.weight > 0).to(residuals))))
+        inflation = correlation_inflation(residuals, (term.data.weight > 0).to(residuals))
+        inflated_noise.append(noise_level[0] * torch.sqrt(inflation))
     likelihood = problem.at_noise(inflated_noise)
     curvature = likelihood.linearise(theta, lanes).curvature[0]
     estimate = make_estimate(

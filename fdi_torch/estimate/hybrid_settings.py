@@ -41,7 +41,7 @@ class HybridSettings:
     adaptive: bool = False
 
 
-def sparing(settings: HybridSettings) -> HybridSettings:
+def with_less_effort(settings: HybridSettings) -> HybridSettings:
     """Reduce the effort for an engine that evaluates every integration step in Python.
 
     The search gets larger tolerances. The refinement uses an adaptive solver unless a step is prescribed.

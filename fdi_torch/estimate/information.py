@@ -60,13 +60,11 @@ class Certainty:
 def certainty(
     information: Float[Tensor, "*batch P P"],
     held: Bool[Tensor, "*batch P"] | None = None,
-    threshold: float = RELATIVE_EIGENVALUE,
 ) -> Certainty:
     """Covariance from the Fisher information (*batch, P, P), priors included: the Cramer-Rao bound at the estimate.
 
     held (*batch, P) bool: parameters taken as exactly known, such as those at an active bound. Their standard error is
     0 and they do not contribute to that of the others.
-    threshold: relative eigenvalue below which a direction is undetermined.
     """
     diagonal = information.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(diagonal > 0, 1.0 / torch.where(diagonal > 0, diagonal, 1.0).sqrt(), 1.0)
@@ -78,7 +76,7 @@ def certainty(
         scaled = torch.where(involves_held, torch.eye(scaled.shape[-1]).to(scaled), scaled)
     not_finite = ~torch.isfinite(scaled).all(-1).all(-1)[..., None, None]
     values, vectors = _eigen(torch.where(not_finite, torch.zeros_like(scaled), scaled))
-    undetermined = (values <= threshold * values[..., -1:].clamp(min=0.0)) | (values <= 0)
+    undetermined = (values <= RELATIVE_EIGENVALUE * values[..., -1:].clamp(min=0.0)) | (values <= 0)
     inverse = torch.where(undetermined, 0.0, 1.0 / torch.where(undetermined, 1.0, values))
     null = _recompose(vectors, undetermined.to(vectors))
     covariance = _recompose(vectors, inverse) * scale[..., :, None] * scale[..., None, :]

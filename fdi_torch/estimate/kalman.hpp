@@ -105,7 +105,7 @@ inline void backward(const Model& m, int64_t t, const double* __restrict z, doub
 template <int W>
 inline void look(const Model& m, int64_t t, const double* __restrict z, double* __restrict to) {
     std::fill(to, to + C * W, 0.0);
-    for (int i = 0; i < C * n; ++i)  // a channel shows few levels
+    for (int i = 0; i < C * n; ++i)  // a reading depends on few levels
         if (const double h = m.h[t * C * n + i]; h != 0.0)
             for (int k = 0; k < W; ++k) to[i / n * W + k] += h * z[i % n * W + k];
     for (int i = 0; i < LAYERS * C; ++i)

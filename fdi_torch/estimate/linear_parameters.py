@@ -22,7 +22,7 @@ def decomposed(
     return torch.linalg.qr(torch.cat([jacobian, rows]))
 
 
-def without(basis: Tensor, columns: Tensor) -> Tensor:
-    """Columns (N + P, K), or (N, K) with no influence on the priors, less what the basis explains of them."""
+def without(basis: Float[Tensor, "NP rank"], columns: Float[Tensor, "rows K"]) -> Float[Tensor, "NP K"]:
+    """Columns less what the basis explains of them; rows: N + P, or N for columns with no influence on the priors."""
     columns = torch.nn.functional.pad(columns, (0, 0, 0, len(basis) - len(columns)))
     return columns - basis @ (basis.T @ columns)

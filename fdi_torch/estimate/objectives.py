@@ -74,9 +74,9 @@ class Problem:
 
     def cost(self, theta: Float[Tensor, "L N P"], lanes: Int[Tensor, " L"]) -> Float[Tensor, "L N"]:
         """Cost (L, N) of the candidates theta (L, N, P) of the problems `lanes` (L,)."""
-        total = self._prior(theta)
+        total = self._prior(theta)[0]
         for term in self.terms:
-            data = of_lanes(term.data, lanes)
+            data = term.data.of(lanes)
             sums = term.engine.moments(term.theta(theta), data)
             if self.objective == "correlation":
                 total = total + correlation_loss(sums, data).sum(-1)
@@ -86,18 +86,15 @@ class Problem:
 
     def correlations(self, theta: Float[Tensor, "L N P"], lanes: Int[Tensor, " L"]) -> Float[Tensor, "L N C"]:
         """Correlation rho (18) of each channel of the first recording, (L, N, C)."""
-        data = of_lanes(self.terms[0].data, lanes)
+        data = self.terms[0].data.of(lanes)
         return 1.0 - correlation_loss(self.terms[0].engine.moments(self.terms[0].theta(theta), data), data)
 
     def linearise(self, theta: Float[Tensor, "L P"], lanes: Int[Tensor, " L"]) -> Linearisation:
         """Cost (L,), gradient (L, P) and Gauss-Newton curvature (L, P, P) at theta (L, P), priors included."""
-        precision = self._precision(theta)
-        deviation = torch.where(precision > 0, theta - self.space.nominal(theta), torch.zeros_like(theta))
-        cost = self._prior(theta)
-        gradient = precision * deviation
+        cost, gradient, precision = self._prior(theta)
         curvature = torch.diag_embed(precision.expand_as(theta))
         for term in self.terms:
-            data = of_lanes(term.data, lanes)
+            data = term.data.of(lanes)
             term_theta = term.theta(theta)
             gram = term.engine.gram(term_theta.unsqueeze(1), data).squeeze(1)
             if self.objective == "correlation":
@@ -119,41 +116,35 @@ class Problem:
         """
         levels = []
         for term in self.terms:
-            data = of_lanes(term.data, lanes)
+            data = term.data.of(lanes)
             squares = term.engine.moments(term.theta(theta.unsqueeze(1)), data)[:, 0, :, 1]
             lost_degrees = theta.shape[-1] / squares.shape[-1] / len(self.terms)
             levels.append(torch.sqrt(squares / (data.degrees - lost_degrees).clamp(min=1.0)))
         return levels
 
-    def _precision(self, theta: Tensor) -> Tensor:
-        return self.space.std(theta) ** -2
-
-    def _prior(self, theta: Tensor) -> Tensor:
-        precision = self._precision(theta)
+    def _prior(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost (*batch) of the priors at theta (*batch, P), its gradient (*batch, P), and the precisions (P,)."""
+        precision = self.space.std(theta) ** -2
         deviation = torch.where(precision > 0, theta - self.space.nominal(theta), torch.zeros_like(theta))
-        return 0.5 * (precision * deviation * deviation).sum(-1)
+        gradient = precision * deviation
+        return 0.5 * (gradient * deviation).sum(-1), gradient, precision
 
 
-def of_lanes(data: Readings, lanes: Tensor) -> Readings:
-    """The readings of the problems `lanes` (L,); readings that all problems share are returned unchanged."""
-    if data.values.dim() == 2:
-        return data
-    return Readings(data.values[lanes], data.weight[lanes], None if data.ar is None else data.ar[lanes])
-
-
-def spread_of(data: Readings) -> Tensor:
-    """Weighted sum of squared deviations of each channel from its mean, (C,) or (L, C)."""
+def spread_of(data: Readings) -> Float[Tensor, "*L C"]:
+    """Weighted sum of squared deviations of each channel from its mean."""
     return (data.weight * (data.known - data.centre.unsqueeze(-2)) ** 2).sum(-2)
 
 
-def known_noise(term: Term, lanes: Tensor) -> Tensor | None:
-    """Noise levels of the problems `lanes` (L,), as (C,) or (L, C); None if unknown."""
+def known_noise(term: Term, lanes: Int[Tensor, " L"]) -> Float[Tensor, "*L C"] | None:
+    """Noise levels of the problems `lanes`, common to all or one set each; None if unknown."""
     std = term.noise_std
     return std if std is None or std.dim() == 1 else std[lanes]
 
 
-def deviance(squares: Tensor, data: Readings, noise_std: Tensor | None) -> Tensor:
-    """Negative log-likelihood of each channel, (L, N, C), from its sum of squared residuals; constants are dropped.
+def deviance(
+    squares: Float[Tensor, "L N C"], data: Readings, noise_std: Float[Tensor, "*L C"] | None
+) -> Float[Tensor, "L N C"]:
+    """Negative log-likelihood of each channel from its sum of squared residuals; constants are dropped.
 
     Known noise: SSR / (2 sigma^2). Unknown noise, profiled out: n/2 log(SSR / n), n being the number of values.
     """
@@ -163,8 +154,10 @@ def deviance(squares: Tensor, data: Readings, noise_std: Tensor | None) -> Tenso
     return 0.5 * count * torch.log(squares / count.clamp(min=1.0) + _per_lane(_rounding_variance(data), squares))
 
 
-def likelihood_expansion(gram: Tensor, data: Readings, noise_std: Tensor | None) -> Linearisation:
-    """Gauss-Newton model of the negative log-likelihood, from the sums of products `Engine.gram` (L, C, P+3, P+3)."""
+def likelihood_expansion(
+    gram: Float[Tensor, "L C W W"], data: Readings, noise_std: Float[Tensor, "*L C"] | None
+) -> Linearisation:
+    """Gauss-Newton model of the negative log-likelihood, from the sums of products `Engine.gram`; W = P + 3."""
     squares = gram[..., -3, -3]
     cost = deviance(squares.unsqueeze(1), data, noise_std).squeeze(1).sum(-1)
     profiled = squares / data.degrees.clamp(min=1.0) + _rounding_variance(data)
@@ -173,8 +166,8 @@ def likelihood_expansion(gram: Tensor, data: Readings, noise_std: Tensor | None)
     return Linearisation(cost, -scaled[..., :-3, -3].sum(1), scaled[..., :-3, :-3].sum(1))
 
 
-def correlation_loss(sums: Tensor, data: Readings) -> Tensor:
-    """1 - rho of each channel (2020 paper, eq. 18) from sums of r, r^2, r y': (L, N, C, 3) -> (L, N, C).
+def correlation_loss(sums: Float[Tensor, "L N C 3"], data: Readings) -> Float[Tensor, "L N C"]:
+    """1 - rho of each channel (2020 paper, eq. 18) from the sums of r, r^2 and r y' (`Engine.moments`).
 
     Computed from 1 - rho^2 = (Syy Srr' - Sry^2) / (Syy Sff), which avoids cancellation as rho approaches 1. A constant
     prediction counts as uncorrelated, with a loss of 1.
@@ -191,10 +184,10 @@ def correlation_loss(sums: Tensor, data: Readings) -> Tensor:
     return torch.where(varies | ~torch.isfinite(ff), loss, torch.ones_like(loss))
 
 
-def correlation_expansion(gram: Tensor, data: Readings) -> Linearisation:
+def correlation_expansion(gram: Float[Tensor, "L C W W"], data: Readings) -> Linearisation:
     """Gauss-Newton model of the sum of 1 - rho = |z - f|^2 / 2; z, f: centred readings and predictions of unit norm.
 
-    gram (L, C, P+3, P+3): sums of products, see `Engine.gram`.
+    gram: sums of products, see `Engine.gram`; W = P + 3.
     """
     count = data.weight.sum(-2).expand(gram.shape[:-2])
     centred = gram - gram[..., :, -1:] * gram[..., -1:, :] / count[..., None, None]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 STATUSES = ("running", "converged", "stalled", "max_iterations", "failed", "abandoned")
@@ -54,11 +54,6 @@ class Refined:
     def statuses(self) -> list[str]:
         """Status of each member by name, flattened."""
         return [STATUSES[code] for code in self.status.flatten().tolist()]
-
-    def member(self, which: int) -> Refined:
-        """One member of a flat batch, as a batch of one."""
-        place = self.status.new_tensor([which])
-        return self._each(lambda value: value[place], None if self.state is None else self.state.lanes(place))
 
     def unflatten(self, shape: torch.Size) -> Refined:
         """Restore the batch shape from one flat leading dimension; `state` remains flat."""
@@ -110,12 +105,16 @@ def flat_box(
     return start.reshape(-1, parameters).clamp(low, high), low, high
 
 
-def held_back(theta: Tensor, gradient: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Active bounds, (..., P) bool: theta is at the bound, and the cost would decrease beyond it."""
+def held_back(
+    theta: Float[Tensor, "L P"], gradient: Float[Tensor, "L P"], low: Float[Tensor, "L P"], high: Float[Tensor, "L P"]
+) -> Bool[Tensor, "L P"]:
+    """Active bounds: theta is at the bound, and the cost would decrease beyond it."""
     return ((theta <= low) & (gradient >= 0)) | ((theta >= high) & (gradient <= 0))
 
 
-def typical_size(theta: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Scale of each parameter for the step tolerance, (..., P): width of the box, or |theta| without a finite box."""
+def typical_size(
+    theta: Float[Tensor, "L P"], low: Float[Tensor, "L P"], high: Float[Tensor, "L P"]
+) -> Float[Tensor, "L P"]:
+    """Scale of each parameter for the step tolerance: width of the box, or |theta| without a finite box."""
     width = high - low
     return torch.where(torch.isfinite(width), width, theta.abs())

@@ -11,14 +11,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fdi_torch.estimate.evolution import EvolutionResult
+from fdi_torch.estimate.evolution import EvolutionResult, distant_members
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid_settings import HybridSettings
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import Progress, RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.objectives import Problem
 from fdi_torch.estimate.refined import Refined
-from fdi_torch.estimate.uncertainty import make_estimate
 from fdi_torch.plant.scales import time_scale
 
 # A stalled refinement counts as converged if the predicted distance to the optimum is below this, in standard errors.
@@ -35,30 +34,21 @@ LOOSE_DECREASE, TIGHT_DECREASE = 1e-2, 1e-4
 MOST_MOVES, NEAREST_WITHIN = 10, 0.01
 
 
-def distant_members(search_result: EvolutionResult, low: Tensor, high: Tensor, count: int) -> Tensor:
-    """Starting points (K, P) of the refinement, K <= count, best first.
-
-    A member of the final population is selected if, in at least one parameter, it differs from every better selected
-    one by more than 5 % of the box's width.
-    """
-    population = search_result.population[0]
-    members = population[torch.isfinite(search_result.cost[0]) & torch.isfinite(population).all(-1)]
-    selected = [search_result.best[0]]
-    for member in members:
-        if len(selected) == count:
-            break
-        is_distant = [float(((member - t) / (high - low)).abs().max()) > 0.05 for t in selected]
-        if all(is_distant):
-            selected.append(member)
-    return torch.stack(selected)
+def starting_points(
+    search_result: EvolutionResult, low: Float[Tensor, " P"], high: Float[Tensor, " P"], count: int
+) -> Float[Tensor, "K P"]:
+    """Starting points of the refinement, K <= count: the best distant members of the search, best first."""
+    members = distant_members(search_result.population, search_result.cost, high - low, count)[0]
+    is_repeated = (members[1:] == members[0]).all(-1)
+    return torch.cat([members[:1], members[1:][~is_repeated]])
 
 
 def refine_to_convergence(
     fitting: Fitting,
     settings: HybridSettings,
-    starts: Tensor,
-    low: Tensor,
-    high: Tensor,
+    starts: Float[Tensor, "K P"],
+    low: Float[Tensor, " P"],
+    high: Float[Tensor, " P"],
     step: float,
     on_iteration: Callable[[Progress], None] | None,
 ) -> tuple[Refined, float]:
@@ -70,8 +60,8 @@ def refine_to_convergence(
 
     def run(theta: Tensor, at: float) -> Refined:
         linearise = fitting.problem(at, settings.objectives[1]).linearise
-        stop = near_enough(settings, TIGHT_DECREASE) if fitting.takes_own_steps(at) else settings.refine
-        return best_of(levenberg_marquardt(linearise, theta, low, high, stop, on_iteration))
+        stop = stopping_at(settings, TIGHT_DECREASE) if fitting.takes_own_steps(at) else settings.refine
+        return levenberg_marquardt(linearise, theta[None], low, high, stop, on_iteration).best()
 
     refinement = run(starts, step)
     while settings.refine_step is None and step > 2.0 * FINEST_STEP * time_scale(fitting.plant):
@@ -90,9 +80,9 @@ def refine_to_convergence(
 def refine_adaptively(
     fitting: Fitting,
     settings: HybridSettings,
-    starts: Tensor,
-    low: Tensor,
-    high: Tensor,
+    starts: Float[Tensor, "K P"],
+    low: Float[Tensor, " P"],
+    high: Float[Tensor, " P"],
     coarse: float,
     on_iteration: Callable[[Progress], None] | None,
 ) -> Refined:
@@ -102,8 +92,8 @@ def refine_adaptively(
     """
 
     def run(problem: Problem, theta: Tensor, decrease: float) -> Refined:
-        stop = near_enough(settings, decrease)
-        return best_of(levenberg_marquardt(problem.linearise, theta, low, high, stop, on_iteration))
+        stop = stopping_at(settings, decrease)
+        return levenberg_marquardt(problem.linearise, theta[None], low, high, stop, on_iteration).best()
 
     refinement = run(fitting.problem(coarse, settings.objectives[1]), starts, LOOSE_DECREASE)
     scale = time_scale(fitting.plant)
@@ -145,18 +135,12 @@ def unrefined(
     return levenberg_marquardt(problem.linearise, starts[:1], low, high, replace(settings.refine, iterations=0))
 
 
-def near_enough(settings: HybridSettings, decrease: float) -> RefineSettings:
+def stopping_at(settings: HybridSettings, decrease: float) -> RefineSettings:
     """Settings that stop the refinement as soon as the Newton decrement is below `decrease`.
 
     For a negative log-likelihood the decrement is d^2 / 2 with d the distance to the optimum in standard errors.
     """
     return replace(settings.refine, decrease_tolerance=max(settings.refine.decrease_tolerance, decrease))
-
-
-def best_of(refined: Refined) -> Refined:
-    """The member of lowest cost of a flat batch, as a batch of one; members whose cost is not finite rank last."""
-    cost = torch.where(torch.isfinite(refined.cost), refined.cost, torch.inf)
-    return refined.member(int(cost.argmin()))
 
 
 def status_of(refinement: Refined) -> str:
@@ -175,5 +159,4 @@ def status_of(refinement: Refined) -> str:
 
 def information_std(problem: Problem, theta: Float[Tensor, "one P"]) -> Float[Tensor, " P"]:
     """Standard errors (P,) from the Gauss-Newton curvature at theta (1, P); infinite for undetermined parameters."""
-    curvature = problem.linearise(theta, torch.zeros(1, dtype=torch.int64)).curvature[0]
-    return make_estimate(problem.space, theta[0], curvature).std
+    return certainty(problem.linearise(theta, torch.zeros(1, dtype=torch.int64)).curvature[0]).std

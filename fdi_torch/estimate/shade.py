@@ -19,14 +19,14 @@ TERMINAL = -1.0
 _SPREAD = 0.1
 
 
-def draw_rate(memory: Tensor, u: Tensor) -> Tensor:
-    """Draw CR ~ normal(memory, 0.1), clamped to [0, 1]; 0 from a terminal cell. memory (...); u (...) uniform. [1]"""
+def draw_rate(memory: Float[Tensor, "*batch"], u: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Draw CR ~ normal(memory, 0.1), clamped to [0, 1]; 0 from a terminal cell. u: uniform draws. [1]"""
     normal = math.sqrt(2.0) * torch.erfinv(2.0 * u - 1.0)
     return torch.where(memory == TERMINAL, 0.0, (memory + _SPREAD * normal).clamp(0.0, 1.0))
 
 
-def draw_factor(memory: Tensor, u: Tensor) -> Tensor:
-    """Draw F ~ Cauchy(memory, 0.1), conditional on F > 0, limited to 1. memory (...); u (...) uniform. [2]
+def draw_factor(memory: Float[Tensor, "*batch"], u: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Draw F ~ Cauchy(memory, 0.1), conditional on F > 0, limited to 1. u: uniform draws. [2]
 
     The paper redraws until F > 0. The inverse distribution function of the truncated distribution needs no loop.
     """
@@ -35,8 +35,8 @@ def draw_factor(memory: Tensor, u: Tensor) -> Tensor:
     return (memory + _SPREAD * torch.tan(math.pi * (probability - 0.5))).clamp(1e-12, 1.0)
 
 
-def lehmer_mean(values: Tensor, weights: Tensor) -> Tensor:
-    """Weighted Lehmer mean sum w S^2 / sum w S over the last dimension, (..., N) -> (...); 0 if sum w S is 0. [7]"""
+def lehmer_mean(values: Float[Tensor, "*batch N"], weights: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch"]:
+    """Weighted Lehmer mean sum w S^2 / sum w S over the last dimension; 0 if sum w S is 0. [7]"""
     weighted = weights * values
     denominator = row_sum(weighted)
     return torch.where(
@@ -44,8 +44,8 @@ def lehmer_mean(values: Tensor, weights: Tensor) -> Tensor:
     )
 
 
-def success_weights(gain: Tensor, success: Tensor) -> Tensor:
-    """Weights of the successful candidates, (..., N): improvement of the cost relative to the largest finite one.
+def success_weights(gain: Float[Tensor, "*batch N"], success: Bool[Tensor, "*batch N"]) -> Float[Tensor, "*batch N"]:
+    """Weights of the successful candidates: improvement of the cost relative to the largest finite one.
 
     Candidates without success have weight 0; a parent of infinite cost counts as the largest finite gain. The weights
     are not normalised to a sum of 1, because a common factor cancels in the Lehmer mean.
@@ -74,8 +74,8 @@ def update_memory(
     any_success = success.any(-1)
     at = cell[..., None]
     terminal = (memory_cr.gather(-1, at)[..., 0] == TERMINAL) | (torch.where(success, rate, 0.0).amax(-1) == 0.0)
-    new_cr = torch.where(terminal, TERMINAL, lehmer_mean(rate, weights))
-    new_f = lehmer_mean(factor, weights)
+    new_f, mean_cr = lehmer_mean(torch.stack([factor, rate]), weights.expand(2, *weights.shape))
+    new_cr = torch.where(terminal, TERMINAL, mean_cr)
     memory_f = torch.where(any_success[..., None], memory_f.scatter(-1, at, new_f[..., None]), memory_f)
     memory_cr = torch.where(any_success[..., None], memory_cr.scatter(-1, at, new_cr[..., None]), memory_cr)
     return memory_f, memory_cr, torch.where(any_success, (cell + 1) % memory_f.shape[-1], cell)

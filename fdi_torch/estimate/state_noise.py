@@ -41,6 +41,7 @@ class Likelihood:
 
     noise: StateNoise
     log_likelihood: float
+    start_log_likelihood: float
     converged: bool
     determined: Tensor
 
@@ -134,7 +135,7 @@ class _Problem:
         At each time the other noise parameters are optimised. with_time: sets the correlation time of a noise model.
         """
         middle = min(range(len(times)), key=lambda i: abs(times[i] - first_time))
-        best = self.solve(with_time(start, times[middle]))
+        first = best = self.solve(with_time(start, times[middle]))
         for step in (1, -1):
             i = middle + step
             while 0 <= i < len(times):
@@ -142,7 +143,7 @@ class _Problem:
                 if candidate.log_likelihood <= best.log_likelihood:
                     break
                 best, i = candidate, i + step
-        return best
+        return replace(best, start_log_likelihood=first.start_log_likelihood)
 
     def solve(self, start: StateNoise) -> Likelihood:
         """Maximise the profile likelihood over the logarithms of intensities, scales and wander, by L-BFGS-B."""
@@ -179,7 +180,7 @@ class _Problem:
             options={"ftol": LIKELIHOOD_TOLERANCE / samples, "gtol": LIKELIHOOD_TOLERANCE / samples},
         )
         noise, value = noise_at(optimum.x / unit), start_value - float(optimum.fun) * samples
-        return Likelihood(noise, value, bool(optimum.success), likeliest[1].determined)
+        return Likelihood(noise, value, start_value, bool(optimum.success), likeliest[1].determined)
 
     def likelihood(self, noise: StateNoise) -> tuple[float, Score]:
         """Profile log-likelihood of a noise model with the log prior of its intensities, and its score."""

@@ -8,8 +8,8 @@ A strategy is used by `evolve`, or alone:
         trial = strategy.ask(state, settings)
         state = strategy.tell(state, trial, cost(trial.candidates), settings)
 
-N: population size, P: parameters. Leading dimensions are independent problems; the results of each must be bit-for-bit
-those of running it alone, so that random numbers come from `draws` and sums from `batch_algebra`.
+N: population size, P: parameters. Leading dimensions are independent problems. The results of each must be bit-for-bit
+those of running it alone: random numbers therefore come from `draws`, and sums from `batch_algebra`.
 """
 
 from __future__ import annotations

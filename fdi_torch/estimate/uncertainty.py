@@ -12,15 +12,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.estimate.combinations import Combination, undetermined_groups
-from fdi_torch.estimate.information import RELATIVE_EIGENVALUE, certainty
+from fdi_torch.estimate.information import certainty
 from fdi_torch.parameters import Parameter, ParameterSpace, quantity_text
 
 if TYPE_CHECKING:
     from fdi_torch.estimate.posterior_draws import Draws
 
-# A value within this fraction of the range of a bound counts as at the bound.
-_AT_BOUND = 1e-9
-AT_END = 1e-3  # of a parameter's range: distance from an end that an estimate has reached
+# Distances from an end of a parameter's range, as a share of it: within the first, an estimate lies at the bound by
+# rounding; within the second, the range and not the data determined it.
+_AT_BOUND, AT_END = 1e-9, 1e-3
 
 
 @dataclass(frozen=True)
@@ -91,11 +91,10 @@ def make_estimate(
     status: str = "",
     noise_std: Tensor | None = None,
     reached: Mapping[str, Any] | None = None,
-    threshold: float = RELATIVE_EIGENVALUE,
 ) -> Estimate:
     """Make the estimate theta (P,) with uncertainties from the Fisher information (P, P) there, priors included.
 
-    threshold: relative eigenvalue below which a direction is undetermined. Raises ValueError for mismatched shapes.
+    Raises ValueError for mismatched shapes.
     """
     parameters = len(space)
     if theta.shape != (parameters,) or information.shape != (parameters, parameters):
@@ -103,7 +102,7 @@ def make_estimate(
             f"expected theta ({parameters},) and information ({parameters}, {parameters}), got {tuple(theta.shape)} "
             f"and {tuple(information.shape)}; make one estimate for each member of a batch"
         )
-    uncertainty = certainty(information, threshold=threshold)
+    uncertainty = certainty(information)
     groups = undetermined_groups(space, theta, uncertainty)
     return Estimate(
         names=space.names,
@@ -122,14 +121,12 @@ def make_estimate(
 
 def parameters_at_bounds(space: ParameterSpace, theta: Tensor) -> dict[str, str]:
     """'low' or 'high' by name, for each parameter whose value in theta (P,) is at a bound."""
-    at_bounds = {}
-    for p, value in zip(space, theta.tolist(), strict=True):
-        margin = _AT_BOUND * (p.high - p.low) if math.isfinite(p.high - p.low) else 0.0
-        if value <= p.low + margin:
-            at_bounds[p.name] = "low"
-        elif value >= p.high - margin:
-            at_bounds[p.name] = "high"
-    return at_bounds
+    pairs = zip(space, theta.tolist(), strict=True)
+    return {
+        p.name: "low" if end == p.low else "high"
+        for p, value in pairs
+        if (end := _end(p, value, _AT_BOUND)) is not None
+    }
 
 
 def end_reached(p: Parameter, value: float) -> float | None:
@@ -137,10 +134,16 @@ def end_reached(p: Parameter, value: float) -> float | None:
 
     The nominal value and physical limits are no ends in this sense: they are valid estimates.
     """
+    end = _end(p, value, AT_END)
+    return None if end in (p.nominal, *p.extremes) else end
+
+
+def _end(p: Parameter, value: float, share: float) -> float | None:
+    """The finite end of the range that the value lies within this share of it from, or beyond; None inside."""
     width = p.high - p.low
     for end, beyond in ((p.low, p.low - value), (p.high, value - p.high)):
-        margin = AT_END * (width if math.isfinite(width) else abs(end))
-        if math.isfinite(end) and end not in (p.nominal, *p.extremes) and beyond > -margin:
+        margin = share * (width if math.isfinite(width) else abs(end))
+        if math.isfinite(end) and beyond >= -margin:
             return end
     return None
 

@@ -1,4 +1,7 @@
-"""Estimate the suspected faults in each short window of a recording separately."""
+"""Estimates of the suspected faults in each short window of a recording, and the intervals in which a fault is present.
+
+Consecutive windows in which a fault is present are merged into one interval (stretch) with one size.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ REFINE = RefineSettings(iterations=40, decrease_tolerance=1e-6)
 START_SIZE = 0.3  # initial size of a fault, as a fraction of its range above nominal
 STEP_ERROR = 0.2  # admissible integration error, as a fraction of the sensor noise; it cannot accumulate in a window
 NOISE_FLOOR = 1e-6  # lower limit of the sensor noise, as a fraction of the reading span from floor to rim
-SIGNIFICANT_SIZE = 0.05  # smaller deviations from nominal do not count as a fault, as a fraction of the range
+SIGNIFICANT_SIZE = 0.05  # as a fraction of the range; a smaller deviation from nominal does not count as a fault
 INFORMATIVE_STD = 0.15  # a fault is undecidable if its standard error exceeds this fraction of the range
 EMPTY_LEVEL = 0.02  # fraction of its height below which a tank counts as empty; a leak is then unobservable
 State = Literal["present", "absent", "cannot tell"]
@@ -61,6 +64,23 @@ class Window:
     stop: float
     faults: tuple[WindowFault, ...]
     misfit: float
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Time interval in which a fault was present without interruption.
+
+    start, stop: s. size, std: merged estimate and standard error, in `unit`; std is infinite if most windows have no
+    finite one. flow: mean change of flow, m^3/s; None if the fault does not change a flow.
+    """
+
+    name: str
+    start: float
+    stop: float
+    size: float
+    std: float
+    flow: float | None
+    unit: str = "1"
 
 
 def noise_of(recording: Recording, plant: PlantDescription) -> Float[Tensor, " C"]:
@@ -124,9 +144,7 @@ def window_of(fitting: Fitting, std: Float[Tensor, " C"], suspects: Collection[s
     theta = refined.theta[best]
     residual = (data.values - engine.readings(theta.unsqueeze(0))[0]) * data.weight / std
     misfit = float(torch.sqrt((residual**2).sum() / data.weight.sum()))
-    assert refined.curvature is not None
-    held = None if refined.held is None else refined.held[best]
-    errors = certainty(refined.curvature[best], held=held).std * max(1.0, misfit)
+    errors = certainty(refined.curvature[best], held=refined.held[best]).std * max(1.0, misfit)
     levels = torch.stack([_mean_level(fitting, tank.name, data) for tank in fitting.plant.tanks])
     channels = recording.inputs[:, [recording.input_names.index(c) for c in fitting.plant.channels()]].mean(dim=0)
     faults = []
@@ -176,3 +194,40 @@ def state_of(size: float, std: float, width: float) -> State:
     if not std < INFORMATIVE_STD * width:
         return "cannot tell"
     return "present" if size > max(SIGNIFICANT_SIZE * width, 1.96 * std) else "absent"
+
+
+def stretches_of(windows: Sequence[Window]) -> list[Stretch]:
+    """All intervals in which faults are present, ordered by fault, then by time."""
+    intervals = []
+    for k, first in enumerate(windows[0].faults if windows else ()):
+        run: list[Window] = []
+        for window in [*windows, None]:
+            adjacent = window is not None and (not run or run[-1].start < window.start <= run[-1].stop + 1e-6)
+            if window is not None and adjacent and window.faults[k].state == "present":
+                run.append(window)
+                continue
+            if run:
+                intervals.append(_merged(first.name, [w.faults[k] for w in run], run[0].start, run[-1].stop))
+            run = [window] if window is not None and window.faults[k].state == "present" else []
+    return intervals
+
+
+def _merged(name: str, estimates: Sequence[WindowFault], start: float, stop: float) -> Stretch:
+    """Merge the estimates of one fault in consecutive windows.
+
+    The size is the mean m = sum w_i s_i, weighted by flow, with variance sum w_i^2 (std_i^2 + (s_i - m)^2). Windows
+    with an infinite standard error are excluded; if they are the majority, the result is the largest size, with
+    std = inf.
+    """
+    flows = [f.flow for f in estimates if f.flow is not None]
+    flow = sum(flows) / len(flows) if flows else None
+    finite = [f for f in estimates if math.isfinite(f.std)]
+    if 2 * len(finite) < len(estimates):
+        return Stretch(name, start, stop, max(f.size for f in estimates), math.inf, flow, estimates[0].unit)
+    size = torch.tensor([f.size for f in finite], dtype=torch.float64)
+    weight = torch.tensor([1.0 if f.flow is None else max(f.flow, 1e-12) for f in finite], dtype=torch.float64)
+    weight = weight / weight.sum()
+    mean = float((weight * size).sum())
+    std_of_window = torch.tensor([f.std for f in finite], dtype=torch.float64)
+    std = float(torch.sqrt((weight**2 * (std_of_window**2 + (size - mean) ** 2)).sum()))
+    return Stretch(name, start, stop, mean, std, flow, estimates[0].unit)

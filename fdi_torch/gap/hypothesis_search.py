@@ -54,12 +54,12 @@ class HypothesisSearch:
         for explanation in {e.key: e for e in (likeliest(named).explanation, result.null)}.values():
             hypotheses += self._with_discrepancies(explanation, self.places, likeliest(hypotheses))
         hypotheses = self._after_fits_at_unknowns(hypotheses)
-        found = self._climbed(likeliest(hypotheses))
-        best = likeliest([*hypotheses, *found])
+        trials = self._climbed(likeliest(hypotheses))
+        best = likeliest([*hypotheses, *trials])
         if best.discrepancy and any(at != best.discrepancy.location for _, at in best.explanation.key):
             alone = self._with_discrepancies(result.null, [best.discrepancy.location])
-            found += [*alone, *self._climbed(likeliest(alone))]
-        hypotheses += self._after_fits_at_unknowns(found, likeliest(hypotheses).weight)
+            trials += [*alone, *self._climbed(likeliest(alone))]
+        hypotheses += self._after_fits_at_unknowns(trials, likeliest(hypotheses).weight)
         least = likeliest(hypotheses).weight + math.log(RARE)
         return hypotheses + [law for h in hypotheses if h.weight > least for law in self._with_inexact_laws(h)]
 
@@ -77,13 +77,13 @@ class HypothesisSearch:
         if all((id(explanation), place) in self._evaluated for place in at):
             return [h for place in at for h in self._evaluated[id(explanation), place]]
         needed, rival = (self._needed(explanation, best), best.noise) if best else (-math.inf, None)
-        found = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed, rival)
+        localization = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed, rival)
         hypotheses = {
-            (id(explanation), d.location): self._with_discrepancy(explanation, d) for d in found.discrepancies
+            (id(explanation), d.location): self._with_discrepancy(explanation, d) for d in localization.discrepancies
         }
         self._evaluated |= hypotheses
         causes = causes_in_order(explanation.fit)
-        alone = CauseHypothesis(explanation, causes, explanation.log_weight + found.itself)
+        alone = CauseHypothesis(explanation, causes, explanation.log_weight + localization.itself)
         return [alone, *(h for each in hypotheses.values() for h in each)]
 
     def _with_discrepancy(self, explanation: RankedExplanation, at: LocalizedDiscrepancy) -> list[CauseHypothesis]:
@@ -91,33 +91,34 @@ class HypothesisSearch:
         causes = causes_in_order(explanation.fit)
         # A random flow into a tank may stand for the error of any flow there.
         plant, flow = self.pool.fitter.data.plant, at.noise.apart is not None
-        here = [c for c in causes if c[1] == at.location or (flow and at.location in tanks_of(c[1], plant))]
+        effects = [c for c in causes if c[1] == at.location or (flow and at.location in tanks_of(c[1], plant))]
         weight = explanation.log_weight + at.gain
-        if not here:
+        if not effects:
             return [CauseHypothesis(explanation, causes, weight + self._log_odds, at)]
-        error = relative_size(self.pool.fitter, explanation.fit, at.size, here)
+        random = at.predicted is None  # its size is not known
+        error = None if random else relative_size(self.pool.fitter, explanation.fit, at.size, effects)
         law, other = _shares([self._log_odds_of_law(error)])
-        other += sum(self._log_selection(place) for _, place in here)  # they describe a part of the other law
+        other += sum(self._log_selection(place) for _, place in effects)  # they describe a part of the other law
         return [
             CauseHypothesis(explanation, causes, weight + law, at, inexact=True),
-            CauseHypothesis(explanation, tuple(c for c in causes if c not in here), weight + other, at),
+            CauseHypothesis(explanation, tuple(c for c in causes if c not in effects), weight + other, at),
         ]
 
     def _log_selection(self, place: str) -> float:
         """Log probability of one of the effects at a place, if it is not a cause but describes a part of one."""
         return -math.log(len({o.cause for o in self.options if o.cause[1] == place}))
 
-    def _log_odds_of_law(self, error: float) -> float:
+    def _log_odds_of_law(self, error: float | None) -> float:
         return log_odds_of_law(error, self.pool.choices, len(self.places))
 
     def _climbed(self, best: CauseHypothesis) -> list[CauseHypothesis]:
         """Hypotheses with an effect fewer or more than the best, while that improves it."""
-        found: list[CauseHypothesis] = []
+        evaluated: list[CauseHypothesis] = []
         while True:
             trials = [*self._with_fewer_effects(best), *self._with_more_effects(best)]
-            found += trials
+            evaluated += trials
             if not trials or likeliest(trials).weight <= best.weight:
-                return found
+                return evaluated
             best = likeliest(trials)
 
     def _with_fewer_effects(self, best: CauseHypothesis) -> list[CauseHypothesis]:
@@ -152,8 +153,8 @@ class HypothesisSearch:
             fitter = with_disturbances(self.pool.fitter, fit, noise)
             evidence = log_likelihood(fitter, fit, fit.linearised) + log_prior(fit.key, self.pool.choices)
             explanation = RankedExplanation(replace(fit, cost=fitter.cost(fit)), fitter, noise, evidence)
-            if found := localize_beside(fitter, fit, noise, at, self._needed(explanation, best)):
-                hypotheses += self._with_discrepancy(explanation, found)
+            if discrepancy := localize_beside(fitter, fit, noise, at, self._needed(explanation, best)):
+                hypotheses += self._with_discrepancy(explanation, discrepancy)
         return hypotheses
 
     def _needed(self, explanation: RankedExplanation, best: CauseHypothesis) -> float:
@@ -178,36 +179,37 @@ class HypothesisSearch:
                 base = under.fit(Candidate(others, (h.fit.values_of(others),)), h.fit)
                 for fit in self.pool.fits_beside(under, base, at_place):
                     self.pool.evaluate(fit, replace(h.unknown.noise, wander=None))
-                here = [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
-                added += [law for e in here for law in self._with_discrepancies(e, [h.unknown.location], h)]
+                named = [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
+                added += [law for e in named for law in self._with_discrepancies(e, [h.unknown.location], h)]
         return [each for h in [*hypotheses, *added] for each in (self._among_known(h) if h.weight > least else [h])]
 
     def _among_known(self, h: CauseHypothesis) -> list[CauseHypothesis]:
         """The hypothesis, and those of single effects in place of its unknown, with its weight divided among them."""
         if h.unknown is None:
             return [h]
-        known = [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
-        errors = [self._law_error(e, h.explanation, h.unknown) for e in known]
+        named = [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
+        errors = [self._law_error(e, h.explanation, h.unknown) for e in named]
         *shares, other = _shares([self._log_odds_of_law(error) for error in errors])
-        named = [CauseHypothesis(e, causes_in_order(e.fit), h.weight + s) for e, s in zip(known, shares, strict=True)]
-        return [*named, replace(h, weight=h.weight + other)]
+        weights = [h.weight + share for share in shares]
+        known = [CauseHypothesis(e, causes_in_order(e.fit), w) for e, w in zip(named, weights, strict=True)]
+        return [*known, replace(h, weight=h.weight + other)]
 
     def _law_error(
-        self, known: RankedExplanation, explanation: RankedExplanation, unknown: LocalizedDiscrepancy
-    ) -> float:
-        """Relative error of the law of an effect if the unknown at its place is true.
+        self, named: RankedExplanation, explanation: RankedExplanation, unknown: LocalizedDiscrepancy
+    ) -> float | None:
+        """Relative error of the law of the effect that `named` has in place of an unknown, if the unknown is true.
 
-        It is 0 if the effect predicts as well by Akaike's criterion (1974), which costs one nat for each parameter.
+        None if the effect predicts as well by Akaike's criterion (1974), which costs one nat for each parameter.
         """
-        fitter, fit = self.pool.fitter, known.fit
-        better = self._log_likelihood(explanation) + unknown.log_likelihood - self._log_likelihood(known)
+        fitter, fit = self.pool.fitter, named.fit
+        better = self._log_likelihood(explanation) + unknown.log_likelihood - self._log_likelihood(named)
         if better <= unknown.parameters + len(explanation.fit.space) - len(fit.space):
-            return 0.0
+            return None
         if unknown.predicted is None:
             return math.inf
         difference = unknown.predicted - fit.linearised.readings[0]
         size = unexplained_norm(fitter, fit.space, fit.theta, fit.linearised.jacobian[0], difference)
-        return relative_size(fitter, fit, size, [c for c in known.key if c[1] == unknown.location])
+        return relative_size(fitter, fit, size, [c for c in named.key if c[1] == unknown.location])
 
     def _log_likelihood(self, explanation: RankedExplanation) -> float:
         fitter, fit = explanation.fitter, explanation.fit
@@ -222,9 +224,9 @@ class HypothesisSearch:
         explained: list[CauseHypothesis] = []
         fitter, fit = self.pool.fitter, h.explanation.fit
         for cause in h.causes:
-            here = [c for c in h.causes if c[1] == cause[1]]
-            if len(here) > 1:
-                error = relative_size(fitter, fit, influence(fitter, fit, [cause]), here)
+            at_place = [c for c in h.causes if c[1] == cause[1]]
+            if len(at_place) > 1:
+                error = relative_size(fitter, fit, influence(fitter, fit, [cause]), at_place)
                 reduced = self.pool.without(h.explanation, cause)
                 odds = log_prior(reduced.key, self.pool.choices) - log_prior(h.explanation.key, self.pool.choices)
                 weight = h.weight + odds + self._log_selection(cause[1]) + log_law_error(error)
@@ -246,7 +248,7 @@ def _without_discrepancy(h: CauseHypothesis, at: LocalizedDiscrepancy) -> Fitter
     return under.of(corrected)
 
 
-def _names_unknown(known: RankedExplanation, h: CauseHypothesis) -> bool:
+def _names_unknown(explanation: RankedExplanation, h: CauseHypothesis) -> bool:
     """Whether an explanation has one effect instead of the unknown of a hypothesis, and else the same causes."""
-    further = known.key - set(h.causes)
-    return known.key.issuperset(h.causes) and [at for _, at in further] == [h.unknown_at]
+    further = explanation.key - set(h.causes)
+    return explanation.key.issuperset(h.causes) and [at for _, at in further] == [h.unknown_at]

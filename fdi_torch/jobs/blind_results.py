@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.blind import Row, Tables, tables
-from fdi_torch.blind.benchmark import without_nan
 from fdi_torch.blind.score_tables import OWN, markdown
 from fdi_torch.blind.scored_rows import write_rows
 from fdi_torch.blind.sealed_files import manifest, read_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.disk import write_text
+from fdi_torch.estimate.uncertainty import plain_value
 from fdi_torch.logbook import RunLog
 from fdi_torch.recordings.source import file_sha256
 
@@ -28,7 +28,7 @@ def write_results(out: Path, rows: Sequence[Row], config: Mapping[str, Any], sou
     data = [{"path": str(path), "sha256": file_sha256(path)} for path in sources]
     scores = tables(rows)
     write_rows(out, rows)
-    write_text(out / "scores.json", json.dumps(without_nan(scores), indent=1) + "\n")
+    write_text(out / "scores.json", json.dumps(plain_value(scores, "scores"), indent=1) + "\n")
     write_text(out / "scores.md", markdown(scores, rows))
     _write_log(out / LOG, rows, scores, config, data)
     return scores

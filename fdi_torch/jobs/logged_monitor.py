@@ -15,7 +15,7 @@ from torch import Tensor
 from fdi_torch.amounts import parameter_words
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.gap.preprocess.acquisition import usable
-from fdi_torch.jobs.row_buffer import CLOCK
+from fdi_torch.jobs.monitor_rows import CLOCK
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.monitor.diagnosability import diagnosability
 from fdi_torch.monitor.events import FORMAT, Event

@@ -23,7 +23,7 @@ from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.jobs.live_batches import DelayWatch, LiveBatches
 from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
 from fdi_torch.jobs.logged_monitor import ALARM, LoggedMonitor, MonitorCallbacks, event_key
-from fdi_torch.jobs.row_buffer import (
+from fdi_torch.jobs.monitor_rows import (
     logged_origin,
     logged_rows,
     recording_of_rows,
@@ -77,6 +77,8 @@ def run_monitor(
                 _follow(monitor, callbacks, _source(run, idle, origin, earlier_rows, zeros), earlier_rows, zeros)
             else:
                 show_clock([whole.clock_zero])
+                if run.config.recording.every > 1:  # the inputs' mean until the next kept sample is known only then
+                    whole = whole.stretch(0, len(whole) - 1)
                 monitor.process_recording(whole)
             monitor.close()
         finally:

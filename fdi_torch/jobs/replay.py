@@ -18,7 +18,7 @@ from fdi_torch.jobs import study as study_job
 from fdi_torch.jobs.gap import groups, run_gap
 from fdi_torch.jobs.logged_monitor import ALARM, LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.logged_recordings import logged_recording
-from fdi_torch.jobs.row_buffer import logged_rows, recording_of_rows, rows_until, samples_of_rows
+from fdi_torch.jobs.monitor_rows import logged_rows, recording_of_rows, rows_until, samples_of_rows
 from fdi_torch.jobs.run_setup import fitting_of, requested_space
 from fdi_torch.jobs.study import TRIAL, log_summary, log_trials
 from fdi_torch.jobs.train import STATE, Tell, estimate_logged, log_recordings, origin_of, state_is_due

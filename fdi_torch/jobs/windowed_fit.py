@@ -14,8 +14,7 @@ from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recording_config import StartLevel
 from fdi_torch.config.run_file import Run
 from fdi_torch.effects import without_startup_effects
-from fdi_torch.estimate.stretches import Stretch, stretches_of
-from fdi_torch.estimate.windows import Window, cut_up, noise_of, window_of, window_step
+from fdi_torch.estimate.windows import Stretch, Window, cut_up, noise_of, stretches_of, window_of, window_step
 from fdi_torch.jobs.log_paths import STARTS_OVER, free_path
 from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, requested_space
 from fdi_torch.jobs.train import log_recordings, origin_of

@@ -24,20 +24,18 @@ class Register:
         self._described: dict[str, tuple[frozenset[str], Channel]] = {}
         self._count: dict[str, int] = {}
 
-    def __contains__(self, topic: str) -> bool:
-        return topic in self._described
-
     def channel(
         self,
         topic: str,
         fields: Mapping[str, Any],
         message: Mapping[str, Any],
-        told_units: Mapping[str, str] | None = None,
+        named_units: Mapping[str, str] | None = None,
         about: Mapping[str, str] | None = None,
     ) -> Channel:
         """The topic's channel; a new one if the message has fields that the current one does not describe.
 
-        fields: as given. message: the same as plain values. about: further metadata, used with the first message.
+        fields: as given. message: the same as plain values. named_units: of fields beyond the topic's own. about:
+        further metadata, used with the first message.
         Raises ValueError for field names that the topic does not allow.
         """
         described, channel = self._described.get(topic, (frozenset(), None))
@@ -57,7 +55,7 @@ class Register:
             "unit.t": "s",
             **units,
             **previous,
-            **units_of(told_units),
+            **{f"unit.{name}": unit for name, unit in (named_units or {}).items()},
             **(about or {}),
         }
         schema = json_schema(definition, named)
@@ -87,11 +85,6 @@ class Register:
             properties = orjson.loads(channel.schema_data)["properties"]
             self._described[channel.topic] = (frozenset(properties), channel)
         self._count[channel.topic] = sequence + 1
-
-
-def units_of(units: Mapping[str, str] | None) -> dict[str, str]:
-    """Units as channel metadata: {"h1": "m"} -> {"unit.h1": "m"}."""
-    return {f"unit.{name}": unit for name, unit in (units or {}).items()}
 
 
 def _check_names(topic: str, definition: Topic, named: Mapping[str, Kind]) -> None:

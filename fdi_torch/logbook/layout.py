@@ -17,7 +17,7 @@ from fdi_torch.logbook.reader import Run
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _PLAIN_TOPIC = re.compile(r"(/[A-Za-z0-9_-]+)+")
-_BESIDE = ("_statistic", "_threshold", "_low", "_high")
+_COMPANIONS = ("_statistic", "_threshold", "_low", "_high")
 _COST = {
     "/estimator/de/generation": ("Search", "generation", ("best_cost", "mean_cost")),
     "/estimator/refine/iteration": ("Refinement", "iteration", ("cost",)),
@@ -143,8 +143,8 @@ def _cost_plots(fields: Fields) -> list[Panel]:
 
 def _signals(present: Mapping[str, str]) -> list[tuple[str, str]]:
     """The fields that are signals of their own, with their units."""
-    beside = {name + end for name in present for end in _BESIDE}
-    return [(name, unit) for name, unit in present.items() if name not in _SECONDS and name not in beside]
+    companions = {name + end for name in present for end in _COMPANIONS}
+    return [(name, unit) for name, unit in present.items() if name not in _SECONDS and name not in companions]
 
 
 def _title(name: str, topic: str, unit: str) -> str:

@@ -156,7 +156,7 @@ class Messages:
             named = [names for _, _, names, *_ in signals]
             channels, sequences = self.register.next_numbers(topics, len(clock))
             encoded = [_rows(*parts, clock.tolist()) for parts in zip(named, blocks, hidden, strict=True)]
-            self.put(_in_turn(channels, sequences, log_times.tolist(), encoded))
+            self.put(_interleaved(channels, sequences, log_times.tolist(), encoded))
         self._latest = max(self._latest, float(time.max())) if len(time) else self._latest
 
     def follow_on(self, channel: Channel, sequence: int, t: float) -> None:
@@ -165,7 +165,7 @@ class Messages:
         self._latest = max(self._latest, t)
 
 
-def _in_turn(
+def _interleaved(
     channels: Sequence[Channel],
     sequences: Sequence[int],
     log_times: Sequence[int],

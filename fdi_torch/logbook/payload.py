@@ -28,15 +28,11 @@ _PACKED = {"f": "<f8", "i": "<i8", "u": "<i8", "b": "|b1"}
 _DTYPES = ("<f8", "<i8", "|u1", "|b1")
 
 
-def encode(fields: Mapping[str, Any]) -> bytes:
-    """JSON of plain numbers, strings, arrays and tensors; None is omitted."""
-    return orjson.dumps(plain(fields))
-
-
 def as_it_is(message: Mapping[str, Any]) -> bytes | None:
-    """Fast path of `encode` for plain numbers, texts and homogeneous flat lists; None for other messages.
+    """Fast path for plain numbers, texts and homogeneous flat lists; None for other messages.
 
-    The bytes are those of `encode`. A message with a non-finite number, which JSON would show as null, also gets None.
+    The bytes are those of orjson.dumps(plain(message)). A message with a non-finite number, which JSON would show as
+    null, also gets None.
     """
     kinds = set(map(type, message.values()))
     if list in kinds:
@@ -49,7 +45,7 @@ def as_it_is(message: Mapping[str, Any]) -> bytes | None:
         return None
     try:
         data = orjson.dumps(message, option=orjson.OPT_STRICT_INTEGER)
-    except TypeError:  # an integer that is too large; `encode` reports it
+    except TypeError:  # an integer that is too large; `plain` reports it
         return None
     return None if b"null" in data else data
 

@@ -153,7 +153,7 @@ def _deviations(then: Message | None, now: Message | None) -> Iterator[_Deviatio
 def _unequal(name: str, then: Any, now: Any) -> Iterator[_Deviation]:
     """Deviations of a field: one per element of lists of equal length and of mappings, also within JSON texts."""
     if isinstance(then, str) and isinstance(now, str) and then != now:
-        then, now = _untold(then), _untold(now)
+        then, now = _parsed(then), _parsed(now)
     if isinstance(then, list) and isinstance(now, list) and len(then) == len(now):
         for place, (a, b) in enumerate(zip(then, now, strict=True)):
             yield from _unequal(f"{name}[{place}]", a, b)
@@ -164,7 +164,7 @@ def _unequal(name: str, then: Any, now: Any) -> Iterator[_Deviation]:
         yield _Deviation(name, then, now)
 
 
-def _untold(text: str) -> Any:
+def _parsed(text: str) -> Any:
     """The value of a JSON text that is a mapping or a list; other texts unchanged."""
     if not text.startswith(("{", "[")):
         return text

@@ -26,9 +26,9 @@ class Topics(Messages):
         fields = {"event": event, "channel": channel, "message": message, **numbers}
         self.write("/observer/alarm", fields, t)
 
-    def population(self, generation: int, arrays: Mapping[str, Any], *, problem: int = 0) -> None:
+    def population(self, generation: int, arrays: Mapping[str, Any]) -> None:
         """The state of the search for its continuation: any numeric arrays, such as population and cost."""
-        fields: dict[str, Any] = {"problem": problem, "generation": generation}
+        fields: dict[str, Any] = {"problem": 0, "generation": generation}
         for name, array in arrays.items():
             fields |= pack(name, array)
         self.write("/estimator/de/population", fields, generation)
@@ -70,11 +70,9 @@ class Topics(Messages):
         fields = {"fault": fault, "location": location, "present": present, "message": message, **numbers}
         self.write("/diagnosis/fault", fields, t)
 
-    def gap_where(self, location: str, share: float, p_value: float | None = None, **numbers: Any) -> None:
-        """The probability that something is wrong at a component. In format 1: the share of the gap that it
-        explains.
-        """
-        self.write("/gap/where", {"location": location, "share": share, "p_value": p_value, **numbers})
+    def gap_where(self, location: str, share: float, **numbers: Any) -> None:
+        """The probability that something is wrong at a component; in format 1, the share of the gap it explains."""
+        self.write("/gap/where", {"location": location, "share": share, **numbers})
 
     def gap_verdict(self, answer: Named) -> None:
         """The diagnosis of a gap in the format `fdi_torch.gap/2`; numbers of its closure are fields of their own."""

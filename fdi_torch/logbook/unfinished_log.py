@@ -39,11 +39,9 @@ def unfinished(path: str | Path) -> Run | None:
     return read_run(aside, salvage=True) if aside else None
 
 
-def last_state(run: Run, problem: int = 0) -> tuple[int, dict[str, np.ndarray]] | None:
-    """The last logged state of one problem's search: generation and arrays; None if none was logged."""
+def last_state(run: Run) -> tuple[int, dict[str, np.ndarray]] | None:
+    """The last logged state of the search: generation and arrays; None if none was logged."""
     latest = None
     for message in run.messages(["/estimator/de/population"]):
-        payload = message.payload
-        if payload.get("problem", 0) == problem:
-            latest = payload
+        latest = message.payload
     return (int(latest["generation"]), unpack(latest)) if latest else None

@@ -85,7 +85,7 @@ class RunLog(Topics):
         self._size = 0
 
     def __enter__(self) -> RunLog:
-        _make_room(self.path)
+        _expect_free(self.path)
         self._started = self._clock()
         self._run["started"] = _wall_text(self._started)
         self._run["run_id"] = _sha256(repr((self._run, self._start_records)))[:16]
@@ -157,7 +157,7 @@ class RunLog(Topics):
         """Write encoded messages; all methods of `Topics` call it."""
         with self._lock:
             sink = self._open_sink()
-            sink.messages(messages if self._listener is None else self._heard(messages, self._listener))
+            sink.messages(messages if self._listener is None else self._forwarding(messages, self._listener))
             self._note_progress()
 
     def carry_over(self, messages: Iterable[Message]) -> int:
@@ -170,7 +170,7 @@ class RunLog(Topics):
         return count
 
     @staticmethod
-    def _heard(messages: Iterable[Timed], listener: Listener) -> Iterator[Timed]:
+    def _forwarding(messages: Iterable[Timed], listener: Listener) -> Iterator[Timed]:
         for message in messages:
             yield message
             listener(message[0], message[1], message[4])
@@ -224,7 +224,7 @@ class RunLog(Topics):
         sink.finish()
 
 
-def _make_room(path: Path) -> None:
+def _expect_free(path: Path) -> None:
     if path.suffix != ".mcap":
         raise ValueError(f"{path}: expected a log name that ends in .mcap; rename it")
     try:

@@ -16,6 +16,7 @@ from fdi_torch.monitor.event_text import EventWriter
 from fdi_torch.monitor.events import Event, Kind
 from fdi_torch.monitor.explanations import Explainer
 from fdi_torch.monitor.hypothesis import HypothesisFit, merged
+from fdi_torch.monitor.isolation import SMALLEST_PROBABILITY
 from fdi_torch.monitor.known_faults import (
     STRONG_EVIDENCE,
     effect_of_value,
@@ -37,8 +38,6 @@ from fdi_torch.monitor.monitor_state import (
     adopt_sizes,
     normalized_residuals,
 )
-
-SMALLEST_PROBABILITY = 1e-3  # explanations below it are not fitted again
 
 
 class AlarmHandler:
@@ -81,7 +80,13 @@ class AlarmHandler:
         """Handle a crossing of the detector's threshold.
 
         It is a new alarm unless the latest change still explains the residual, or a known fault only changed its size.
+        It ends one that chance explains.
         """
+        if state.pending is not None:
+            number = state.pending.number
+            state, retired = self.retire(state, number, "the residual left its range again", announced=False)
+            state, events = self.on_threshold(state)
+            return state, [retired, *events]
         change = state.change
         if change is not None and self.explainer.is_current(state, change):
             fits = self.explainer.of_change(state, change)
@@ -109,7 +114,7 @@ class AlarmHandler:
         if change is not None and self.explainer.is_current(state, change):
             # The previous change may have been explained wrongly: one change that explains both alarms is preferred.
             fits = self.explainer.of_change(state, change)
-            if (fits[0].fits and fits[0].hypothesis.columns) or change.best.at_bound:
+            if fits[0].fits and fits[0].hypothesis.columns:
                 return self._same_change(state, change, fits)
         return self._isolate(state)
 
@@ -188,7 +193,9 @@ class AlarmHandler:
         number, attempts = state.pending.number, state.pending.attempts + 1
         waiting, events = replace(state, pending=PendingAlarm(number, attempts)), []
         if attempts == 1:
-            waiting = waiting.with_alarm(waiting.alarm(number).with_state(State.CANNOT_TELL))
+            waiting = replace(waiting, detector_memory=None).with_alarm(
+                waiting.alarm(number).with_state(State.CANNOT_TELL)
+            )
             events = [self.writer.unexplained(waiting, number, self.explainer.reported(fits))]
         if self.next_fit(waiting) - state.alarm(number).last <= self.settings.longest:
             return waiting, events

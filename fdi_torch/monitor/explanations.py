@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit, credible_set, merged
-from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.isolation import SMALLEST_PROBABILITY, isolate
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
 from fdi_torch.monitor.observer_bank import ObserverBank
@@ -36,28 +36,37 @@ class Explainer:
         return max(alarm_time - self.settings.lookback, state.valid_since)
 
     def of_alarm(self, state: MonitorState, alarm_time: float) -> list[HypothesisFit]:
-        """Explanations of an alarm, likeliest first.
-
-        The window is doubled while the onset lies at its beginning, because the change may have occurred before it.
-        """
-        start, earliest = self.search_start(state, alarm_time), max(state.valid_since, state.earliest_start)
-        while True:
-            fits = self._fits(state, start, state.believed)
-            at_start = fits[0].onset - start <= 2.0 * fits[0].onset_std and bool(fits[0].hypothesis.columns)
-            if not at_start or start <= earliest:
-                return fits
-            start = max(start - (state.now - start), earliest)
+        """Explanations of an alarm, likeliest first."""
+        start, since = self.search_start(state, alarm_time), max(state.valid_since, state.earliest_start)
+        return self._fits(state, start, since, state.believed)
 
     def of_change(self, state: MonitorState, change: DetectedChange) -> list[HypothesisFit]:
         """Explanations of the latest change, likeliest first; those it had are further initial guesses."""
-        start = max(change.best.onset - self.settings.lookback, change.since, state.reachable)
-        return self._fits(state, start, change.before, change.explanations)
+        since = max(change.since, state.reachable)
+        start, earliest = max(change.best.onset - self.settings.lookback, since), max(since, state.earliest_start)
+        return self._fits(state, start, earliest, change.before, change.explanations)
 
     def _fits(
-        self, state: MonitorState, start: float, believed: Tensor, earlier: Sequence[HypothesisFit] = ()
+        self,
+        state: MonitorState,
+        start: float,
+        earliest: float,
+        believed: Tensor,
+        earlier: Sequence[HypothesisFit] = (),
     ) -> list[HypothesisFit]:
-        s, healthy, window = self.settings, self.fault_free(believed), state.window(start)
-        return isolate(self.observer, window, believed, self.faults, s.incipient, s.together, healthy, earlier)
+        """Fits of all hypotheses since `start` s, likeliest first.
+
+        The window is doubled, up to `earliest` s, while the onset of a plausible one lies at its beginning: the change
+        may have occurred before it, and a fault that had grown before would not be an explanation.
+        """
+        s, healthy = self.settings, self.fault_free(believed)
+        while True:
+            window = state.window(start)
+            fits = isolate(self.observer, window, believed, self.faults, s.incipient, s.together, healthy, earlier)
+            plausible = [f for f in fits if f.hypothesis.columns and f.probability > SMALLEST_PROBABILITY]
+            if start <= earliest or all(f.onset - start > 2.0 * f.onset_std for f in plausible):
+                return fits
+            start = max(start - (state.now - start), earliest)
 
     def is_current(self, state: MonitorState, change: DetectedChange) -> bool:
         """Whether a change is recent enough to be fitted again."""

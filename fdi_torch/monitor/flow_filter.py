@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import ctypes
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from fdi_torch.monitor.observer_gain import Gain, Linear, kalman_gain, riccati, 
 from fdi_torch.simulate.build import load_library
 
 FREQUENCIES = 2048  # at which spectra are evaluated
+FIRST_TIME = 20.0  # correlation time at which the optimisation starts, in sampling intervals
 FIRST_UNIT = 0.1  # initial flow per sample of the optimisation, in standard deviations of a level's measurement noise
 
 
@@ -37,7 +39,9 @@ class FlowFilter:
 
     linear: transition A (n, n) and output C (sensors, n). noise: intensities of the tanks in m per sample. reading_std
     (sensors,): measurement noise. observer: the observer's gain. start_std (tanks,): of the initial levels, m.
-    interval: s. samples: number that the noise was learnt from.
+    interval: s. learnt (samples, sensors): what the residual that the noise was learnt from would have been without
+    the observer's corrections, NaN where a reading is missing. begins: number of samples that the observer had
+    processed before the filter starts, from unknown levels and flows.
     """
 
     linear: Linear
@@ -46,7 +50,13 @@ class FlowFilter:
     observer: Gain
     start_std: Tensor
     interval: float
-    samples: int
+    learnt: Tensor
+    begins: int = 0
+
+    @property
+    def samples(self) -> int:
+        """Number of samples that the noise was learnt from."""
+        return int(torch.isfinite(self.learnt).sum()) // self.learnt.shape[-1]
 
     @cached_property
     def transition(self) -> Tensor:
@@ -88,6 +98,22 @@ class FlowFilter:
         """Steady covariance of the predicted states and flows, (2 n, 2 n) m^2."""
         return riccati(self.joint, torch.diag(self.process_std**2), torch.diag(self.reading_std**2))
 
+    @property
+    def innovation_std(self) -> Tensor:
+        """Steady standard deviation (sensors,) of the innovations, in the readings' units."""
+        h = self.joint.output
+        return (torch.diagonal(h @ self.covariance @ h.mT) + self.reading_std**2).sqrt()
+
+    def learning_from(self, residual: Tensor, number: int) -> tuple[FlowFilter, float]:
+        """The filter for the noise that is most likely with what it was learnt from and further residuals, and the log
+        of that likelihood over the one of the present noise.
+
+        residual (S, sensors): scaled to the steady variance, of the observer's samples from `number` on, where the
+        filter starts anew: the state of one with other noise would not be known to the precision that its gain assumes.
+        """
+        further = _free_residual(self.linear, self.observer, residual, number)
+        return _likeliest(replace(self, begins=number), [self.learnt, further])
+
     @cached_property
     def spectra(self) -> Tensor:
         """Amplitudes of the white, unit innovations by tank flows and sensor noise, (FREQUENCIES, sensors, P).
@@ -119,11 +145,6 @@ class FlowFilter:
         information[:tanks, :tanks] += (eye - 1.0 / tanks) / (2.0 * SCATTER) ** 2
         return torch.linalg.inv(information + torch.eye(len(information), dtype=eye.dtype) / (2.0 * LOG_BOUND) ** 2)
 
-    @property
-    def intensity_error(self) -> Tensor:
-        """Standard error of ln of the intensity of each tank's flow, (tanks,)."""
-        return 0.5 * torch.diagonal(self.covariance_of_variances)[: len(self.noise.intensity)].sqrt()
-
     def error_of_sums(self, length: int) -> Tensor:
         """Standard error (sensors,) of ln of the standard deviation of sums of `length` innovations.
 
@@ -149,19 +170,20 @@ class FlowFilter:
         each sample.
 
         residual (*batch, S, sensors): scaled to the steady variance (`Observation.steady_residual`). number: samples
-        of the run before the first. memory (*batch, 2 n): state before the first sample, 0 at the start of a run.
+        of the run before the first. memory (*batch, 2 n): state before the first sample, 0 where the filter starts.
         """
         batch, (count, channels) = residual.shape[:-2], residual.shape[-2:]
         n, lanes = len(self.linear.transition), batch.numel()
         raw = (residual * self.observer.spread(number, count)).reshape(lanes, count, channels).contiguous()
-        state = raw.new_zeros(2 * n) if memory is None else memory
+        state = raw.new_zeros(2 * n) if memory is None or number == self.begins else memory
         state = state.expand(*batch, 2 * n).reshape(lanes, -1).contiguous()
         out, path = torch.empty_like(raw), raw.new_empty(lanes, count, 2 * n)
-        tables = [self.gain.table(number, count).contiguous(), self.observer.table(number, count).contiguous()]
+        processed = number - self.begins
+        tables = [self.gain.table(processed, count).contiguous(), self.observer.table(number, count).contiguous()]
         fixed = [self.transition.contiguous(), self.linear.output.contiguous()]
         pointers = [ctypes.c_void_p(x.data_ptr()) for x in (*fixed, *tables, raw, state, out, path)]
         _library(n, channels).flow_filter(ctypes.c_int64(lanes), ctypes.c_int64(count), *pointers)
-        out = out.reshape(residual.shape) / self.gain.spread(number, count)
+        out = out.reshape(residual.shape) / self.gain.spread(processed, count)
         return out, path.reshape(*batch, count, 2 * n)
 
 
@@ -177,19 +199,39 @@ def estimate_flow_filter(
 
     reading_std (sensors,): first guess of the measurement noise. Raises BuildError without a compiler.
     """
-    mask = torch.isfinite(residual)
-    free, count = _free_residual(linear, observer, residual.nan_to_num()), len(residual)
-    repeated = [x.expand(count, *x.shape) for x in (linear.transition, forcing(linear.transition), linear.output)]
-    fresh = torch.arange(count) == 0
-    propagation = Propagation(repeated[0], repeated[1], repeated[2], interval, fresh, mask)
-    sensors = SensorNoise(reading_std, torch.zeros_like(reading_std))
+    first = StateNoise(_usual_flow(linear, reading_std, start_std), FIRST_TIME * interval, torch.ones_like(reading_std))
+    free = _free_residual(linear, observer, residual)
+    return _likeliest(FlowFilter(linear, first, reading_std, observer, start_std, interval, free), [free])[0]
+
+
+def _likeliest(start: FlowFilter, segments: Sequence[Tensor]) -> tuple[FlowFilter, float]:
+    """The filter with the most likely noise, by a search from that of `start` on, and the gain in log-likelihood.
+
+    segments (S, sensors): residuals without corrections, NaN where missing, each from unknown levels on.
+    """
+    linear, free = start.linear, torch.cat(list(segments))
+    count, tanks = len(free), len(start.start_std)
+    fresh, by_levels = torch.zeros(count, dtype=torch.bool), free.new_zeros(*free.shape, len(segments) * tanks)
+    first = 0
+    for k, segment in enumerate(segments):
+        last, fresh[first] = first + len(segment), True
+        moved = _by_initial_levels(linear, len(segment))[..., :tanks] * start.start_std
+        by_levels[first:last, :, k * tanks : (k + 1) * tanks] = moved
+        first = last
+    a, b, c = (x.expand(count, *x.shape) for x in (linear.transition, forcing(linear.transition), linear.output))
+    propagation = Propagation(a, b, c, start.interval, fresh, torch.isfinite(free))
+    sensors = SensorNoise(start.reading_std, torch.zeros_like(start.reading_std))
+    noise = replace(start.noise, scale=torch.ones_like(start.reading_std))
+    unit, ones = _usual_flow(linear, start.reading_std, start.start_std), free.new_ones(by_levels.shape[-1])
+    likely = estimate_state_noise(propagation, sensors, free.nan_to_num(), by_levels, ones, 0.0 * ones, unit, noise)
+    gain = likely.log_likelihood - likely.start_log_likelihood
+    return replace(start, noise=likely.noise, reading_std=likely.noise.scale * start.reading_std), gain
+
+
+def _usual_flow(linear: Linear, reading_std: Tensor, start_std: Tensor) -> Tensor:
+    """Order of magnitude of each tank's random flow, (tanks,) m per sample."""
     metres = reading_std / torch.linalg.vector_norm(linear.output, dim=-1)
-    unit = FIRST_UNIT * metres.median() * torch.ones_like(start_std)
-    ones = torch.ones_like(start_std)
-    by_levels = _by_initial_levels(linear, count)[..., : len(start_std)] * start_std
-    likely = estimate_state_noise(propagation, sensors, free, by_levels, ones, 0.0 * ones, unit)
-    read = int(mask.sum()) // mask.shape[-1]
-    return FlowFilter(linear, likely.noise, likely.noise.scale * reading_std, observer, start_std, interval, read)
+    return FIRST_UNIT * metres.median() * torch.ones_like(start_std)
 
 
 def _frequencies(like: Tensor) -> Tensor:
@@ -197,12 +239,14 @@ def _frequencies(like: Tensor) -> Tensor:
     return (torch.arange(FREQUENCIES, dtype=like.dtype) + 0.5) * math.pi / FREQUENCIES
 
 
-def _free_residual(linear: Linear, observer: Gain, residual: Tensor) -> Tensor:
+def _free_residual(linear: Linear, observer: Gain, residual: Tensor, number: int = 0) -> Tensor:
     """What the residual (S, sensors) would be without the observer's corrections: r_k + C xi_k, with
-    xi_{k+1} = A (xi_k + L_k r_k).
+    xi_{k+1} = A (xi_k + L_k r_k). NaN where a reading is missing, which makes no correction.
+
+    number: samples of the run before the first.
     """
-    raw = residual * observer.spread(0, len(residual))
-    steps = (observer.table(0, len(raw)) @ raw.unsqueeze(-1)).squeeze(-1)
+    raw = residual * observer.spread(number, len(residual))
+    steps = (observer.table(number, len(raw)) @ raw.nan_to_num().unsqueeze(-1)).squeeze(-1)
     shift, path = torch.zeros_like(steps[0]), []
     for step in steps:
         path.append(shift)

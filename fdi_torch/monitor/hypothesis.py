@@ -59,6 +59,11 @@ class Hypothesis:
         """The columns that are sizes of faults."""
         return tuple(c for c in self.columns if c not in self.shape)
 
+    @property
+    def count(self) -> int:
+        """Number of faults that change, where simultaneous recoveries count as one."""
+        return len(set(self.sizes) - set(self.recovered)) + bool(self.recovered)
+
     def with_fault(self, fault: Fault) -> Hypothesis:
         """The same with a further fault at the same onset."""
         columns, shape = {*self.columns, *fault.columns}, {*self.shape, *fault.shape}
@@ -90,13 +95,13 @@ class HypothesisFit:
 
     @property
     def fits(self) -> bool:
-        """Whether the innovations are no larger than noise and no estimate stopped at an end of its range."""
-        return 2.0 * self.misfit <= self.noise_limit and not self.at_bound
+        """Whether the innovations are no larger than noise."""
+        return 2.0 * self.misfit <= self.noise_limit
 
     @property
     def misfit_ratio(self) -> float:
         """Misfit relative to the expected misfit of pure noise; 1 if noise alone can explain the residuals."""
-        return max(2.0 * self.misfit / self.noise_level, 1.0) if 2.0 * self.misfit > self.noise_limit else 1.0
+        return 1.0 if self.fits else max(2.0 * self.misfit / self.noise_level, 1.0)
 
 
 NO_CHANGE = Hypothesis(())

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -28,11 +28,12 @@ from fdi_torch.monitor.oscillation import (
     with_phases_at,
     with_wrapped_phases,
 )
-from fdi_torch.parameters import ParameterName
+from fdi_torch.parameters import ParameterName, ParameterSpace
 
 SIZE_STEP = 1e-4  # finite-difference step, as a share of a parameter's range
 ITERATIONS = 12
 DEEPEST = 2  # largest number of simultaneous faults
+SMALLEST_PROBABILITY = 1e-3  # explanations below it are not fitted again
 
 
 def isolate(
@@ -71,7 +72,7 @@ def isolate(
     hypotheses = [*plain, *oscillating, *recoveries, *(f.hypothesis for f in earlier)]
     fits = _best_of_each(fit(observer, window, believed, hypotheses, starts, _misfit(base), prior))
     for _ in range(1, deepest):
-        best = fits[:2]
+        best = [f for f in fits if f.hypothesis.count < deepest][:2]
         origin = {b.hypothesis.with_fault(f): b for b in best for f in faults if f.size not in b.hypothesis.columns}
         wider = [h for h in origin if h not in {f.hypothesis for f in fits}]
         if not wider:
@@ -82,7 +83,56 @@ def isolate(
         wider += [b.hypothesis for b in best]
         starts = torch.stack([_point(origin[h]) for h in wider])
         fits = _best_of_each([*fits, *fit(observer, window, believed, wider, starts, _misfit(base), prior)])
-    return with_posterior([*fits, no_change_fit(observer, window, believed, base)])
+    ranked = with_posterior([*fits, no_change_fit(observer, window, believed, base)])
+    if ranked[0].hypothesis.columns and ranked[0].fits:
+        observer, ranked = _with_flows_of_window(observer, window, believed, ranked, prior)
+    return [_beyond_range(observer, window, believed, f, prior) if f.at_bound else f for f in ranked]
+
+
+def _with_flows_of_window(
+    observer: ObserverBank, window: ObserverWindow, believed: Tensor, ranked: Sequence[HypothesisFit], prior: Prior
+) -> tuple[ObserverBank, list[HypothesisFit]]:
+    """The fits again, with random flows learnt from the window too: a short fault-free part leaves them uncertain.
+
+    Those whose odds may rise above the smallest that counts, if the flows halve the differences of log evidence, are
+    fitted with the flows that are most likely under the likeliest hypothesis. The evidence of each plausible one then
+    gains what flows of its own add to the likelihood.
+    """
+    observer, _ = observer.learning_from(window, believed, _change_of(ranked[0]))
+    base = observer.white_innovations(window, believed, no_change(believed))
+    changes = [f for f in ranked if f.hypothesis.columns and f.probability > SMALLEST_PROBABILITY**2]
+    starts, hypotheses = torch.stack([_point(f) for f in changes]), [f.hypothesis for f in changes]
+    fits = fit(observer, window, believed, hypotheses, starts, _misfit(base), prior)
+    fits.append(no_change_fit(observer, window, believed, base))
+    likely = {f.hypothesis for f in (*ranked, *with_posterior(fits)) if f.probability > SMALLEST_PROBABILITY}
+    for i, f in enumerate(fits):
+        if f.hypothesis in likely:
+            gain = observer.learning_from(window, believed, _change_of(f))[1]
+            fits[i] = replace(f, evidence=f.evidence + gain)
+    return observer, with_posterior(fits)
+
+
+def _change_of(fit: HypothesisFit) -> ChangeHypotheses:
+    """A fit as the single lane of a bank of observers."""
+    incipient = torch.tensor([fit.hypothesis.incipient])
+    return ChangeHypotheses(fit.value[None], fit.value.new_tensor([fit.onset]), incipient)
+
+
+def _beyond_range(
+    observer: ObserverBank, window: ObserverWindow, believed: Tensor, ended: HypothesisFit, prior: Prior
+) -> HypothesisFit:
+    """A fit that stopped at an end of a range, with the values and the onset that it has without that end.
+
+    Its probability remains that of the range. At the end of the range, an earlier onset would take the place of a
+    larger size.
+    """
+    if ended.probability < SMALLEST_PROBABILITY:
+        return ended
+    space = observer.search_space(ended.value)
+    [free] = fit(observer, window, believed, [ended.hypothesis], _point(ended)[None], 0.0, prior, space=space)
+    wider = free.misfit_ratio**0.5
+    onset = {"onset": free.onset, "onset_std": free.onset_std * wider}
+    return replace(ended, value=free.value, std=free.std * wider, misfit=free.misfit, **onset)
 
 
 @dataclass(frozen=True)
@@ -93,11 +143,10 @@ class Prior:
     single_changes: int
 
     def __call__(self, hypothesis: Hypothesis) -> float:
-        """Log of the odds against no change. Simultaneous recoveries count as one event."""
+        """Log of the odds against no change."""
         new = [c for c in hypothesis.sizes if c not in hypothesis.recovered]
-        count = len(new) + bool(hypothesis.recovered)
         places = len({ParameterName.parse(self.names[c]).place for c in new}) + bool(hypothesis.recovered)
-        return log_prior(count, places, max(self.single_changes, 1))
+        return log_prior(hypothesis.count, places, max(self.single_changes, 1))
 
 
 def no_change_fit(observer: ObserverBank, window: ObserverWindow, believed: Tensor, base: Tensor) -> HypothesisFit:
@@ -139,11 +188,13 @@ def fit(
     base: float,
     prior: Prior,
     known_onset: bool = False,
+    space: ParameterSpace | None = None,
 ) -> list[HypothesisFit]:
     """Sizes and onset of each hypothesis by Levenberg-Marquardt on the white innovations, all in parallel.
 
     believed (P,): parameters before the change; starts (H, P+1): initial values and onset (s); base: misfit without a
-    change. known_onset: the onsets of `starts` are exact.
+    change. known_onset: the onsets of `starts` are exact. space: its ranges bound the sizes; those of the observer's
+    `search_space` by default.
     """
     free = torch.zeros(len(hypotheses), len(believed) + 1, dtype=torch.bool)
     free[:, -1] = not known_onset
@@ -160,7 +211,7 @@ def fit(
     fixed[:, -1] = starts[:, -1]
     for i, hypothesis in enumerate(hypotheses):
         fixed[i, list(hypothesis.recovered)] = starts[i, list(hypothesis.recovered)]
-    space = observer.search_space(believed)
+    space = observer.search_space(believed) if space is None else space
     low = torch.where(free, torch.cat([space.low(believed), first[None]]), fixed)
     high = torch.where(free, torch.cat([space.high(believed), last[None]]), fixed)
     starts = with_phases_at(torch.where(free, starts.clamp(low, high), fixed), oscillations, free, middle)

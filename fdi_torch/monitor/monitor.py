@@ -148,7 +148,8 @@ class Monitor:
         count = min(count, LARGEST_BATCH)
         moved, statistic = self._observed(state, samples.segment(0, count))
         above = statistic > self.detector.threshold
-        raised = state.pending is None and not learning and bool(above.any())
+        listens = state.pending is None or state.pending.attempts > 0
+        raised = listens and not learning and bool(above.any())
         if raised:
             count = int(above.to(torch.int8).argmax()) + 1
             moved, statistic = self._observed(state, samples.segment(0, count))

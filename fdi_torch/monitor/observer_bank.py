@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from fdi_torch.estimate.uncertainty import end_reached
-from fdi_torch.monitor.observer import initial_levels
+from fdi_torch.monitor.observer import initial_levels, run_observers
 from fdi_torch.monitor.observer_gain import Gain
-from fdi_torch.monitor.observer_run import run_observers
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.monitor.switched_plant import ONSET, RAMP, SwitchedNetwork
@@ -117,6 +117,16 @@ class ObserverBank:
         white = self.whitening.of_innovations(self.whitening.innovations(residual, window.number, window.memory)[0])
         white[:, : self.whitening.order] = 0.0
         return torch.nan_to_num(white, nan=0.0)
+
+    def learning_from(
+        self, window: ObserverWindow, believed: Tensor, change: ChangeHypotheses
+    ) -> tuple[ObserverBank, float]:
+        """The same observers, with random flows learnt from a window too, in which a change (one lane) took place, and
+        the log of the likelihood of these flows over that of the present ones.
+        """
+        bank, residual = copy(self), self.run(window, believed, change)[1][0]
+        bank.whitening, gain = self.whitening.learning_from(residual, window.number)
+        return bank, gain
 
     def in_blocks(self, window: ObserverWindow, changes: ChangeHypotheses, even: int = 1) -> list[ChangeHypotheses]:
         """The hypotheses in blocks that fit into memory; each block's size is a multiple of `even`."""

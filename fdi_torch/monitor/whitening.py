@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -50,6 +50,18 @@ class Whitening:
         """Contribution of the mean to every white residual, W (I - sum A) m, (C,); standard error 1 / sqrt(samples)."""
         eye = torch.eye(len(self.mean), dtype=self.mean.dtype)
         return self.whitener @ (eye - self.coefficients.sum(0)) @ self.mean
+
+    def learning_from(self, residual: Tensor, number: int) -> tuple[Whitening, float]:
+        """The whitening if the random flows are learnt from further residuals (S, C) too, the observer's from `number`
+        on, and the log of their likelihood over that with the present ones.
+
+        What the innovations' standard deviations are relative to those of the flow filter remains.
+        """
+        if self.flows is None:
+            return self, 0.0
+        flows, gain = self.flows.learning_from(residual, number)
+        whitener = self.whitener * (self.flows.innovation_std / flows.innovation_std)
+        return replace(self, whitener=whitener, samples=self.samples + len(residual), flows=flows), gain
 
     def __call__(self, residual: Tensor) -> Tensor:
         """Residuals of a run from its first sample on, scaled to the steady variance (*batch, S, C) -> white

@@ -61,13 +61,12 @@ def _positive(component: str, field: str, unit: str, value: float, tolerances: d
 
 def leak_pipe(plant: PlantDescription, tank: str) -> Pipe:
     """The pipe or outlet that defines a leak of size 1: the tank's `leak_reference`, or else the first one attached."""
-    reference = plant.component(tank).leak_reference  # type: ignore[union-attr]
+    reference = plant.tank(tank).leak_reference
     attached = [p for p in plant.pipes if p.name == reference or (reference is None and tank in (p.source, p.target))]
     if attached:
         return attached[0]
     # A tank without pipes: the reference is a hole of a thousandth of the floor's area.
-    area = next(t.area for t in plant.tanks if t.name == tank)
-    return plant.pipes[0] if plant.pipes else Pipe(f"{tank}.hole", tank, OUTSIDE, 1e-3 * area, 0.6)
+    return plant.pipes[0] if plant.pipes else Pipe(f"{tank}.hole", tank, OUTSIDE, 1e-3 * plant.tank(tank).area, 0.6)
 
 
 def nominal_capacity(plant: PlantDescription, pipe: Pipe) -> float:
@@ -83,26 +82,17 @@ def inverse_areas(plant: PlantDescription, component: FlowComponent) -> float:
 
 def source_height(plant: PlantDescription, pipe: str) -> float:
     """Height of the tank from which the pipe draws, m."""
-    source = plant.component(pipe).source  # type: ignore[union-attr]
-    return next(t.height for t in plant.tanks if t.name == source)
-
-
-def target_height(plant: PlantDescription, pump: str) -> float:
-    """Height of the tank that the pump feeds, m."""
-    target = plant.component(pump).target  # type: ignore[union-attr]
-    return next(t.height for t in plant.tanks if t.name == target)
+    return plant.tank(plant.flow(pipe).source).height
 
 
 def flow_scale(plant: PlantDescription, tank: str) -> float:
     """Characteristic flow of a tank: outflow of the full tank through its leak reference, C sqrt(H), m^3/s."""
-    height = next(t.height for t in plant.tanks if t.name == tank)
-    return nominal_capacity(plant, leak_pipe(plant, tank)) * math.sqrt(height)
+    return nominal_capacity(plant, leak_pipe(plant, tank)) * math.sqrt(plant.tank(tank).height)
 
 
 def reading_at(plant: PlantDescription, sensor: Sensor, share: float) -> float:
     """The reading at a level of `share` times the tank's height, in the sensor's unit."""
-    height = next(t.height for t in plant.tanks if t.name == sensor.tank)
-    return sensor.gain * share * height + sensor.offset
+    return sensor.gain * share * plant.tank(sensor.tank).height + sensor.offset
 
 
 def reading_span(plant: PlantDescription, sensor: Sensor) -> float:

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, TypeVar
 
 from fdi_torch.parameters import ParameterName
-from fdi_torch.plant.components import COMMAND_UNITS, OUTSIDE, READING_UNITS, Sensor, Tank
+from fdi_torch.plant.components import COMMAND_UNITS, OUTSIDE, READING_UNITS, Component, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
 from fdi_torch.plant.kinds.pipe import Pipe
 from fdi_torch.plant.kinds.pump import Pump
@@ -31,6 +31,8 @@ __all__ = [
     "Sensor",
     "Tank",
 ]
+
+Kind = TypeVar("Kind", bound=Component)
 
 SMALLEST, LARGEST = 1e-12, 1e9
 """Range of every plausible area, height and flow of a rig, SI; a number outside has a wrong unit or exponent."""
@@ -124,10 +126,32 @@ class PlantDescription:
         return sorted(self.flow_components(), key=lambda c: (c.order, depth.get(c.name, 0)))
 
     def component(self, name: str) -> Tank | FlowComponent | Sensor:
+        """The component of that name; `tank`, `sensor`, `flow`, `pipe` and `metered_flow` also expect its kind."""
         for component in self.components():
             if component.name == name:
                 return component
         raise ValueError(f"plant {self.name}: expected one of {', '.join(self.locations())}, got {name}")
+
+    def tank(self, name: str) -> Tank:
+        return self._of_kind(Tank, name)
+
+    def sensor(self, name: str) -> Sensor:
+        return self._of_kind(Sensor, name)
+
+    def flow(self, name: str) -> FlowComponent:
+        return self._of_kind(FlowComponent, name)
+
+    def pipe(self, name: str) -> Pipe:
+        return self._of_kind(Pipe, name)
+
+    def metered_flow(self, name: str) -> MeteredFlow:
+        return self._of_kind(MeteredFlow, name)
+
+    def _of_kind(self, kind: type[Kind], name: str) -> Kind:
+        component = self.component(name)
+        if not isinstance(component, kind):
+            raise ValueError(f"plant {self.name}: expected the name of a {kind.__name__}, got {name}")
+        return component
 
     def tank_pairs(self) -> tuple[tuple[str, str], ...]:
         """All unordered pairs of tanks; the location of an effect between two tanks is 'T1-T2'."""

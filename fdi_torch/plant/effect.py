@@ -20,7 +20,10 @@ from fdi_torch.plant.local_conditions import Local, Values
 from fdi_torch.plant.operating_range import OperatingRange
 from fdi_torch.plant.signals import Clock
 
-__all__ = ["Effect", "Local", "Memory", "Placement", "Stage", "Values", "fits", "place_kind", "place_kinds_of"]
+__all__ = [
+    *("Effect", "Memory", "Placement", "Stage", "fits", "place_kind", "place_kinds_of"),
+    *("Clock", "Local", "OperatingRange", "Parameter", "PlantDescription", "Values"),  # for the files of effects
+]
 
 Memory = tuple[Tensor, ...]
 

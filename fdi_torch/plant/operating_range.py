@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.constants import reading_at
-from fdi_torch.plant.description import Pipe, PlantDescription
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
 Range = tuple[float, float]
@@ -83,9 +83,7 @@ def bounded_by_recording(space: ParameterSpace, end: float) -> ParameterSpace:
 
 def head_range(plant: PlantDescription, pipe: str, operating_range: OperatingRange) -> Range:
     """Least and greatest absolute driving head of a pipe or an outlet, m."""
-    component = plant.component(pipe)
-    assert isinstance(component, Pipe)
-    levels = operating_range.levels
+    component, levels = plant.pipe(pipe), operating_range.levels
     low, high = (max(level - component.elevation, 0.0) for level in levels[component.source])
     if component.is_outlet:
         return low, high

@@ -91,7 +91,9 @@ class Collocation:
             path.movedim(2, 1),
         )
 
-    def corrected(self, theta: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:
+    def corrected(
+        self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L nodes m"]
+    ) -> tuple[Float[Tensor, "L nodes n"], Float[Tensor, " L"]]:
         """The levels and defect of `linearise` without derivatives, at a fraction of the cost."""
         path = self._path(theta, levels)
         values = self.network.bind(self.space, theta.unsqueeze(-2))

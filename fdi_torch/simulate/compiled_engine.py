@@ -28,7 +28,7 @@ _INTEGERS = (
 _ARRAYS = (
     "theta", "nominal", "lifted", "resolution", "starts", "spans", "means", "first_sample", "sample_times",
     "sample_intervals", "sample_shares", "signal_times", "signal_integral", "signal_slopes", "values", "weights",
-    "centres", "memory", "gains", "start", "start_memory", "out", "jacobian",
+    "centres", "gains", "start", "start_memory", "out", "jacobian",
 )  # fmt: skip
 _STEP_CONTROL = ("tolerance", "slope_tolerance", "shortest")
 _MODES = {"levels": 0, "readings": 1, "moments": 2, "linearise": 3, "gram": 4, "observe": 5}
@@ -98,20 +98,22 @@ class CompiledEngine:
         self._run("linearise", theta, out, jacobian)
         return out, jacobian
 
-    def moments(self, theta: Tensor, data: Readings) -> Tensor:
+    def moments(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C 3"]:
         expect_no_gradient(self, theta, "moments")
         out = theta.new_empty(*theta.shape[:-1], self._sensors, 3)
         self._run("moments", theta, out, data=data)
         return out
 
-    def gram(self, theta: Tensor, data: Readings) -> Tensor:
+    def gram(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C W W"]:
         expect_no_gradient(self, theta, "gram")
         width = len(self.space) + 3
         out = theta.new_empty(*theta.shape[:-1], self._sensors, width, width)
         self._run("gram", theta, out, data=data)
         return out
 
-    def observe(self, theta: Tensor, data: Readings, injection: Injection) -> Tensor:
+    def observe(
+        self, theta: Float[Tensor, "*batch P"], data: Readings, injection: Injection
+    ) -> Float[Tensor, "*batch S columns"]:
         expect_no_gradient(self, theta, "observe")
         memory = self.network.command_memory() + self.network.reading_memory()
         out = self._empty(theta, self.network.order + memory + self._sensors)
@@ -217,13 +219,7 @@ class CompiledEngine:
         def table(t: Tensor) -> Tensor:
             return t.detach().to(like.dtype).contiguous()
 
-        memory = None if data.ar is None else table(data.ar)
-        return {
-            "values": table(data.known),
-            "weights": table(data.weight),
-            "centres": table(data.centre),
-            "memory": memory,
-        }
+        return {"values": table(data.known), "weights": table(data.weight), "centres": table(data.centre)}
 
 
 @lru_cache(maxsize=128)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from fdi_torch.simulate.cpp_statements import Statements, stored
-from fdi_torch.simulate.expression import Varies
+from fdi_torch.simulate.cpp_statements import EXPENSIVE, Statements, stored
+from fdi_torch.simulate.expression import Graph, Node, Varies
 from fdi_torch.simulate.program import Program
 from fdi_torch.simulate.section import Output, Place, Row, Section
-from fdi_torch.simulate.step_invariants import step_invariant_nodes
 
 
 class SectionWriter:
@@ -187,3 +186,22 @@ def d_place_text(place: Place) -> str:
 
 def d_name(place: Place) -> str:
     return f"d_{place[0]}_{place[1]}"
+
+
+def step_invariant_nodes(graph: Graph) -> frozenset[int]:
+    """The nodes that vary between lanes and otherwise only with the length of a step, such as a lag's exp(-dt / tau).
+
+    They are recomputed only when that length changes. Only those that depend on an expensive operation are worth it.
+    """
+    steady: set[int] = set()
+    expensive: set[int] = set()
+    for i, node in enumerate(graph.nodes):
+        if node.operation in EXPENSIVE or any(a in expensive for a in node.arguments):
+            expensive.add(i)
+        if _is_steady(node) if node.operation in ("input", "literal") else all(a in steady for a in node.arguments):
+            steady.add(i)
+    return frozenset(i for i in steady & expensive if graph.nodes[i].varies == Varies.BOTH)
+
+
+def _is_steady(node: Node) -> bool:
+    return not node.varies & Varies.STEP or (node.kind == "clock" and node.index == 1)

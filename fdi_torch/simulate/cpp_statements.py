@@ -7,7 +7,8 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 
 from fdi_torch.simulate.expression import Graph, Varies
 from fdi_torch.simulate.operations import OPERATIONS
-from fdi_torch.simulate.step_invariants import EXPENSIVE
+
+EXPENSIVE = frozenset({"sqrt", "inverse_fourth_root", "div", "exp", "log", "pow", "sin", "cos", "tanh"})
 
 
 class Statements:
@@ -170,7 +171,7 @@ def _literal(value: float | None) -> str:
     return f"real({value!r})" if math.isfinite(value) else f"real({'-' if value < 0 else ''}INFINITY)"
 
 
-def _input_text(kind: str, index: int, varies: Varies) -> str:
+def _input_text(kind: str, index: int, varies: int) -> str:
     if kind == "resolution":
         return "b.resolution"
     if kind in ("clock", "channel"):

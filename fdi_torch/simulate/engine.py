@@ -16,14 +16,11 @@ class Readings:
     """Measured readings, to be compared with an engine's predictions.
 
     values and weight: (S, C) for all lanes, or (problems, S, C), one set per problem. A value of weight n is the
-    mean of n readings; weight 0 masks it. ar: None, or the AR(1) coefficient of each channel's noise, (C,) or
-    (problems, C). With it, residuals and Jacobians are whitened, x_k - ar x_(k-1); the first sample, and a sample after
-    a masked one, is scaled by sqrt(1 - ar^2) instead.
+    mean of n readings; weight 0 masks it.
     """
 
     values: Tensor
     weight: Tensor
-    ar: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.values.dim() < 2 or self.weight.shape != self.values.shape:
@@ -31,9 +28,6 @@ class Readings:
                 f"expected values and weights of one shape (*problems, samples, channels), got "
                 f"{tuple(self.values.shape)} and {tuple(self.weight.shape)}"
             )
-        expected = self.values.shape[:-2] + self.values.shape[-1:]
-        if self.ar is not None and self.ar.shape != expected:
-            raise ValueError(f"expected ar of shape {tuple(expected)}, got {tuple(self.ar.shape)}")
 
     @cached_property
     def count(self) -> Tensor:
@@ -57,9 +51,7 @@ class Readings:
 
     def of(self, lanes: Tensor) -> Readings:
         """The readings of the selected problems; readings shared by all are returned unchanged."""
-        if self.values.dim() == 2:
-            return self
-        return Readings(self.values[lanes], self.weight[lanes], self.ar[lanes] if self.ar is not None else None)
+        return self if self.values.dim() == 2 else Readings(self.values[lanes], self.weight[lanes])
 
 
 class Engine(Protocol):
@@ -71,30 +63,28 @@ class Engine(Protocol):
     why: str  # the reason for the choice of this engine, one sentence
 
     def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
-        """theta (*batch, P) -> readings (*batch, S, C) in SI; differentiable if theta requires a gradient."""
+        """Readings in SI; differentiable if theta requires a gradient."""
         ...
 
     def levels(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S tanks"]:
-        """theta (*batch, P) -> tank levels at the samples (*batch, S, tanks), m."""
+        """Tank levels at the samples, m."""
         ...
 
     def linearise(
         self, theta: Float[Tensor, "*batch P"]
     ) -> tuple[Float[Tensor, "*batch S C"], Float[Tensor, "*batch S C P"]]:
-        """theta (*batch, P) -> readings (*batch, S, C) and their Jacobian (*batch, S, C, P), forward mode."""
+        """Readings and their Jacobian, by forward mode."""
         ...
 
-    def moments(self, theta: Tensor, data: Readings) -> Tensor:
-        """theta (problems, N, P) -> weighted sums of r, r^2 and r y' over the samples, (problems, N, C, 3).
+    def moments(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C 3"]:
+        """Weighted sums of r, r^2 and r y' over the samples.
 
         r = y - prediction, y' = y - mean(y). Likelihood and correlation follow from them and the sums of y.
         """
         ...
 
-    def gram(self, theta: Tensor, data: Readings) -> Tensor:
-        """theta (problems, N, P) -> weighted sums of the products of [d prediction/d theta, r, y', 1], (problems, N, C,
-        P+3, P+3).
-        """
+    def gram(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C W W"]:
+        """Weighted sums of the products of [d prediction/d theta, r, y', 1]; W = P + 3."""
         ...
 
 
@@ -108,7 +98,7 @@ def expect_problems(theta: Float[Tensor, "*problems N P"], data: Readings) -> No
         )
 
 
-def moments_of(readings: Float[Tensor, "*problems N S C"], data: Readings) -> Tensor:
+def moments_of(readings: Float[Tensor, "*problems N S C"], data: Readings) -> Float[Tensor, "*problems N C 3"]:
     """`Engine.moments` from readings (*problems, N, S, sensors)."""
     y, w = data.known.unsqueeze(-3), data.weight.unsqueeze(-3)
     residual = y - readings
@@ -118,22 +108,12 @@ def moments_of(readings: Float[Tensor, "*problems N S C"], data: Readings) -> Te
 
 def gram_of(
     readings: Float[Tensor, "*problems N S C"], jacobian: Float[Tensor, "*problems N S C P"], data: Readings
-) -> Tensor:
+) -> Float[Tensor, "*problems N C W W"]:
     """`Engine.gram` from readings (*problems, N, S, sensors) and their Jacobian (..., P)."""
     y, w = data.known.unsqueeze(-3), data.weight.unsqueeze(-3).expand(readings.shape)
     residual = y - readings
     centred = (y - data.centre.unsqueeze(-2).unsqueeze(-3)).expand(residual.shape)
     others = torch.stack([residual, centred, torch.ones_like(residual)], dim=-1)
     columns = torch.cat([jacobian, others], dim=-1)
-    if data.ar is not None:
-        columns = whitened(columns, w, data.ar.unsqueeze(-2).unsqueeze(-3))
     columns = torch.where(w.unsqueeze(-1) > 0, columns, 0.0).movedim(-2, -3)
     return (columns * w.movedim(-1, -2).unsqueeze(-1)).mT @ columns
-
-
-def whitened(columns: Tensor, weight: Tensor, ar: Tensor) -> Tensor:
-    """columns (..., S, sensors, M) -> x_k - ar x_(k-1), or sqrt(1 - ar^2) x_k where the preceding reading is masked."""
-    ar = ar.expand(weight.shape).unsqueeze(-1)
-    before = torch.cat([torch.zeros_like(columns[..., :1, :, :]), columns[..., :-1, :, :]], dim=-3)
-    follows = torch.cat([torch.zeros_like(weight[..., :1, :]), weight[..., :-1, :]], dim=-2).unsqueeze(-1) > 0
-    return torch.where(follows, columns - ar * before, torch.sqrt(1.0 - ar * ar) * columns)

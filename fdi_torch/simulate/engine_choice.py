@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
 
 import torch
 
@@ -17,7 +16,6 @@ from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.reference_engine import ReferenceEngine
 from fdi_torch.simulate.traced_engine import TracedEngine
 
-Kind = Literal["auto", "compiled", "traced", "reference"]
 KINDS = ("auto", "compiled", "traced", "reference")
 
 

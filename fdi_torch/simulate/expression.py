@@ -8,18 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntFlag
 
 from fdi_torch.simulate.operations import FOLDED, OPERATIONS
 
 
-class Varies(IntFlag):
-    """The indices on which a value depends."""
+class Varies:
+    """The indices on which a value depends, as bits; plain integers, because operations on an IntFlag are slow."""
 
-    NEVER = 0
-    LANE = 1
-    STEP = 2
-    BOTH = 3
+    NEVER, LANE, STEP, BOTH = 0, 1, 2, 3
 
 
 @dataclass(frozen=True)
@@ -30,7 +26,7 @@ class Node:
 
     operation: str
     arguments: tuple[int, ...]
-    varies: Varies
+    varies: int
     value: float | None = None
     kind: str = ""
     index: int = 0
@@ -54,7 +50,7 @@ class Graph:
         self.closed: set[int] = set()
         self._known: dict[tuple[object, ...], int] = {}
 
-    def input(self, kind: str, index: int, varies: Varies) -> int:
+    def input(self, kind: str, index: int, varies: int) -> int:
         return self._intern(Node("input", (), varies, None, kind, index))
 
     def literal(self, value: float) -> int:
@@ -210,7 +206,7 @@ class Graph:
                     return self.apply("mul", x, self.apply("mul", c, d))
         return None
 
-    def _below(self, i: int, often: Varies) -> bool:
+    def _below(self, i: int, often: int) -> bool:
         """Whether the node varies with less than `often`."""
         return self.nodes[i].varies | often == often and self.nodes[i].varies != often
 

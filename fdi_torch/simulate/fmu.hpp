@@ -1,7 +1,7 @@
 // The functions of FMI 2.0 for co-simulation (Modelica Association, 2014, chapters 2 and 4) around `run` of kernel.hpp.
 //
 // Value references: inputs, levels, readings, parameters, one after the other. A communication step is one call of `run`
-// with the inputs held; levels and memories at its end are those that the next one begins with. The plant is in steady
+// with the inputs held; the next step begins with the levels and memories at its end. The plant is in steady
 // memory (settled actuators and sensors) when the first step begins.
 #include <algorithm>
 #include <cstdarg>
@@ -224,7 +224,7 @@ FMI fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const char *bytes, size_
     return fmi2OK;
 }
 
-// What the standard requires to be there, and this FMU has no use for.
+// Functions that the standard requires and this FMU does not need.
 FMI fmi2Status fmi2SetDebugLogging(fmi2Component, fmi2Boolean, size_t, const fmi2String *) { return fmi2OK; }
 FMI fmi2Status fmi2CancelStep(fmi2Component) { return fmi2Error; }
 FMI fmi2Status fmi2GetDirectionalDerivative(fmi2Component, const fmi2ValueReference *, size_t, const fmi2ValueReference *,

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-
-class _Linearising(Protocol):
-    name: str
-
-    def linearise(self, theta: Tensor) -> tuple[Tensor, Tensor]: ...
+from fdi_torch.simulate.engine import Engine
 
 
 def is_differentiated(theta: Tensor) -> bool:
@@ -20,7 +16,7 @@ def is_differentiated(theta: Tensor) -> bool:
     return theta.requires_grad and torch.is_grad_enabled()
 
 
-def readings_with_gradient(engine: _Linearising, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
+def readings_with_gradient(engine: Engine, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
     """theta (*batch, P) -> readings y (*batch, S, C), with dL/dtheta = sum over S and C of dL/dy dy/dtheta.
 
     The Jacobian dy/dtheta (*batch, S, C, P) is computed together with the readings and stored for the backward pass, 8
@@ -29,7 +25,7 @@ def readings_with_gradient(engine: _Linearising, theta: Float[Tensor, "*batch P"
     return _Readings.apply(theta, engine)
 
 
-def expect_no_gradient(engine: _Linearising, theta: Tensor, what: str) -> None:
+def expect_no_gradient(engine: Engine, theta: Tensor, what: str) -> None:
     """Raises ValueError if theta requires a gradient that this operation would silently lose."""
     if is_differentiated(theta):
         raise ValueError(
@@ -40,7 +36,7 @@ def expect_no_gradient(engine: _Linearising, theta: Tensor, what: str) -> None:
 
 class _Readings(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, theta: Tensor, engine: _Linearising) -> Tensor:
+    def forward(ctx: Any, theta: Tensor, engine: Engine) -> Tensor:
         readings, jacobian = engine.linearise(theta.detach())
         ctx.save_for_backward(jacobian, theta)
         ctx.engine = engine.name

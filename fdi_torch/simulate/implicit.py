@@ -148,7 +148,7 @@ def _error(step: Tensor, slopes: Sequence[Numbers]) -> Numbers:
 
 
 def _along(start: Sequence[Tensor], step: Tensor, weights: Sequence[float], slopes: Sequence[Numbers]) -> Numbers:
-    """begun + step x sum of weights x slopes, for each state."""
+    """start + step x sum of weights x slopes, for each state."""
     levels = []
     for i, h in enumerate(start):
         total = weights[0] * slopes[0][i]

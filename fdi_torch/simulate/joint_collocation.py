@@ -46,7 +46,9 @@ class JointCollocation:
         pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
         return self._joined([part.linearise(columns, piece) for part, columns, piece in pieces])
 
-    def corrected(self, theta: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:
+    def corrected(
+        self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L N m"]
+    ) -> tuple[Float[Tensor, "L N n"], Float[Tensor, " L"]]:
         """The levels and the defect of `linearise`, without derivatives."""
         pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
         corrected = [part.corrected(columns, piece) for part, columns, piece in pieces]

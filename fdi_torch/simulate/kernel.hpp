@@ -1,8 +1,8 @@
 // The loop over blocks of lanes, steps and samples around a plant's generated sections.
 //
-// A block is LANES trajectories side by side: each array below has one number a lane, each inner loop runs over
-// lanes and becomes vector instructions. No lane reads another's numbers, and every block is full (a last, short one
-// repeats its last lane), so a trajectory does not depend on its neighbours, their number, or the threads.
+// A block is LANES trajectories side by side: each array below has one number per lane, and each inner loop runs over
+// the lanes and becomes vector instructions. No lane reads another lane's numbers, and every block is full (an incomplete
+// last block repeats its last lane), so that a trajectory does not depend on its neighbours, their number, or the threads.
 #include <atomic>
 #include <chrono>
 #include <limits>
@@ -18,7 +18,7 @@
 enum Mode { LEVELS, READINGS, MOMENTS, LINEARISE, GRAM, OBSERVE };
 enum { MEMORY = COMMAND_MEMORY + READING_MEMORY, STATE = ORDER + MEMORY };
 
-// How the calling thread lets Python's other threads run, and whether a signal's handler has raised an exception.
+// Functions of Python: release and take back the global lock, and run signal handlers (nonzero: one raised an exception).
 struct Python {
     void *(*release)();
     void (*take)(void *);
@@ -28,13 +28,13 @@ struct Python {
 struct Job {
     int64_t lanes, lanes_per_problem, steps, samples, signal_samples, mode, threads, gain_stride;
     int64_t start_width, out_bytes, jacobian_bytes;          // start_width: TANKS or ORDER
-    double tolerance, slope_tolerance, shortest;             // of a lane's own steps: m, a share, s
+    double tolerance, slope_tolerance, shortest;             // step control: m, relative, s
     const real *theta, *nominal, *lifted, *resolution;
     const real *starts, *spans, *means;                      // (K), (K), (K, CHANNELS)
     const int64_t *first_sample;                             // (K + 1): step k holds samples first[k] .. first[k + 1]
     const real *sample_times, *sample_intervals, *sample_shares;
     const real *signal_times, *signal_integral, *signal_slopes;  // (T), (T, CHANNELS), (T + 1, CHANNELS)
-    const real *values, *weights, *centres, *memory;         // (problems, S, SENSORS) twice, (problems, SENSORS) twice
+    const real *values, *weights, *centres;                  // (problems, S, SENSORS) twice, (problems, SENSORS)
     const real *gains, *start, *start_memory;                // (lanes or 1, S, ORDER, SENSORS), (lanes, start_width), (lanes, MEMORY)
     real *out, *jacobian;
     const Python *python;
@@ -42,7 +42,7 @@ struct Job {
 
 static constexpr std::chrono::milliseconds INTERVAL(50);
 
-// Whether all threads are to stop: the one that was called looks now and then whether it was interrupted.
+// Stop flag of all threads; the calling thread checks at intervals whether it was interrupted.
 struct Watch {
     explicit Watch(const Python *python) : python(python), state(python->release()) {}
     ~Watch() { python->take(state); }
@@ -73,13 +73,13 @@ struct Block {
     Lane lane[SOME(LANE_CONSTANTS)], steady[SOME(STEADY)];
     Lane level[ORDER], before[ORDER], sample[ORDER], slope_left[ORDER], slope_right[ORDER];
     Lane action[SOME(ACTUATORS)], command_memory[SOME(COMMAND_MEMORY)], late_channel[SOME(LATE_ACTUATORS)];
-    Lane integral[SOME(LATE_ACTUATORS)], late_slope[SOME(LATE_ACTUATORS)];   // of late channels, so far
+    Lane integral[SOME(LATE_ACTUATORS)], late_slope[SOME(LATE_ACTUATORS)];   // of delayed channels, up to the present
     Lane command_delay[SOME(LATE_ACTUATORS)], reading_delay[SOME(LATE_SENSORS)];
     Lane seen[SENSORS], reading[SENSORS], reading_memory[SOME(READING_MEMORY)];
     Lane value, weight, centre;
     Lane squares[SENSORS][3];
 #if WITHIN
-    Lane part[2], pace, gone, failed;                        // each lane's own step: its clock, its length, how far it is
+    Lane part[2], pace, gone, failed;                        // of a lane's adaptive step: clock, planned length, elapsed time, whether it failed
     Lane base[ORDER], move[ORDER], error[ORDER];
     Lane factor[ENTRIES], inverse[ORDER];                    // of 1 - g df/dh
 #if TANGENT
@@ -93,15 +93,15 @@ struct Block {
 #endif
 #endif
 #if TANGENT
-    Lane row[SOME(ROWS)][COLUMNS];                           // what theta alone does to each output
+    Lane row[SOME(ROWS)][COLUMNS];                           // direct slope of each output by theta
     Lane d_level[COLUMNS][ORDER], d_before[COLUMNS][ORDER], d_sample[COLUMNS][ORDER];
     Lane d_slope_left[COLUMNS][ORDER], d_slope_right[COLUMNS][ORDER], d_action[COLUMNS][SOME(ACTUATORS)];
     Lane d_command_memory[COLUMNS][SOME(COMMAND_MEMORY)], d_late_channel[COLUMNS][SOME(LATE_ACTUATORS)];
     Lane d_command_delay[COLUMNS][SOME(LATE_ACTUATORS)], d_reading_delay[COLUMNS][SOME(LATE_SENSORS)];
     Lane d_seen[COLUMNS][SENSORS], d_reading[COLUMNS][SENSORS], d_reading_memory[COLUMNS][SOME(READING_MEMORY)];
-    Lane gram[SENSORS][PAIRS], previous[SENSORS][WIDTH], column[WIDTH], previous_weight[SENSORS];
+    Lane gram[SENSORS][PAIRS], column[WIDTH];
 #endif
-    real uniform[SOME(UNIFORM_CONSTANTS)], span[SOME(SPANS)];    // span: the steps' lengths that `steady` is of
+    real uniform[SOME(UNIFORM_CONSTANTS)], span[SOME(SPANS)];    // span: step lengths for which `steady` was computed
     int64_t end[SOME(LATE_ACTUATORS)][LANES], past[SOME(LATE_SENSORS)][LANES];
     int64_t problem[LANES];
     bool one_problem, looks;
@@ -114,10 +114,10 @@ struct Block {
 
 //@SECTIONS@
 
-// As in plant/signals.py: at a switch the slope is the one before it, since a delay reaches back.
+// As in plant/signals.py: at a switch the slope is the one before it, because a delay looks back.
 static const real SAME_INSTANT = 1e-9;
 
-// The integral of channel c up to an instant; i moves on to the slope that holds there.
+// The integral of channel c up to an instant; i advances to the index of the slope that holds there.
 static real up_to(const Job &job, int c, real instant, int64_t &i, real &slope) {
     while (i < job.signal_samples && job.signal_times[i] < instant - SAME_INSTANT) ++i;
     const int64_t left = i > 0 ? i - 1 : 0;
@@ -125,8 +125,8 @@ static real up_to(const Job &job, int c, real instant, int64_t &i, real &slope) 
     return job.signal_integral[left * CHANNELS + c] + slope * (instant - job.signal_times[left]);
 }
 
-// The mean of a held or linear signal over [start - delay, start - delay + span], exactly. Steps follow one another:
-// an interval begins where the one before it ended.
+// The exact mean of a held or linear signal over [start - delay, start - delay + span]. Each interval begins where the
+// preceding one ended.
 static void look_up_late_channels(const Job &job, Block &b, real start, real span, bool first) {
     for (int j = 0; j < LATE_ACTUATORS; ++j) {
         const int c = LATE_CHANNEL[j];
@@ -146,7 +146,7 @@ static void look_up_late_channels(const Job &job, Block &b, real start, real spa
     }
 }
 
-// Each late sensor sees the level that its tank had earlier, between the samples on a straight line.
+// Replaces the level at each delayed sensor by the earlier level of its tank, interpolated linearly between samples.
 static void look_up_late_levels(const Job &job, Block &b, int64_t s) {
     for (int j = 0; j < LATE_SENSORS; ++j) {
         Lane *history = reinterpret_cast<Lane *>(b.history.data()) + j * job.samples;
@@ -235,22 +235,6 @@ static void add_moments(const Job &job, Block &b, int64_t s) {
 }
 
 #if TANGENT
-// x_k - phi x_{k-1}, or sqrt(1 - phi^2) x_k where nothing was read before it.
-static void whiten(const Job &job, Block &b, int c) {
-    for (int l = 0; l < LANES; ++l) {
-        const real phi = job.memory[b.problem[l] * SENSORS + c];
-        const bool follows = b.previous_weight[c][l] > 0;
-        b.value[l] = follows ? phi : 0;
-        b.centre[l] = follows ? 1 : std::sqrt(1 - phi * phi);
-    }
-    for (int m = 0; m < WIDTH; ++m) EACH_LANE {
-        const real x = b.column[m][l], earlier = b.value[l] != 0 ? b.value[l] * b.previous[c][m][l] : 0;
-        b.column[m][l] = b.centre[l] * x - earlier;
-        b.previous[c][m][l] = x;
-    }
-    EACH_LANE b.previous_weight[c][l] = b.weight[l];
-}
-
 static void add_gram(const Job &job, Block &b, int64_t s) {
     for (int c = 0; c < SENSORS; ++c) {
         fetch_data(job, b, s, c);
@@ -260,7 +244,6 @@ static void add_gram(const Job &job, Block &b, int64_t s) {
             b.column[COLUMNS + 1][l] = b.value[l] - b.centre[l];
             b.column[COLUMNS + 2][l] = 1;
         }
-        if (job.memory) whiten(job, b, c);
         Lane *sum = b.gram[c];
         for (int m = 0; m < WIDTH; ++m) {
             Lane weighted;
@@ -276,7 +259,7 @@ static bool is_interrupted(Block &b) {
     return b.watch->stop.load(std::memory_order_relaxed);
 }
 
-struct Rows {  // where the lanes of a block stand in the results
+struct Rows {  // rows of the results that belong to the lanes of a block
     int64_t first, count;
 };
 
@@ -298,8 +281,8 @@ static void write(const Job &job, Block &b, const Rows &rows, int64_t s) {
 #endif
 }
 
-// An observer at a sample: state += gain (value - reading) where something was read, no level below zero. Writes the
-// state after it and the reading that it expected.
+// Observer correction at a sample: state += gain (value - reading) for valid readings, with no level below zero. Writes
+// the corrected state and the predicted reading.
 static void correct(const Job &job, Block &b, const Rows &rows, int64_t s) {
     Lane error[SENSORS];
     for (int c = 0; c < SENSORS; ++c) {
@@ -325,7 +308,7 @@ static void correct(const Job &job, Block &b, const Rows &rows, int64_t s) {
     }
 }
 
-// What a run begins with, where it is told: levels or the whole state, and what actuators and sensors remember.
+// The given initial values of a run, if any: levels or the whole state, and the memories of actuators and sensors.
 static void begin_with(Lane *into, const real *from, int width, int first, int count, const Rows &rows) {
     if (!from) return;
     for (int64_t l = 0; l < LANES; ++l) {
@@ -382,7 +365,6 @@ static void load(const Job &job, Block &b, const Rows &rows) {
     std::memset(b.d_command_memory, 0, sizeof b.d_command_memory);
     std::memset(b.d_reading_memory, 0, sizeof b.d_reading_memory);
     std::memset(b.gram, 0, sizeof b.gram);
-    std::memset(b.previous_weight, 0, sizeof b.previous_weight);
 #endif
 }
 
@@ -411,7 +393,7 @@ static bool has_inner_sample(const Job &job, int64_t k) {
 }
 
 #if !UNROLLED
-// The rates at the levels, and how they move, as those of stage s.
+// The rates at the levels and their slopes by theta, stored as those of stage s.
 static void take_rates(Block &b, const real *clock, const real *channel, int s) {
     rates(b, clock, channel);
     std::memcpy(b.stage[s], b.slope, sizeof b.slope);
@@ -452,7 +434,7 @@ static void step(Block &b, const real *clock, const real *channel) {
     }
 }
 
-// The slopes at both ends of the step that was taken, for samples within it.
+// The rates at both ends of the last step, for samples within it.
 static void end(Block &b, const real *clock, const real *channel) {
     std::memcpy(b.slope_left, b.stage[0], sizeof b.slope_left);
 #if TANGENT
@@ -480,7 +462,7 @@ static bool set_out(Block &b, real start, real span) {
     return open;
 }
 
-// 1 - g df/dh, eliminated. The work is that of `Elimination` in elimination.py.
+// LU factors of 1 - g df/dh, by the operations of `Elimination` in elimination.py.
 static void eliminate(Block &b) {
     EACH_VECTOR {
         const Vec g = real(DIAGONAL) * AT(b.part[1]);
@@ -520,12 +502,12 @@ static inline Vec weighted(const double *weight, Lane *first, int stride, int co
     return sum;
 }
 
-// By how much a step may be wrong.
+// Error estimate of a step.
 static inline void error_of(Block &b, Lane out, Lane *first, int stride) {
     EACH_VECTOR AT(out) = FABS(AT(b.part[1]) * weighted(STEP_ERROR, first, stride, STAGES + 1, l));
 }
 
-// Levels at base + g f(levels), each lane by as many rounds of Newton's method as it needs.
+// Solves levels = base + g f(levels) by Newton's method, with as many iterations as each lane needs.
 static void solve_stage(const Job &job, Block &b, const real *clock, const real *channel) {
     const real enough = NEWTON_SHARE * job.tolerance;
     Lane active, before;
@@ -641,7 +623,7 @@ static void keep_or_undo(const Job &job, Block &b, real span) {
 #endif
 }
 
-// A step of the grid, each lane in as many of its own as it needs.
+// A step of the grid, which each lane divides into as many adaptive steps as it needs.
 static void step_within(const Job &job, Block &b, const real *clock, const real *channel) {
     act(b, clock, channel);
     EACH_LANE b.gone[l] = 0;
@@ -709,7 +691,7 @@ static void work(const Job &job, std::atomic<int64_t> &next, Watch &watch, bool 
         run_block(job, b, {first, job.lanes - first < LANES ? job.lanes - first : LANES});
 }
 
-// Results are written once and all over: large pages are handed out five hundred times as rarely as small ones.
+// The results are written once, in full; large pages need 1/500 of the page faults of small ones.
 static void prefer_large_pages(void *from, int64_t bytes) {
 #if defined(__linux__)
     const uintptr_t page = 1 << 21, begin = (reinterpret_cast<uintptr_t>(from) + page - 1) / page * page;
@@ -718,7 +700,7 @@ static void prefer_large_pages(void *from, int64_t bytes) {
 #endif
 }
 
-// Called with Python's lock held. Where it was interrupted an exception is set, and the results are of no use.
+// Called with Python's lock held. After an interruption an exception is set, and the results are incomplete.
 extern "C" void run(const Job *job) {
     Watch watch(job->python);
     prefer_large_pages(job->out, job->out_bytes);

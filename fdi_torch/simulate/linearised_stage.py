@@ -15,7 +15,7 @@ from torch import Tensor
 
 from fdi_torch.plant.effect import Memory
 from fdi_torch.simulate.pointwise import Row, partials
-from fdi_torch.simulate.scan import linear_scan, scan_in_time
+from fdi_torch.simulate.scan import scan_in_time
 
 ROUNDS = 40
 CONVERGED = 1e-11
@@ -126,8 +126,9 @@ def solve_memory(
         defect = torch.cat([path[..., :1, :] - initial, path[..., 1:, :] - after[..., :-1, :]], dim=-2)
         if float(defect.abs().max() / scale) < CONVERGED:
             break
-        forcing = (after - (slopes * path.unsqueeze(-2)).sum(-1)).unsqueeze(-1)
-        path = linear_scan(slopes, forcing, initial.transpose(-1, -2))[:, :-1, :, 0]
+        forcing = after - (slopes * path.unsqueeze(-2)).sum(-1)
+        a, b = slopes.movedim(1, -1), forcing.transpose(1, 2).unsqueeze(2)
+        path = scan_in_time(a, b, initial.transpose(1, 2))[:, :, 0, :-1].transpose(1, 2)
     return [m.contiguous() for m in path.unbind(-1)]
 
 

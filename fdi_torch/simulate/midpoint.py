@@ -11,8 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fdi_torch.simulate.recurrence import midpoint_correction, midpoint_step
-from fdi_torch.simulate.scan import product, scan_in_time
+from fdi_torch.simulate.scan import product, run_loop, scan_in_time
 
 
 def newton_step(
@@ -32,9 +31,11 @@ def newton_step(
     Returns the corrected levels (L, n, K+1), their sensitivities (L, n, P, K+1), transition and gain of a disturbance
     (L, n, n, K), and the largest correction (L,).
     """
-    compiled = midpoint_step(span, path, rates, by_level, by_theta, start, start_slopes)
-    if compiled is not None:
-        return compiled
+    inputs = [span, path, rates, by_level, by_theta, start, start_slopes]
+    slopes, defect = path.new_empty(*by_theta.shape[:-1], path.shape[-1]), path.new_empty(len(path))
+    outputs = [torch.empty_like(path), slopes, torch.empty_like(by_level), torch.empty_like(by_level), defect]
+    if run_loop("midpoint_step", by_theta.shape, inputs, outputs):
+        return tuple(outputs)
     transition, gain, forcing = _recurrence(span, path, rates, by_level)
     forcing = torch.cat([forcing, product(gain, by_theta)], dim=2)
     first = torch.cat([(start - path[..., 0]).unsqueeze(-1), start_slopes], dim=-1)
@@ -50,9 +51,11 @@ def newton_correction(
     start: Float[Tensor, "L n"],
 ) -> tuple[Float[Tensor, "L n K+1"], Float[Tensor, " L"]]:
     """The corrected levels and the largest correction of `newton_step`, without sensitivities."""
-    compiled = midpoint_correction(span, path, rates, by_level, start)
-    if compiled is not None:
-        return compiled
+    lanes, n, steps = rates.shape
+    levels, defect = torch.empty_like(path), path.new_empty(lanes)
+    inputs = [span, path, rates, by_level, None, start, None]
+    if run_loop("midpoint_step", torch.Size((lanes, n, 0, steps)), inputs, [levels, None, None, None, defect]):
+        return levels, defect
     transition, _, forcing = _recurrence(span, path, rates, by_level)
     correction = scan_in_time(transition, forcing, (start - path[..., 0]).unsqueeze(-1))[:, :, 0]
     return path + correction, correction.abs().amax(dim=(-1, -2))

@@ -84,7 +84,7 @@ class PlantOde(nn.Module):
 def _function_of_time(inputs: Inputs, network: TankNetwork, like: Tensor) -> Callable[[Tensor], Tensor]:
     channels = network.description.channels()
     if isinstance(inputs, Recording):
-        return _played(inputs.selected(channels, ()))
+        return _inputs_over_time(inputs.selected(channels, ()))
     if not callable(inputs):
         constant = torch.as_tensor(inputs, dtype=like.dtype, device=like.device)
         if constant.shape[-1:] != (len(channels),):
@@ -93,7 +93,7 @@ def _function_of_time(inputs: Inputs, network: TankNetwork, like: Tensor) -> Cal
     return inputs
 
 
-def _played(recording: Recording) -> Callable[[Tensor], Tensor]:
+def _inputs_over_time(recording: Recording) -> Callable[[Tensor], Tensor]:
     """The inputs (channels,) of a recording as a function of the time since its start, constant before and after it."""
     time, values = recording.time - recording.time[0], recording.inputs
 

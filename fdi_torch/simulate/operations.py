@@ -8,23 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-
-class Graph(Protocol):
-    """The operations of an expression graph in which derivatives are built."""
-
-    def literal(self, value: float) -> int: ...
-
-    def apply(self, operation: str, *arguments: int) -> int: ...
-
-    def value(self, node: int) -> float | None: ...
+if TYPE_CHECKING:
+    from fdi_torch.simulate.expression import Graph
 
 
-Partials = Callable[[Graph, int, tuple[int, ...]], tuple[int | None, ...]]
+Partials = Callable[["Graph", int, tuple[int, ...]], tuple[int | None, ...]]
 
 
 @dataclass(frozen=True)

@@ -31,15 +31,15 @@ class DelayedSignal:
     interval: Tensor
     by_theta: Row
 
-    def of(self, x: Tensor) -> Tensor:
-        """The delayed signal, for x (L, S) or (L, M, S)."""
+    def of(self, x: Float[Tensor, "L *M S"]) -> Float[Tensor, "L *M S"]:
+        """The delayed signal, or several ones."""
         wide = (lambda t: t) if x.dim() == 2 else (lambda t: t.unsqueeze(1))
         left, share = wide(self.left).expand(x.shape), wide(self.share)
         before = x.gather(-1, left)
         return before + share * (x.gather(-1, left + 1) - before)
 
-    def by_delay(self, x: Tensor) -> Tensor:
-        """Slope of the delayed signal (L, S) by the delay, per s."""
+    def by_delay(self, x: Float[Tensor, "L S"]) -> Float[Tensor, "L S"]:
+        """Slope of the delayed signal by the delay, per s."""
         return torch.where(self.share > 0, x.gather(-1, self.left) - x.gather(-1, self.left + 1), 0.0) / self.interval
 
 
@@ -134,8 +134,8 @@ class SampleGrid:
         self.node = node if on_nodes else None
         self.same = on_nodes and torch.equal(node, torch.arange(len(experiment.nodes)))
 
-    def of(self, path: Tensor) -> Tensor:
-        """(..., K+1) -> (..., S)."""
+    def of(self, path: Float[Tensor, "*batch nodes"]) -> Float[Tensor, "*batch S"]:
+        """The path at the samples."""
         if self.same:
             return path
         if self.node is not None:

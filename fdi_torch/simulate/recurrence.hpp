@@ -1,5 +1,5 @@
-// Linear recurrences in time, lane by lane: time is the last dimension in memory, and a few of its steps are turned
-// into a block that lies close together, worked through, and turned back. Compiled for one number of TANKS.
+// Linear recurrences in time, lane by lane. Time is the last dimension in memory; a few steps at a time are transposed
+// into a block, processed there, and transposed back. Compiled for one number of TANKS.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -69,7 +69,7 @@ inline void add_scaled(const Steps& factor, const double* x, int64_t length, Ste
 }
 
 // Inverses of N x N matrices by elimination without pivots, at all steps of a block side by side. on (N, N): which
-// elements of m are not zero at all steps; becomes which elements of the inverse are not.
+// elements of m are nonzero at some step; on return, those of the inverse.
 template <int N>
 inline void invert(Steps* m, Steps* inverse, bool* on) {
     bool reached[N * N] = {};

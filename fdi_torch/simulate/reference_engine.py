@@ -93,12 +93,12 @@ class ReferenceEngine:
         assert slopes is not None
         return readings[:, : len(lanes)], slopes.unflatten(1, (lanes.shape[-1], len(lanes))).movedim(1, -1)
 
-    def moments(self, theta: Tensor, data: Readings) -> Tensor:
+    def moments(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C 3"]:
         """As `Engine.moments`."""
         expect_problems(theta, data)
         return moments_of(self.readings(theta), data)
 
-    def gram(self, theta: Tensor, data: Readings) -> Tensor:
+    def gram(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C W W"]:
         """As `Engine.gram`."""
         expect_problems(theta, data)
         return gram_of(*self.linearise(theta), data)

@@ -83,7 +83,8 @@ def substituted(
 ) -> list[Output]:
     """The outputs and rows with nodes replaced, and with their changes taken from other places."""
     slopes = [n for o in section for n in (*(c for c, _ in o.row.terms), *o.row.theta.values())]
-    new = dict(zip([*(o.node for o in section), *slopes], _substitute(graph, section, slopes, replaced), strict=True))
+    nodes = [*(o.node for o in section), *slopes]
+    new = dict(zip(nodes, graph.substitute(nodes, replaced), strict=True))
     return [
         Output(
             o.place,
@@ -95,7 +96,3 @@ def substituted(
         )
         for o in section
     ]
-
-
-def _substitute(graph: Graph, section: Sequence[Output], slopes: list[int], replaced: Mapping[int, int]) -> list[int]:
-    return graph.substitute([*(o.node for o in section), *slopes], replaced)

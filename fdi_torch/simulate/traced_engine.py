@@ -51,17 +51,19 @@ class TracedEngine:
         assert jacobian is not None
         return readings, jacobian
 
-    def moments(self, theta: Tensor, data: Readings) -> Tensor:
+    def moments(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C 3"]:
         expect_no_gradient(self, theta, "moments")
         expect_problems(theta, data)
         return moments_of(self.readings(theta), data)
 
-    def gram(self, theta: Tensor, data: Readings) -> Tensor:
+    def gram(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C W W"]:
         expect_no_gradient(self, theta, "gram")
         expect_problems(theta, data)
         return gram_of(*self.linearise(theta), data)
 
-    def observe(self, theta: Tensor, data: Readings, injection: Injection) -> Tensor:
+    def observe(
+        self, theta: Float[Tensor, "*batch P"], data: Readings, injection: Injection
+    ) -> Float[Tensor, "*batch S columns"]:
         expect_no_gradient(self, theta, "observe")
         program = build_program(self.network, self.space.names, False, self.experiment.step_control is not None)
         expect_injectable(self.experiment, injection, program.command_memory + program.reading_memory)
@@ -275,7 +277,7 @@ class _Run:
                 state.changes["seen", i] = self._late_change(j, right, share, by_delay)
 
     def _late_change(self, j: int, right: Tensor, share: Tensor, by_delay: Tensor) -> Tensor:
-        """Slopes of a delayed level; moved: its slope by the delay."""
+        """Slopes of a delayed level. by_delay: its slope by the delay."""
         past = torch.stack([self.full(row[j][1]) for row in self.history])
         index = right.expand(1, *past.shape[1:])
         first, last = past.gather(0, index - 1)[0], past.gather(0, index)[0]

@@ -1,7 +1,7 @@
-// Numbers side by side, as many as a register holds, and the elementary functions of them.
+// Vectors of as many numbers as a register holds, and their elementary functions.
 //
-// A section's expressions are made of these: a value is a `real` where all lanes share it, and a `Vec` where they do
-// not. Every element is computed on its own and always by the same instructions, so no lane knows its neighbours.
+// The expressions of a section use these: a value that all lanes share is a `real`, any other a `Vec`. Every element is
+// computed separately and by the same instructions, so that no lane depends on its neighbours.
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -24,9 +24,9 @@ typedef Bits BitsVec __attribute__((vector_size(REGISTER)));
 #define EACH_VECTOR for (int l = 0; l < LANES; l += VECTOR)
 #define AT(lane) (*reinterpret_cast<Kept *>((lane) + l))
 
-// Mask: whether something holds, for each element. ANY: whether it does anywhere.
+// Mask: a truth value for each element. ANY: whether one is true.
 #if defined(__AVX512F__) && defined(__GNUC__) && !defined(__clang__)
-// What immintrin.h calls, without the third of a second that its 46,000 lines take to compile.
+// The builtins behind immintrin.h, whose 46,000 lines would take a third of a second to compile.
 #if REAL_BITS == 64
 #define BUILT_IN(name, end) __builtin_ia32_##name##pd##end
 #else
@@ -116,7 +116,7 @@ template <class A, class B> INLINE auto MINIMUM(A a, B b) { return WHERE(DIFFERE
 template <class A, class B> INLINE auto MAXIMUM(A a, B b) { return WHERE(DIFFERENT(a, a), a, AT_LEAST(b, a)); }
 template <class A> INLINE A SIGN(A a) { return WHERE(MORE(a, real(0)), real(1), WHERE(LESS(a, real(0)), real(-1), a)); }
 
-// A function of one number, of each in a vector; a compiler takes a library's vector form where it knows one.
+// A scalar function applied to each element; a compiler uses the library's vector version if there is one.
 #define OF_EACH(NAME, function)                                              \
     INLINE Vec NAME(Vec x) {                                                 \
         real y[VECTOR];                                                      \
@@ -151,7 +151,7 @@ template <class A, class B> INLINE auto POW(A x, B n) {
 }
 
 // s^(-1/4) for normal s > 0, to two units in the last place: a guess y, then y (1 + h/4 + 5 h^2/32 + 15 h^3/128) with
-// h = 1 - s y^4. A processor's own rough roots are right to 2^-14; the small term makes up for the one in h^4.
+// h = 1 - s y^4. The processor's approximate roots are accurate to 2^-14; the small term compensates the one in h^4.
 INLINE Vec refined(Vec s, Vec y) {
     const Vec square = y * y, h = 1 - (s * square) * square;
     return y + y * h * (real(0.25) + h * (real(5.0 / 32.0 + 1.3e-8) + h * real(15.0 / 128.0)));
@@ -162,7 +162,7 @@ INLINE Vec INVERSE_FOURTH_ROOT(Vec s) {
     return refined(s, inverse_root * rough_inverse_root(inverse_root));
 }
 #else
-INLINE Vec INVERSE_FOURTH_ROOT(Vec s) {  // the guess from the exponent is right to 3 % only
+INLINE Vec INVERSE_FOURTH_ROOT(Vec s) {  // the guess from the exponent is accurate to 3 % only
     const BitsVec guess = (REAL_BITS == 64 ? Bits(0x4feb028f5c28f800) : Bits(0x4f58147a)) - ((BitsVec)s >> 2);
     return refined(s, refined(s, (Vec)guess));
 }

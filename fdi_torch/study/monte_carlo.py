@@ -6,10 +6,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from fdi_torch.estimate.evolution import evolve
-from fdi_torch.estimate.fitting import Fitting
+from fdi_torch.estimate.evolution import distant_members, evolve
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.misfit import UNEXPLAINED_RATIO, sample_noise
@@ -23,8 +23,6 @@ from fdi_torch.study.trial_readings import limits, make_trials
 STEP_SHARE = 1e-4
 # The sum of correlations has a standard error of 1e-8 at an SNR of 50 dB, a hundred times this tolerance and more.
 CORRELATION_TOLERANCE = 1e-13
-# Starts closer than this share of the box count as one.
-APART = 0.05
 
 
 @dataclass(frozen=True)
@@ -89,8 +87,10 @@ class Fits:
         self.low, self.high = plan.fitting.space.low(), plan.fitting.space.high()
         self.engines: list[Engine] = [plan.fitting.engines(step)[0] for step in plan.method.steps]
 
-    def searched(self, seeds: Tensor, lanes: Tensor | None = None, again: int = 0) -> Tensor:
-        """Best distant members (B, K, P) of differential evolution for each trial.
+    def searched(
+        self, seeds: Int[Tensor, " B"], lanes: Int[Tensor, " B"] | None = None, again: int = 0
+    ) -> Float[Tensor, "B K P"]:
+        """Best distant members of differential evolution for each trial.
 
         Repeated searches alternate between the objectives, because their best basins may differ: the correlation is
         insensitive to gain and offset.
@@ -98,15 +98,16 @@ class Fits:
         every, method = self.method.search_every, self.method
         data = self.data if lanes is None else self.data.of(lanes)
         thinned = Readings(data.values[:, ::every], data.weight[:, ::every])
-        engine = thinned_fitting(self.fitting, every).engines(method.search_step)[0]
+        recordings = tuple(r.every(every) for r in self.fitting.recordings)
+        engine = replace(self.fitting, recordings=recordings).engines(method.search_step)[0]
         first = OBJECTIVES.index(method.objective)
         problem = Problem(self.fitting.space, [Term(engine, thinned)], OBJECTIVES[(first + again) % len(OBJECTIVES)])
         low, high = (bound.expand(len(seeds), -1) for bound in (self.low, self.high))
         result = evolve(problem.cost, low, high, method.search, seeds)
-        return distant(result.population, result.cost, self.high - self.low, method.starts)
+        return distant_members(result.population, result.cost, self.high - self.low, method.starts)
 
-    def refined(self, starts: Tensor, lanes: Tensor | None = None) -> Refined:
-        """Levenberg-Marquardt within the box from every start (B, K, P); the best result continues at finer steps."""
+    def refined(self, starts: Float[Tensor, "B K P"], lanes: Int[Tensor, " B"] | None = None) -> Refined:
+        """Levenberg-Marquardt within the box from every start; the best result continues at finer steps."""
         best = starts
         for engine in self.engines:
             refined = self._refine(engine, best, self.low, self.high, lanes=lanes)
@@ -126,8 +127,8 @@ class Fits:
             fit = fit.file(lanes[better], **values)
         return fit
 
-    def unbounded(self, theta: Tensor, objective: Objective = "likelihood") -> Refined:
-        """Levenberg-Marquardt at the finest step without bounds, from theta (B, P)."""
+    def unbounded(self, theta: Float[Tensor, "B P"], objective: Objective = "likelihood") -> Refined:
+        """Levenberg-Marquardt at the finest step without bounds, from theta."""
         everywhere = torch.full_like(self.low, torch.inf)
         settings = self.method.refine
         if objective == "correlation":
@@ -135,13 +136,12 @@ class Fits:
         refined = self._refine(self.engines[-1], theta[:, None], -everywhere, everywhere, objective, settings)
         return refined.best()
 
-    def standard_errors(self, fit: Refined) -> Tensor:
-        """Standard errors (B, P) from the curvature of the likelihood; 0 where a bound is active."""
-        assert fit.curvature is not None
+    def standard_errors(self, fit: Refined) -> Float[Tensor, "B P"]:
+        """Standard errors from the curvature of the likelihood; 0 where a bound is active."""
         return certainty(fit.curvature, held=fit.held).std
 
-    def correlations(self, theta: Tensor) -> Tensor:
-        """Correlation of each channel at theta (B, P), (B, C)."""
+    def correlations(self, theta: Float[Tensor, "B P"]) -> Float[Tensor, "B C"]:
+        """Correlation of each channel at theta."""
         problem = Problem(self.fitting.space, [Term(self.engines[-1], self.data)])
         return problem.correlations(theta[:, None], torch.arange(len(theta)))[:, 0]
 
@@ -165,34 +165,13 @@ class Fits:
             settings or self.method.refine,
         )
 
-    def _unexplained(self, theta: Tensor) -> Tensor:
-        """(B,) bool: whether residuals exceed the sample-to-sample noise in any channel."""
+    def _unexplained(self, theta: Float[Tensor, "B P"]) -> Bool[Tensor, " B"]:
+        """Whether residuals exceed the sample-to-sample noise in any channel."""
         squares = self.engines[-1].moments(theta[:, None], self.data)[:, 0, :, 1]
         count = self.data.count
         noise = torch.stack([sample_noise(v, w) for v, w in zip(self.data.values, self.data.weight, strict=True)])
         allowed = UNEXPLAINED_RATIO * noise + STEP_SHARE * (spread_of(self.data) / count).sqrt()
         return ((squares / count).sqrt() > allowed).any(-1)
-
-
-def thinned_fitting(fitting: Fitting, every: int) -> Fitting:
-    """The problem with every n-th sample of its recordings."""
-    return replace(fitting, recordings=tuple(r.every(every) for r in fitting.recordings))
-
-
-def distant(population: Tensor, cost: Tensor, width: Tensor, count: int) -> Tensor:
-    """The best members (B, K, P) of populations (B, N, P), sorted by cost, that differ from each other.
-
-    If too few differ, the best is repeated.
-    """
-    usable = torch.isfinite(cost) & torch.isfinite(population).all(-1)
-    chosen = [population[:, 0]]
-    for _ in range(count - 1):
-        near = torch.stack([((population - c[:, None]) / width).abs().amax(-1) <= APART for c in chosen]).any(0)
-        differs = usable & ~near
-        index = differs.to(torch.int8).argmax(-1)
-        next_best = population[torch.arange(len(population)), index]
-        chosen.append(torch.where(differs.any(-1)[:, None], next_best, chosen[0]))
-    return torch.stack(chosen, dim=1)
 
 
 def is_converged(status: str) -> bool:

@@ -12,6 +12,7 @@ from itertools import combinations, groupby
 from typing import Literal
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from fdi_torch.estimate.draws import stream, uniform
@@ -116,27 +117,27 @@ class Plan:
                 if chosen:
                     yield replace(block, first=chosen[0] - block.offset, last=chosen[-1] + 1 - block.offset)
 
-    def noise(self, block: Block, shape: tuple[int, ...]) -> Tensor:
-        """Standard normal draws (trials, *shape), with one generator per trial."""
+    def noise(self, block: Block, shape: tuple[int, ...]) -> Float[Tensor, "trials ..."]:
+        """Standard normal draws, with one generator per trial."""
         base = _key(self.seed, _NOISE, block.setting)
         # The generator uses 32 bits of its seed; consecutive seeds give each trial of a setting its own.
         seeds = [(base + trial) % 2**32 for trial in range(block.first, block.last)]
         made = [torch.Generator().manual_seed(seed) for seed in seeds]
         return torch.stack([torch.randn(shape, generator=g, dtype=torch.float64) for g in made])
 
-    def search_seeds(self, block: Block, again: int = 0) -> Tensor:
-        """Seeds (trials,) int64 of a search; each repetition has other ones."""
+    def search_seeds(self, block: Block, again: int = 0) -> Int[Tensor, " trials"]:
+        """Seeds of a search; each repetition has other ones."""
         base = _key(self.seed, _SEARCH, block.setting, again)
         return stream(torch.arange(block.first, block.last) + base)
 
 
-def fixed_faults(theta: Tensor, trials: int) -> Tensor:
-    """The same fault (P,) in every trial, (trials, P)."""
+def fixed_faults(theta: Float[Tensor, " P"], trials: int) -> Float[Tensor, "trials P"]:
+    """The same fault in every trial."""
     return theta.expand(trials, -1).clone()
 
 
-def uniform_faults(space: ParameterSpace, trials: int, seed: int, setting: int = 0) -> Tensor:
-    """Faults drawn evenly from the box, (trials, P)."""
+def uniform_faults(space: ParameterSpace, trials: int, seed: int, setting: int = 0) -> Float[Tensor, "trials P"]:
+    """Faults drawn evenly from the box."""
     unit = _unit_draws(seed, setting, trials, len(space))
     return space.low() + (space.high() - space.low()) * unit
 
@@ -149,8 +150,8 @@ def fault_modes(space: ParameterSpace) -> list[tuple[int, ...]]:
 
 def mode_faults(
     space: ParameterSpace, mode: Iterable[int], smallest: float, trials: int, seed: int, setting: int
-) -> Tensor:
-    """Faults of the parameters of `mode` only, (trials, P), the others nominal.
+) -> Float[Tensor, "trials P"]:
+    """Faults of the parameters of `mode` only, the others nominal.
 
     Each is uniform over the part of its box that is at least `smallest` of the box's width away from nominal.
     """

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.estimate.proportion import wilson
@@ -97,14 +98,9 @@ def summarise(plan: Plan, setting: Setting, trials: Sequence[Trial], tolerance: 
     )
 
 
-def column(trials: Sequence[Trial], name: str) -> Tensor:
-    """One array of all trials, stacked (trials, ...)."""
+def column(trials: Sequence[Trial], name: str) -> Float[Tensor, "trials ..."]:
+    """One array of all trials, stacked."""
     return torch.tensor([trial.numbers[name] for trial in trials], dtype=torch.float64)
-
-
-def bound_name(estimator: str) -> str:
-    """Name of the bound that applies to an estimator: the correlation is insensitive to a reading's scale."""
-    return "correlation_bound" if estimator == "correlation" else "bound"
 
 
 def _scores(
@@ -132,26 +128,28 @@ def _scores(
 
 
 def _failures(name: str, error: Tensor, trials: Sequence[Trial], setting: Setting, allowed: Tensor) -> int:
-    if setting.snr_db is not None:
-        allowed = STUCK * column(trials, bound_name(name))
+    if (
+        setting.snr_db is not None
+    ):  # the correlation is insensitive to gain and offset of a reading, and has its own bound
+        allowed = STUCK * column(trials, "correlation_bound" if name == "correlation" else "bound")
     return int((~(error.abs() <= allowed)).any(-1).sum())
 
 
-def mean_with_error(values: Tensor) -> Ratio:
-    """Mean of (N,) with its 95 % interval from the sample variance."""
+def mean_with_error(values: Float[Tensor, " N"]) -> Ratio:
+    """Mean with its 95 % interval from the sample variance."""
     mean = float(values.mean())
     reach = _REACH * float(values.std()) / math.sqrt(len(values)) if len(values) > 1 else math.inf
     return Ratio(mean, mean - reach, mean + reach)
 
 
-def rms_with_error(values: Tensor) -> Ratio:
-    """Root mean square of (N,) with its 95 % interval from the variance of the squares."""
+def rms_with_error(values: Float[Tensor, " N"]) -> Ratio:
+    """Root mean square with its 95 % interval from the variance of the squares."""
     square = mean_with_error(values.square())
     return Ratio(math.sqrt(square.value), math.sqrt(max(square.low, 0.0)), math.sqrt(square.high))
 
 
-def rms_ratio(errors: Tensor, others: Tensor) -> Ratio:
-    """Ratio of the root mean squares of paired errors (N,), with its 95 % interval (delta method)."""
+def rms_ratio(errors: Float[Tensor, " N"], others: Float[Tensor, " N"]) -> Ratio:
+    """Ratio of the root mean squares of paired errors, with its 95 % interval (delta method)."""
     a, b = errors.square(), others.square()
     ratio = math.sqrt(float(a.mean() / b.mean()))
     error = float((a / a.mean() - b / b.mean()).std()) / math.sqrt(len(a)) if len(a) > 1 else math.inf
@@ -159,7 +157,7 @@ def rms_ratio(errors: Tensor, others: Tensor) -> Ratio:
     return Ratio(ratio, ratio / factor, ratio * factor)
 
 
-def covered(error: Tensor, std: Tensor) -> Ratio:
+def covered(error: Float[Tensor, " N"], std: Float[Tensor, " N"]) -> Ratio:
     """Share of 95 % intervals that contain the truth, with its interval (Wilson 1927)."""
     return share(int((error.abs() <= _REACH * std).sum()), len(error))
 

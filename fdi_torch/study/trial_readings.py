@@ -57,7 +57,8 @@ class Limits:
 
     bound: Cramer-Rao bound with known initial levels and noise level; infinite for an undetermined parameter.
     correlation_bound: the same if gain and offset of each channel are unknown, as for the correlation objective.
-    linearised: theta_0 + (J' W J)^-1 J' W noise, the efficient estimator of the linearised model on the same draws.
+    linearised: theta_0 + (J' W J)^-1 J' W noise, the efficient estimator of the linearised model on the same draws; NaN
+    where the covariance is not defined.
     """
 
     bound: Tensor
@@ -74,7 +75,7 @@ def limits(engine: Engine, trials: Trials) -> Limits:
     information, score = _summed(weight * gram[..., :-3, :-3]), _summed(weight * gram[..., :-3, -3:-2])[..., 0]
     joint = certainty(information)
     correlation_std = _without_gain_and_offset(engine, trials, predicted).std
-    return Limits(joint.std, correlation_std, trials.truth + _solved(joint, score))
+    return Limits(joint.std, correlation_std, trials.truth + apply(joint.covariance, score))
 
 
 def _without_gain_and_offset(engine: Engine, trials: Trials, predicted: Tensor) -> Certainty:
@@ -87,11 +88,6 @@ def _without_gain_and_offset(engine: Engine, trials: Trials, predicted: Tensor) 
     share = along / torch.where(varies, power, 1.0)[..., None]
     projected = centred[..., :-3, :-3] - along[..., :, None] * share[..., None, :]
     return certainty(_summed((trials.std**-2)[..., None, None] * projected))
-
-
-def _solved(joint: Certainty, score: Tensor) -> Tensor:
-    """Covariance times score; NaN where the covariance is not defined."""
-    return apply(joint.covariance, score)
 
 
 def _summed(per_channel: Tensor) -> Tensor:

@@ -67,7 +67,7 @@ def write_everything(log: RunLog, samples: int = 50) -> None:
     )
     log.predictions(time, outputs, np.full((samples, 3), 0.5), levels, ("m",) * 3, mask=mask, noise_std=[1e-2] * 3)
     log.fault("leak", "T1", True, confidence=0.99, size=0.1, size_std=0.01, unit="1", flow=1e-5, hole_diameter=3e-3)
-    log.gap_where("Q1", 0.91, 1e-9)
+    log.gap_where("Q1", 0.91, p_value=1e-9)
     log.gap_verdict(VERDICT)
     log.trial(0, {"T1.leak.size": 0.1, "error": 1e-3}, group="snr 50", seed=2**63, status="converged")
     log.summary("snr 50", 1, {"rmse": 1e-3})

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import orjson
 import pytest
 import torch
 
-from fdi_torch.logbook.payload import decode, encode, pack, unpack
+from fdi_torch.logbook.payload import decode, pack, plain, unpack
+
+
+def encode(fields: Mapping[str, Any]) -> bytes:
+    return orjson.dumps(plain(fields))
 
 
 def bits(value: float) -> bytes:

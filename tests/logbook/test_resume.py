@@ -68,7 +68,7 @@ def test_a_resumed_run_says_the_same(tmp_path: Path, generations: int) -> None:
 def test_nothing_to_go_on_from(tmp_path: Path) -> None:
     assert set_aside(tmp_path / "a.mcap") is None and unfinished(tmp_path / "a.mcap") is None
     with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
-        log.population(0, {"population": np.zeros(1)}, problem=1)
+        log.say("nothing was searched")
     assert last_state(read_run(tmp_path / "a.mcap")) is None
 
 

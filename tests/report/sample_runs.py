@@ -64,7 +64,7 @@ def write_gap(path: Path) -> Path:
     with RunLog(path, "gap", config_text="plant: three_tank\n", **FIXED) as log:
         log.recording(time, inputs, read, ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3)
         for place in GAP_ANSWER["where"]:
-            log.gap_where(place["location"], place["share"], 1e-9)
+            log.gap_where(place["location"], place["share"], p_value=1e-9)
         log.gap_verdict(GAP_ANSWER)
         log.result_arrays(
             recalibrated=recalibrated,

@@ -132,41 +132,41 @@ class Ascent:
                 break
         return best
 
-    def with_finer_positions(self, known: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
+    def with_finer_positions(self, current: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
         """With further regressors under the same noise, until none is worth its selection.
 
         The estimated noise falls only after most of them were added, so that each alone seems to gain little.
         """
-        at, used = known.discrepancy, known.regressed.used
-        positions = Positions(known.regression, known.location, known.under, at, used, self.generator)
-        while finer := positions.best(known.discrepancy, known.regressed.used):
-            further = self._changed(known, finer)
-            if further.gain - known.gain < CONVERGED:
+        at, used = current.discrepancy, current.regressed.used
+        positions = Positions(current.regression, current.location, current.under, at, used, self.generator)
+        while finer := positions.best(current.discrepancy, current.regressed.used):
+            extended = self._changed(current, finer)
+            if extended.gain - current.gain < CONVERGED:
                 break
-            known = further
-        return known
+            current = extended
+        return current
 
-    def _with_finer_frequency(self, known: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
-        used, regression, at = known.regressed.used, known.regression, known.discrepancy
-        finer = with_best_frequency(regression, known.location, known.under, regression.fit, at, used)
-        return self._changed(known, finer) if finer else known
+    def _with_finer_frequency(self, current: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
+        used, regression, at = current.regressed.used, current.regression, current.discrepancy
+        finer = with_best_frequency(regression, current.location, current.under, regression.fit, at, used)
+        return self._changed(current, finer) if finer else current
 
-    def _changed(self, known: EvaluatedDiscrepancy, discrepancy: Discrepancy) -> EvaluatedDiscrepancy:
+    def _changed(self, current: EvaluatedDiscrepancy, discrepancy: Discrepancy) -> EvaluatedDiscrepancy:
         """The same with a discrepancy that differs in some columns."""
-        whitened = known.whitened.with_columns(discrepancy.columns)
-        regressed = whitened.sparse_fit(column_costs(discrepancy.choices, self.largest), known.regressed.precision)
-        return replace(known, discrepancy=discrepancy, whitened=whitened, regressed=regressed)
+        whitened = current.whitened.with_columns(discrepancy.columns)
+        regressed = whitened.sparse_fit(column_costs(discrepancy.choices, self.largest), current.regressed.precision)
+        return replace(current, discrepancy=discrepancy, whitened=whitened, regressed=regressed)
 
-    def _with_likely_noise(self, known: EvaluatedDiscrepancy, climb: bool) -> EvaluatedDiscrepancy:
-        at, used = known.discrepancy, known.regressed.used
-        further = LinearParameters(at.columns[used], torch.sqrt(known.regressed.precision[used]))
-        fit = known.regression.fit
-        likely = estimate_disturbances(self.fitter, fit, at.linearised, further, known.noise, climb).noise
-        return self.evaluate(known.regression, at, known.location, likely, known.regressed.precision)
+    def _with_likely_noise(self, current: EvaluatedDiscrepancy, climb: bool) -> EvaluatedDiscrepancy:
+        at, used = current.discrepancy, current.regressed.used
+        coefficients = LinearParameters(at.columns[used], torch.sqrt(current.regressed.precision[used]))
+        fit = current.regression.fit
+        likely = estimate_disturbances(self.fitter, fit, at.linearised, coefficients, current.noise, climb).noise
+        return self.evaluate(current.regression, at, current.location, likely, current.regressed.precision)
 
-    def _refitted(self, known: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
+    def _refitted(self, current: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
         """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew."""
-        data, fit = self.fitter.data, known.regression.fit
-        corrected = replace(data, readings=data.readings - known.explained)
-        new = known.under.of(corrected).fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
-        return self.about(new, known.explained, known.noise, known.location, known.discrepancy.frequency)
+        data, fit = self.fitter.data, current.regression.fit
+        corrected = replace(data, readings=data.readings - current.explained)
+        new = current.under.of(corrected).fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
+        return self.about(new, current.explained, current.noise, current.location, current.discrepancy.frequency)

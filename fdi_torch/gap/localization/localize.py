@@ -79,21 +79,21 @@ def localize(
     for place, (expected, start) in sorted(first_order.items(), key=lambda item: -item[1][0]):
         if len(evaluated) >= CALIBRATION_PLACES and expected + excess < needed:
             break
-        found = ascent.evaluate(regression, regression.of(place), place, start)
-        found = ascent.climbed(ascent.with_finer_positions(found), needed)
-        itself = max(itself, found.without if found.regression is regression else -math.inf)
-        excess = max(excess, found.gain - expected)
-        if not is_rounding_error(fitter, place, float(found.explained.square().mean(dim=0).max().sqrt())):
-            needed, evaluated[place] = max(needed, found.gain + math.log(RARE)), found.localized(fitter)
+        best = ascent.evaluate(regression, regression.of(place), place, start)
+        best = ascent.climbed(ascent.with_finer_positions(best), needed)
+        itself = max(itself, best.without if best.regression is regression else -math.inf)
+        excess = max(excess, best.gain - expected)
+        if not is_rounding_error(fitter, place, float(best.explained.square().mean(dim=0).max().sqrt())):
+            needed, evaluated[place] = max(needed, best.gain + math.log(RARE)), best.localized(fitter)
     before = needed - CONVERGED  # nothing is compared about an irrelevant discrepancy
     while evaluated and (likeliest := max(evaluated.values(), key=gain_of)).gain - before > CONVERGED:
         before = likeliest.gain
-        for place, known in evaluated.items():
+        for place, earlier in evaluated.items():
             # A larger noise than that which the likeliest discrepancy left hides what another place explains as well.
-            if known is not likeliest:
-                again = ascent.about(known.fit, known.explained, likeliest.noise, place, known.frequency)
-                again = ascent.climbed(ascent.with_finer_positions(again), needed)
-                evaluated[place] = max(known, again.localized(fitter), key=gain_of)
+            if earlier is not likeliest:
+                best = ascent.about(earlier.fit, earlier.explained, likeliest.noise, place, earlier.frequency)
+                best = ascent.climbed(ascent.with_finer_positions(best), needed)
+                evaluated[place] = max(earlier, best.localized(fitter), key=gain_of)
     localized = list(evaluated.values())
     random = [*drifting_sensors(regression, likely, places, base, needed)]
     random += random_flows(regression, likely, places, base, needed)
@@ -120,8 +120,8 @@ def localize_beside(
         processes += random_flows(regression, likely, [at.location], base, needed)
         return max(processes, key=gain_of, default=None)
     ascent = Ascent(fitter, fit, noise, base)
-    found = ascent.about(fit, at.explained, at.noise, at.location, at.frequency)
-    return ascent.climbed(ascent.with_finer_positions(found), needed).localized(fitter)
+    first = ascent.about(fit, at.explained, at.noise, at.location, at.frequency)
+    return ascent.climbed(ascent.with_finer_positions(first), needed).localized(fitter)
 
 
 def _first_order_gains(

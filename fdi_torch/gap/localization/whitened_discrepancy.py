@@ -15,6 +15,7 @@ from fdi_torch.gap.localization.discrepancy_regression import Columns, Discrepan
 from fdi_torch.gap.localization.sparse_regression import SparseFit, sparse_fit
 
 MOST_ROWS = 1000  # rows per channel from which columns are selected; more samples are summed in groups
+WHITENED = 64  # columns that are whitened together
 
 
 @dataclass(frozen=True)
@@ -42,10 +43,9 @@ class _Projection:
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Columns (S, C, M), the same whitened, and what the projection for the selection leaves of them (R, M)."""
+    """Columns (S, C, M), and what the projection for the selection leaves of them once they are whitened (R, M)."""
 
     columns: Tensor
-    white: Tensor
     remaining: Tensor
 
 
@@ -68,8 +68,9 @@ class WhitenedDiscrepancy:
         self._blocks = list(map(self._block, discrepancy.columns.blocks))
 
     def _block(self, columns: Tensor) -> _Block:
-        white = self._under.whiten(columns)
-        return _Block(columns, white, self._selecting.remaining(white))
+        parts = columns.split(WHITENED, dim=-1)
+        remaining = [self._selecting.remaining(self._under.whiten(part)) for part in parts]
+        return _Block(columns, torch.cat(remaining, dim=1))
 
     def with_columns(self, columns: Columns) -> WhitenedDiscrepancy:
         """The same with other columns (S, C, M), of which only new blocks are whitened."""
@@ -89,7 +90,8 @@ class WhitenedDiscrepancy:
         score = torch.cat([(b.remaining.T @ self._selecting.residual).squeeze(1) for b in self._blocks])
         selected = sparse_fit(gram, score, costs, start)
         used = selected.used
-        columns = self._exact.remaining(Columns(tuple(b.white for b in self._blocks))[used])
+        in_use = Columns(tuple(b.columns for b in self._blocks))[used]
+        columns = self._exact.remaining(self._under.whiten(in_use))
         score = (columns.T @ self._exact.residual).squeeze(1)
         return sparse_fit(columns.T @ columns, score, costs[used], selected.precision[used]).among(used)
 
