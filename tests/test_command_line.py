@@ -115,6 +115,17 @@ def test_check_shows_channels_and_findings(rig: str, capsys: pytest.CaptureFixtu
     assert "h1       output  cm          40" in shown
 
 
+def test_check_says_first_that_readings_lie_beyond_a_tank(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A plant file whose sizes are still those of the example, 60 cm of height, for levels up to 2 m."""
+    rows = [f"{10 * k},{4 + k % 2},{1200 + 8 * (k % 90)},{800 + 3 * (k % 90)}" for k in range(300)]
+    (tmp_path / "run.csv").write_text("t_s,Q_m3_h,hA_mm,hB_mm\n" + "\n".join(rows) + "\n")
+    assert cli.main(["new", "plant", "--out", str(tmp_path / "rig.yaml"), "--quiet"]) == cli.DONE
+    words = ["--plant", str(tmp_path / "rig.yaml"), "--recording", str(tmp_path / "run.csv")]
+    assert cli.main(["check", *words]) == cli.DONE
+    findings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("- ")]
+    assert "lie above the rim of A" in findings[0]
+
+
 def test_a_file_with_other_names_is_refused_with_the_lines_that_map_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

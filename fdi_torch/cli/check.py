@@ -25,6 +25,8 @@ from fdi_torch.recording import Recording
 from fdi_torch.recordings.channel_finding import ChannelFinding
 from fdi_torch.recordings.check import ChannelSummary, RecordingCheck, check_recording
 
+WRONG = ("range", "slip", "unit")  # findings that no diagnosis accepts or survives
+
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     plant, recordings, base = _wanted(arguments)
@@ -45,13 +47,17 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             screen.say(f"usable with all inputs known: {spans}")
     if checks and arguments.config is None:
         named = f"--plant {arguments.plant} --recording {arguments.recording or arguments.file}"
-        screen.say(f"next: fdi gap {named} says whether the plant file explains it")
+        wrong = any(f.kind in WRONG for check in checks for f in check.findings)
+        correct = "correct the plant file or the columns, then check again; " if wrong else ""
+        screen.say(f"next: {correct}fdi gap {named} says whether the plant file explains it")
     screen.result({"format": "fdi_torch.check/1", "plant": plant, "recordings": checks})
     return 0
 
 
 def _checked(whole: Recording, plant: PlantDescription) -> RecordingCheck:
-    """The check of a recording, with refused or masked channels first."""
+    """The check of a recording: readings beyond the tanks first, as they make the rest meaningless, then refused or
+    masked channels.
+    """
     check = check_recording(whole, plant)
     examinations = [examined(plant, part) for part in whole.known_segments()]
     problems = [_slip(", ".join(e.fault.channels), e.fault.text) for e in examinations if e.fault]
@@ -62,7 +68,8 @@ def _checked(whole: Recording, plant: PlantDescription) -> RecordingCheck:
     ]
     refused = {channel for e in examinations if e.fault for channel in e.fault.channels}
     doubts = [f for f in check.findings if not (f.kind == "undersampled" and f.channel in refused)]
-    return replace(check, findings=(*problems, *doubts))
+    beyond = [f for f in doubts if f.kind == "range"]
+    return replace(check, findings=(*beyond, *problems, *(f for f in doubts if f not in beyond)))
 
 
 def _slip(channels: str, text: str) -> ChannelFinding:
