@@ -34,7 +34,7 @@ EQUATIONS = (
     Equation((9, 10, 11, 12), "equal rates at equal states give equal parameters; here a rank and standard errors, not "
              "an assumption", ("estimate.information:certainty", "estimate.combinations:undetermined_groups")),
     Equation((13,), "fit by the sum of correlations within a box",
-             ("estimate.objectives:Problem.cost", "estimate.evolution:evolve")),
+             ("estimate.objectives:Problem.cost", "estimate.hybrid:estimate_parameters")),
     Equation((14,), "Luenberger-like observer with nominal parameters",
              ("monitor.observer:Observer", "monitor.noise_model:learn_noise")),
     Equation((15,), "conventional adaptive observer: parameters integrate the residual",
