@@ -78,3 +78,13 @@ def test_a_fault_after_an_alarm_by_chance_is_told_as_soon_as_without_that_alarm(
     assert ("retired", 1) in kinds and ("isolated", 2) in kinds
     told = next(e for e in events if e.faults)
     assert told.faults == ("T3.leak.size",) and told.time < 340.0
+
+
+def test_no_onset_lies_in_the_part_that_is_declared_fault_free() -> None:
+    """The flows are learnt from that part and the window, so that they must not overlap either."""
+    watch = monitor(lookback=100.0, confirm=20.0, incipient=True)
+    samples = recorded(lambda t: SPACE.vector({"T3.leak.size": 2e-4 * max(t - 150.0, 0.0)}), 260)
+    state = watch.start(samples, learning_until=200.0)
+    state, events = watch.advance(state, samples.segment(1, 260))
+    told = [e.onset for e in events if e.faults]
+    assert told and all(onset is not None and onset >= 199.0 for onset in told)

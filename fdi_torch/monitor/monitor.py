@@ -158,8 +158,11 @@ class Monitor:
         earliest = max(moved.earliest_start, self.alarms.earliest_start(moved))
         moved = drop_old_samples(replace(moved, earliest_start=earliest), self.fewest)
         if learning:
-            ended = moved.now >= state.learning_until
-            return (replace(moved, learning_until=LONG_AGO, detector_memory=None) if ended else moved), count, []
+            if moved.now >= state.learning_until:  # no window reaches into the part that is declared fault-free
+                moved = replace(
+                    moved, learning_until=LONG_AGO, detector_memory=None, earliest_start=state.learning_until
+                )
+            return moved, count, []
         state, events = self.alarms.on_threshold(moved) if raised else (moved, [])
         if not raised and state.now >= self.alarms.next_fit(state):
             state, events = self.alarms.on_schedule(state)
