@@ -98,5 +98,5 @@ def test_an_end_of_a_range_is_reached_except_the_nominal_value_and_a_physical_li
     assert [end_reached(gain, value) for value in (0.0, 1.0, 1.99, 1.9995, 2.4)] == [None, None, None, 2.0, 2.0]
     bias = Parameter("h1.sensor_bias.bias", "m", 0.0, -0.1, 0.1)
     assert end_reached(bias, -0.1) == -0.1 and size_of(bias, -0.12, 0.01).std == math.inf
-    assert size_of(bias, -0.12, 0.01).shown == "h1.sensor_bias.bias at most -10 cm, the end of its range"
+    assert size_of(bias, -0.12, 0.01).shown == "at most -10 cm, the end of its range"
     assert end_reached(replace(gain, low=1.0, extremes=(), high=math.inf), 1.0) is None

@@ -155,7 +155,7 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
     fdi("new", "run", "--plant", "rig.yaml", "--recording", "trend.csv")
     assert load_monitor("monitor.yaml").config.recording.file == "trend.csv"
     assert load_run("run.yaml").config.recordings[0].file == "trend.csv"
-    assert "next: fdi gap --plant rig.yaml --recording trend.csv" in capsys.readouterr().out
+    assert "then check again; fdi gap --plant rig.yaml --recording trend.csv says" in capsys.readouterr().out
     Path("none.csv").write_text("t_s,a,b\n0,1,2\n1,1,2\n")
     assert cli.main(["new", "plant", "--recording", "none.csv", "--out", "none.yaml"]) != cli.DONE
     assert "expected a column of a level with its unit in the header" in capsys.readouterr().err
