@@ -104,14 +104,17 @@ def test_a_second_effect_that_only_corrects_the_law_of_the_first_is_not_a_cause(
     assert [(c.effect, c.location) for c in answer.causes] == [("pump_lag", "Q1")]
 
 
-def test_an_effect_whose_law_is_slightly_wrong_is_no_unknown() -> None:
-    """A draw that opens and closes in 20 s; the library's begins and ends at once."""
+def test_an_effect_whose_law_is_slightly_wrong_is_likelier_than_an_unknown() -> None:
+    """A draw that opens and closes in 20 s; the library's begins and ends at once.
+
+    It differs by 2 %, as few true effects and few other laws do: it is likelier, but not certain.
+    """
     commanded = recorded({}, 8).inputs
     time, net = torch.arange(len(commanded), dtype=torch.float64), commanded.clone()
     net[:, 0] -= 1.5e-5 * (((time - 250.0) / 20.0).clamp(0.0, 1.0) - ((time - 520.0) / 20.0).clamp(0.0, 1.0))
     answer = diagnose(nominal_plant(), replace(recorded({}, 8, inputs=net, std=2e-4), inputs=commanded))
     assert [(c.effect, c.location) for c in answer.causes] == [("unmetered_flow", "T1")]
-    assert answer.verdict == "named"
+    assert answer.verdict == "ambiguous" and answer.to_dict()["posterior"][0]["probability"] > 0.5
 
 
 def test_the_influence_of_an_effect_is_the_chi_square_that_a_fit_without_it_adds() -> None:
@@ -132,6 +135,22 @@ def test_effects_that_only_compensate_a_sensor_that_jumps_are_not_causes() -> No
     readings[400:, 2] -= 0.0065
     answer = diagnose(nominal_plant(), replace(recording, outputs=readings))
     assert [(c.effect, c.location) for c in answer.causes] == [("pump_gain", "Q1"), ("unknown", "h3")]
+
+
+@pytest.mark.slow
+def test_a_random_discrepancy_that_exceeds_an_effect_is_no_error_of_its_law() -> None:
+    """A sensor whose clock runs unevenly, beside a leak: a lag or a delay of it describes the mean lateness only."""
+    recording, generator = recorded({"T1.leak.size": 0.2}, 3, std=2e-4), torch.Generator().manual_seed(3)
+    samples, late = len(recording.outputs), 0.0
+    shocks = 0.6 * torch.randn(samples, generator=generator, dtype=torch.float64)
+    readings, level = recording.outputs.clone(), recording.outputs[:, 1]
+    for k in range(1, samples):
+        late = 0.98 * late + float(shocks[k])
+        at = max(k - abs(late), 0.0)
+        before, share = int(at), at - int(at)
+        readings[k, 1] = (1.0 - share) * level[before] + share * level[min(before + 1, samples - 1)]
+    answer = diagnose(nominal_plant(), replace(recording, outputs=readings))
+    assert [(c.effect, c.location) for c in answer.causes] == [("leak", "T1"), ("unknown", "h2")]
 
 
 @pytest.mark.slow

@@ -95,8 +95,7 @@ class HypothesisSearch:
         weight = explanation.log_weight + at.gain
         if not effects:
             return [CauseHypothesis(explanation, causes, weight + self._log_odds, at)]
-        random = at.predicted is None  # its size is not known
-        error = None if random else relative_size(self.pool.fitter, explanation.fit, at.size, effects)
+        error = relative_size(self.pool.fitter, explanation.fit, at.size, effects) if at.size > 0.0 else None
         law, other = _shares([self._log_odds_of_law(error)])
         other += sum(self._log_selection(place) for _, place in effects)  # they describe a part of the other law
         return [
