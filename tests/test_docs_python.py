@@ -17,9 +17,9 @@ def test_the_page_runs_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     names: dict[str, object] = {"__name__": "page"}
     for code in re.findall(r"```python\n(.*?)```", PAGE, flags=re.S):
         exec(compile(code, "docs/how-to/python.md", "exec"), names)
-    assert "single fault: A.leak.size" in names["found"].headline  # type: ignore[attr-defined]
+    assert "single fault: leak at A" in names["found"].headline  # type: ignore[attr-defined]
     assert "leak at A" in names["gap"].headline  # type: ignore[attr-defined]
-    assert "B.leak.size" in names["events"].headline  # type: ignore[attr-defined]
+    assert "leak at B" in names["events"].headline  # type: ignore[attr-defined]
     assert tuple(names["readings"].shape) == (1000, 601, 2)  # type: ignore[attr-defined]
     assert tuple(names["jacobian"].shape) == (10, 601, 2, 2)  # type: ignore[attr-defined]
     slope = names["slope"]
