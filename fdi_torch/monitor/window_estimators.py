@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.draws import problem_seeds
-from fdi_torch.estimate.evolution import evolve
+from fdi_torch.estimate.evolution import distant_members, evolve
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.information import certainty
@@ -28,8 +28,7 @@ SEARCH_STEP, REFINE_STEP = 5.0, 0.5
 SEARCH = EvolutionSettings(population=40, evaluations=2000)
 REFINE = RefineSettings(iterations=60, decrease_tolerance=1e-6)
 STARTS = 8  # random starts of the multi-start refinement, in addition to the previous estimate
-# Number of members of the search that are refined; members within this share of the box count as identical.
-REFINED, APART = 3, 0.05
+REFINED = 3  # clearly different members of the search that are refined
 # A channel is constant if its standard deviation is less than this multiple of its sample-to-sample noise.
 CONSTANT_RATIO = 1.2
 
@@ -125,22 +124,7 @@ def _searched(window: WindowData, before: Tensor, seed: int) -> tuple[Tensor, Te
     problem = window.problem(min(longest, span / 20.0), objective)
     seeds = problem_seeds(seed, (window.runs,), low.device)
     result = evolve(problem.cost, low, high, SEARCH, seeds, first_guess=before.clamp(low, high).unsqueeze(1))
-    return _distant(result.population, result.cost, (high - low)[0]), result.best_cost
-
-
-def _distant(population: Tensor, cost: Tensor, width: Tensor) -> Tensor:
-    """The best member of each population (R, N, P), sorted by cost, and the next best ones that differ
-    from the chosen.
-    """
-    usable = torch.isfinite(cost) & torch.isfinite(population).all(-1)
-    chosen = [population[:, 0]]
-    for _ in range(REFINED - 1):
-        near = torch.stack([((population - c[:, None]) / width).abs().amax(-1) <= APART for c in chosen]).any(0)
-        distant = usable & ~near
-        index = distant.to(torch.int8).argmax(-1)
-        next_best = population[torch.arange(len(population)), index]
-        chosen.append(torch.where(distant.any(-1)[:, None], next_best, chosen[0]))
-    return torch.stack(chosen, dim=1)
+    return distant_members(result.population, result.cost, (high - low)[0], REFINED), result.best_cost
 
 
 def _refined(window: WindowData, starts: Tensor) -> WindowEstimate:

@@ -36,7 +36,7 @@ from fdi_torch.simulate.output_map import LinearisedOutputs
 from fdi_torch.simulate.resampling import interpolate
 from fdi_torch.simulate.scan import product, scan_in_time
 
-BATCH = 64  # regressors whose influence is computed together
+BATCH = 64  # regressors whose influence is computed, or whitened, together
 
 
 @dataclass(frozen=True)

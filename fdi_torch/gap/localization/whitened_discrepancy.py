@@ -11,11 +11,10 @@ from torch import Tensor
 from fdi_torch.estimate.linear_parameters import decomposed, without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.localization.discrepancy_regression import Columns, Discrepancy
+from fdi_torch.gap.localization.discrepancy_regression import BATCH, Columns, Discrepancy
 from fdi_torch.gap.localization.sparse_regression import SparseFit, sparse_fit
 
 MOST_ROWS = 1000  # rows per channel from which columns are selected; more samples are summed in groups
-WHITENED = 64  # columns that are whitened together
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ class WhitenedDiscrepancy:
         self._blocks = list(map(self._block, discrepancy.columns.blocks))
 
     def _block(self, columns: Tensor) -> _Block:
-        parts = columns.split(WHITENED, dim=-1)
+        parts = columns.split(BATCH, dim=-1)
         remaining = [self._selecting.remaining(self._under.whiten(part)) for part in parts]
         return _Block(columns, torch.cat(remaining, dim=1))
 
