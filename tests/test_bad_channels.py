@@ -20,10 +20,10 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
     ROUNDS,
     blocked_recording,
     blockwise_fit,
-    first_order_log_likelihood,
     noise_of,
     thinned,
 )
+from fdi_torch.gap.preprocess.first_order_likelihood import FirstOrderLikelihood
 from fdi_torch.gap.trajectory_problem import BEHIND
 from fdi_torch.jobs.logged_monitor import usable_part
 from fdi_torch.recording import Recording
@@ -134,10 +134,10 @@ def test_a_swap_is_compared_to_first_order() -> None:
     right, wrong = (blocked_recording(plant, thinned(r), noise_of(plant, r)) for r in (run, swapped))
     fit, fit_to_swapped = blockwise_fit(right), blockwise_fit(wrong)
     # Where the constants are already the best, a further step changes nothing.
-    assert first_order_log_likelihood(right, fit) == pytest.approx(fit.log_likelihood, abs=0.1)
+    assert FirstOrderLikelihood(fit)(right) == pytest.approx(fit.log_likelihood, abs=0.1)
     gain = fit.log_likelihood - fit_to_swapped.log_likelihood
-    assert first_order_log_likelihood(right, fit_to_swapped) - fit_to_swapped.log_likelihood > 0.5 * gain
-    assert first_order_log_likelihood(wrong, fit) - fit.log_likelihood < -0.5 * gain
+    assert FirstOrderLikelihood(fit_to_swapped)(right) - fit_to_swapped.log_likelihood > 0.5 * gain
+    assert FirstOrderLikelihood(fit)(wrong) - fit.log_likelihood < -0.5 * gain
 
 
 def late(run: Recording, seconds: int) -> Recording:

@@ -13,7 +13,8 @@ from fdi_torch.estimate.levenberg_marquardt import levenberg_marquardt
 from fdi_torch.estimate.refinement import information_std
 from fdi_torch.gap.dataset import at_recorded_times, data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
-from fdi_torch.gap.problem import SHORTEST_STEP, problem_of
+from fdi_torch.gap.problem import LONGEST_STEP, MANY_STEPS, SHORTEST_STEP, checked_data_set, problem_of
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.resampling import interpolate, step_means
@@ -70,6 +71,19 @@ def test_means_of_few_readings_are_masked(leaking: Recording) -> None:
     rows = data_set_of(nominal_plant(), (), replace(run, mask=mask), 0.5, averaged=True).mask
     assert rows[:, 0].tolist() == [False] + [True] * 798
     assert rows[:4, 2].tolist() == [False, False, True, True]
+
+
+@pytest.mark.parametrize(("share", "step"), [(0.5, 1.0), (1.9, 1.0), (2.1, 2.0), (9.0, LONGEST_STEP)])
+def test_long_recordings_are_laid_out_in_longer_steps(leaking: Recording, share: float, step: float) -> None:
+    """share: duration, in steps of 1 s, over MANY_STEPS. A second recording of equal length counts as well."""
+    plant, rows = nominal_plant(), int(0.5 * share * MANY_STEPS)
+    assert time_scale(plant) == pytest.approx(1.0)
+    reading = torch.arange(rows) % len(leaking)
+    inputs, outputs = leaking.inputs[reading], leaking.outputs[reading]
+    time = torch.arange(rows, dtype=torch.float64)
+    run = replace(leaking, time=time, inputs=inputs, outputs=outputs, mask=None)
+    data = checked_data_set(plant, (), [run, run], None)
+    assert data.row_spacing == pytest.approx(float(int(step)))
 
 
 def test_estimates_and_standard_errors_from_means_are_those_from_all_readings(leaking: Recording) -> None:

@@ -29,6 +29,9 @@ that count as noise."""
 # Range of integration steps, in units of the plant's time scale. The shortest is a quarter of the shortest period and
 # lag that an effect describes; with steps longer than the longest, fits that meet a rim depend on their start.
 SHORTEST_STEP, LONGEST_STEP = 0.5, 2.5
+MANY_STEPS = 20_000
+"""Steps beyond which longer ones are taken, up to the longest. It limits computing time and memory, which grow with the
+number of steps; long recordings determine lags and periods well in any case."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +116,7 @@ def _without_outliers(
     all_outliers: list[SensorOutliers] = []
     columns = {s.name: s.column for s in plant.sensors}
     for recording in recordings:
-        lay_out = partial(data_set_of, plant, nominal_effects, step=step or _step(plant, recording), averaged=True)
+        lay_out = partial(data_set_of, plant, nominal_effects, step=step or _step(plant, [recording]), averaged=True)
         mask, of_recording = recording.mask, outliers_of(recording, lay_out)
         for of_sensor in of_recording:
             mask = without(mask, of_sensor.each, recording.output_names.index(columns[of_sensor.sensor]))
@@ -205,15 +208,17 @@ def checked_data_set(
     """Lay the recordings out on the grid of their simulation, with the mean of the readings in each step.
 
     step: s; None for the sampling interval of the first recording, or the multiple or fraction of it that lies between
-    SHORTEST_STEP and LONGEST_STEP.
+    SHORTEST_STEP and LONGEST_STEP, for about MANY_STEPS at most.
     """
-    data = data_set_of(plant, nominal_effects, recordings, step or _step(plant, recordings[0]), averaged=True)
+    data = data_set_of(plant, nominal_effects, recordings, step or _step(plant, recordings), averaged=True)
     for sensor, count in zip(plant.sensors, data.mask.sum(dim=0).tolist(), strict=True):
         _expect_enough(data.recording.source, sensor.name, count)
     return data
 
 
-def _step(plant: PlantDescription, recording: Recording) -> float:
+def _step(plant: PlantDescription, recordings: Sequence[Recording]) -> float:
     """A whole multiple, or a whole fraction, of the sampling interval, s."""
-    interval, scale = recording.interval, time_scale(plant)
-    return commensurate_step(min(max(interval, SHORTEST_STEP * scale), LONGEST_STEP * scale), interval)
+    interval, scale = recordings[0].interval, time_scale(plant)
+    duration = sum(float(r.time[-1] - r.time[0]) for r in recordings)
+    shortest = max(interval, SHORTEST_STEP * scale, duration / MANY_STEPS)
+    return commensurate_step(min(shortest, LONGEST_STEP * scale), interval)

@@ -25,7 +25,7 @@ from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet, data_set_of
-from fdi_torch.gap.trajectory_problem import BEHIND, CAP, SHARE, corrected_trajectories
+from fdi_torch.gap.trajectory_problem import BEHIND, CAP, SHARE
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import PlantDescription
@@ -68,6 +68,15 @@ class BlockedRecording:
         total = count.index_add(0, self.block, torch.where(mask, x, 0.0))
         count = count.index_add(0, self.block, mask.to(x.dtype))
         return total / count.clamp(min=1.0), count
+
+    def variance(self, residual: Tensor) -> Tensor:
+        """v_c (C,) of residuals (S, C)."""
+        return self.variance_of_means(*self.means(residual, self.data.mask))
+
+    def variance_of_means(self, means: Tensor, count: Tensor) -> Tensor:
+        """v_c (C,) of the block means (B, C) of residuals, of so many valid samples each."""
+        mean_square = (count * means**2).sum(dim=0) / count.sum(dim=0).clamp(min=1.0)
+        return torch.maximum(mean_square, self.noise)
 
 
 @dataclass(frozen=True)
@@ -150,35 +159,13 @@ def blockwise_fit(
         fitter = _fitter(data, variance, means)
         start = Candidate(candidate.placements, (fit.effect_values,)) if fit and fit.key == candidate.key else candidate
         fit = fitter.fit(start, fit, cap=cap)
-        variance = _variance(blocked, data.readings - fit.linearised.readings[0])
-        fitted = BlockwiseFit(blocked, fit, variance, means, _prior_chi_square(fit, fit.theta))
+        variance = blocked.variance(data.readings - fit.linearised.readings[0])
+        fitted = BlockwiseFit(blocked, fit, variance, means, prior_chi_square(fit, fit.theta))
         behind = target - fitted.log_likelihood
         if behind > 0.5 * BEHIND and fitted.log_likelihood - before < SHARE * behind:
             break
         before = fitted.log_likelihood
     return fitted
-
-
-def first_order_log_likelihood(blocked: BlockedRecording, base: BlockwiseFit) -> float:
-    """The log-likelihood of a recording to first order in the change of the constants from `base`, without effects.
-
-    The trajectory is that of the recording's inputs with the constants of `base`; the sensitivities are those of
-    `base`. One such estimate costs a fraction of an evaluation of a fit.
-    """
-    data, fit, variance = blocked.data, base.fit, base.variance
-    fitter, theta = _fitter(data, variance, base.means), fit.theta.unsqueeze(0)
-    engine, scale = fitter.engine(fit.candidate, ()), fitter.box(fit.space)[2]
-    levels, _ = corrected_trajectories(engine, theta, fit.linearised.levels, fitter.far)
-    residual, jacobian = data.readings - engine.read(levels, theta), fit.linearised.jacobian
-    step = torch.zeros_like(theta)
-    for _ in range(ROUNDS):
-        fitter = _fitter(data, variance, base.means)
-        white = fitter.whiten(residual), fitter.whiten(jacobian)
-        _, descent, curvature = fitter.normal(fit.space, theta, *white, scale)
-        step = torch.linalg.lstsq(curvature, descent.unsqueeze(-1), driver="gelsd").solution.squeeze(-1) * scale
-        variance = _variance(blocked, (residual - (jacobian * step[:, None, None, :]).sum(-1))[0])
-    chi_square = _prior_chi_square(fit, (theta + step)[0])
-    return BlockwiseFit(blocked, fit, variance, base.means, chi_square).log_likelihood
 
 
 def _fitter(data: DataSet, variance: Tensor, means: Tensor) -> Fitter:
@@ -187,14 +174,7 @@ def _fitter(data: DataSet, variance: Tensor, means: Tensor) -> Fitter:
     return Fitter(data, Noise(std, torch.zeros_like(std)))
 
 
-def _variance(blocked: BlockedRecording, residual: Tensor) -> Tensor:
-    """v_c (C,) of residuals (S, C)."""
-    block_means, samples = blocked.means(residual, blocked.data.mask)
-    mean_square = (samples * block_means**2).sum(dim=0) / samples.sum(dim=0).clamp(min=1.0)
-    return torch.maximum(mean_square, blocked.noise)
-
-
-def _prior_chi_square(fit: Fit, theta: Tensor) -> float:
+def prior_chi_square(fit: Fit, theta: Tensor) -> float:
     """Chi-square of the constants theta (P,) against their tolerances."""
     deviation = ((theta - fit.space.nominal(theta)) / fit.space.std(theta)).nan_to_num(0.0)
     constants = torch.tensor([ParameterName.parse(n).is_constant for n in fit.space.names])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 from torch import Tensor
 
@@ -13,9 +14,9 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
     BlockwiseFit,
     blocked_recording,
     blockwise_fit,
-    first_order_log_likelihood,
     thinned,
 )
+from fdi_torch.gap.preprocess.first_order_likelihood import FirstOrderLikelihood
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -91,7 +92,11 @@ class CorrectedFits:
 
         The constants have to be free: those of the uncorrected fit were adapted to the wrong recording.
         """
-        return first_order_log_likelihood(self._blocked(corrected, noise), self.as_is) - self.as_is.log_likelihood
+        return self._first_order(self._blocked(corrected, noise)) - self.as_is.log_likelihood
+
+    @cached_property
+    def _first_order(self) -> FirstOrderLikelihood:
+        return FirstOrderLikelihood(self.as_is)
 
     def _blocked(self, corrected: Recording, noise: Tensor | None) -> BlockedRecording:
         return blocked_recording(self.plant, thinned(corrected), self.noise if noise is None else noise)
