@@ -14,8 +14,9 @@ from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.diagnose import Settings, recalibrate
 from fdi_torch.gap.localization import single_regressor_gain as promise
-from fdi_torch.gap.localization.breakpoints import Breakpoints
+from fdi_torch.gap.localization.breakpoints import Breakpoints, Relays
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
+from fdi_torch.gap.localization.regressors import relay_thresholds
 from fdi_torch.gap.marginal_likelihood import with_estimated_noise
 from fdi_torch.gap.problem import problem_of
 from fdi_torch.plant.effect import Placement
@@ -110,3 +111,16 @@ def test_products_of_all_breakpoints_are_those_of_each_function(jump: bool) -> N
     functions = torch.stack([(x >= c) * factor[0] if jump else (x - c).clamp(min=0.0) * factor[0] for c in at])
     torch.testing.assert_close(family.products(weights), functions @ weights.T)
     torch.testing.assert_close(torch.stack([family.function(i) for i in range(len(at))]), functions)
+
+
+def test_products_of_relays_are_those_of_each_function() -> None:
+    generator = torch.Generator().manual_seed(2)
+    x, factor = (torch.randn(60, generator=generator, dtype=torch.float64) for _ in range(2))
+    weights = torch.randn(3, 60, generator=generator, dtype=torch.float64)
+    family = Relays(x, factor, relay_thresholds((-1.0, 1.0), 5))
+    functions = torch.stack([family.function(i) for i in range(len(family.thresholds))])
+    torch.testing.assert_close(family.products(weights), functions @ weights.T)
+    torch.testing.assert_close(family.functions_at(family.thresholds), functions)
+    around = family.around(torch.tensor([-0.8, -0.4], dtype=torch.float64), 0.5)
+    expected = [[-1.3, -0.9], [-1.3, -0.4], [-1.3, 0.1], [-0.8, -0.4], [-0.8, 0.1], [-0.3, 0.1]]
+    torch.testing.assert_close(around, around.new_tensor(expected))

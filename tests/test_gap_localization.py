@@ -13,10 +13,13 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.estimate.linear_parameters import without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
+from fdi_torch.gap.localization.breakpoints import Relays
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
+from fdi_torch.gap.localization.fine_positions import Positions
 from fdi_torch.gap.localization.localize import localize
 from fdi_torch.gap.localization.regressors import (
     backlash,
@@ -27,9 +30,10 @@ from fdi_torch.gap.localization.regressors import (
     lagged,
     rate_limited,
     relay,
-    relays,
+    relay_thresholds,
     stiction,
 )
+from fdi_torch.gap.localization.single_regressor_gain import parameter_basis, whitened_residual
 from fdi_torch.gap.localization.sparse_regression import column_costs, sparse_fit
 from fdi_torch.gap.localization.whitened_discrepancy import WhitenedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, with_disturbances, with_estimated_noise
@@ -61,9 +65,10 @@ def test_regressors_with_memory_follow_their_equations() -> None:
 
 def test_a_relay_keeps_its_state_between_its_thresholds() -> None:
     x = torch.tensor([0.0, 0.5, 0.9, 0.5, 0.1, 0.5])
-    assert relay(x, 0.2, 0.8).tolist() == [0.0, 0.0, 1.0, 1.0, 0.0, 0.0]
+    thresholds = torch.tensor([[0.2, 0.8], [0.05, 0.4]])
+    assert relay(x, thresholds).int().tolist() == [[0, 0, 1, 1, 0, 0], [0, 1, 1, 1, 1, 1]]
     assert stiction(x, 0.45).tolist() == pytest.approx([0.0, 0.5, 0.5, 0.5, 0.5, 0.5])
-    assert [low for low, _ in relays(x, (0.0, 1.0), 3)] == pytest.approx([1 / 6, 1 / 6, 0.5])
+    assert relay_thresholds((0.0, 1.0), 3).flatten().tolist() == pytest.approx([1 / 6, 0.5, 1 / 6, 5 / 6, 0.5, 5 / 6])
 
 
 def test_hinges_span_every_piecewise_linear_function_of_their_nodes() -> None:
@@ -133,6 +138,33 @@ def test_noise_and_evidence_of_a_discrepancy_refer_to_one_trajectory(
     under = with_disturbances(fitter, fit, likely.noise, about)
     least = -0.5 * under.log_det + likely.noise.log_prior() - 0.5 * least_chi_square(under, fit, about)
     assert likely.log_likelihood == pytest.approx(least, abs=1e-2)
+
+
+@pytest.mark.parametrize("nearest", [140, 180])
+def test_the_thresholds_of_a_relay_are_found_between_those_of_the_grid(nearest: int) -> None:
+    """An outlet that gains 1 % of flow while a relay of its head is on. nearest: thresholds of the grid near those."""
+    case = problem_of(nominal_plant(), (recorded({}, 8, samples=2500),), (), Settings())
+    plain, null, _ = recalibrate(case.data)
+    fitter, _ = with_estimated_noise(plain, null)
+    regression = DiscrepancyRegression(fitter, null, None, 20)
+    (relays,) = [f for f in regression.at("OUT2")[0][0].fine if isinstance(f, Relays)]
+    spacing = float(relays.thresholds[0, 1] - relays.thresholds[0, 0])
+    truth = relays.thresholds[nearest] + spacing * torch.tensor([0.3, -0.4], dtype=torch.float64)
+    influence = 0.01 * regression.influence("OUT2", 0, relays.functions_at(truth.unsqueeze(0)))
+    observed = fitter.of(replace(fitter.data, readings=fitter.data.readings + influence[..., 0]))
+    regression = DiscrepancyRegression(observed, null, None, 20)
+    about = regression.of("OUT2")
+    none = torch.zeros(len(about.columns), dtype=torch.bool)
+    found = Positions(regression, "OUT2", observed, about, none, torch.Generator().manual_seed(0)).best(about, none)
+    assert found is not None
+    basis, residual = parameter_basis(observed, null), whitened_residual(observed, null, about.linearised)
+
+    def gain(columns: Tensor) -> float:
+        white = without(basis, observed.whiten(columns).flatten(0, 1))
+        return float((0.5 * (white.T @ residual)[:, 0] ** 2 / white.square().sum(dim=0)).max())
+
+    assert gain(regression.influence("OUT2", 0, relays.functions_at(relays.thresholds))) < gain(influence) - 1.0
+    assert gain(found.columns.blocks[-1]) > gain(influence) - 0.5
 
 
 def test_every_sample_counts_in_the_weight_of_a_discrepancy(far_from_the_plant: tuple[Fitter, Fit, StateNoise]) -> None:

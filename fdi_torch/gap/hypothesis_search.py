@@ -1,8 +1,9 @@
 """Search over hypotheses with a discrepancy: which unknown, beside which effects.
 
 It starts from the explanations that the structure search found. Beside the likeliest, and beside none, a discrepancy is
-evaluated at each place. About the likeliest hypothesis, effects are then removed and added while that improves it: an
-effect may only have compensated the discrepancy, which may also have hidden an effect.
+evaluated at each place. About the likeliest hypothesis, effects are then removed and added, and the discrepancy moved
+to other places, while that improves it: an effect may only have compensated the discrepancy, which may also have hidden
+an effect.
 """
 
 from __future__ import annotations
@@ -45,14 +46,15 @@ class HypothesisSearch:
     def __init__(self, pool: ExplanationPool, options: Sequence[Option], places: Sequence[str]) -> None:
         self.pool, self.options, self.places = pool, options, places
         self._log_odds = math.log(ODDS.unknown / len(places))
-        # By the explanation's id, and the place.
+        # By the explanation's id, and the place; and the explanations' ids.
         self._evaluated: dict[tuple[int, str], list[CauseHypothesis]] = {}
+        self._at_all_places: set[int] = set()
 
     def search(self, result: SearchResult, named: Sequence[CauseHypothesis]) -> list[CauseHypothesis]:
         """All hypotheses that were examined. named: those without a discrepancy."""
         hypotheses = list(named)
         for explanation in {e.key: e for e in (likeliest(named).explanation, result.null)}.values():
-            hypotheses += self._with_discrepancies(explanation, self.places, likeliest(hypotheses))
+            hypotheses += self._everywhere(explanation, likeliest(hypotheses))
         hypotheses = self._after_fits_at_unknowns(hypotheses)
         trials = self._climbed(likeliest(hypotheses))
         best = likeliest([*hypotheses, *trials])
@@ -69,6 +71,13 @@ class HypothesisSearch:
         needed = best + math.log(RARE) - explanation.log_weight
         gain = localize(explanation.fitter, explanation.fit, explanation.noise, (), needed).itself
         return CauseHypothesis(explanation, causes_in_order(explanation.fit), explanation.log_weight + gain)
+
+    def _everywhere(self, explanation: RankedExplanation, best: CauseHypothesis) -> list[CauseHypothesis]:
+        """An explanation with a discrepancy at each place; none if it was evaluated before."""
+        if id(explanation) in self._at_all_places:
+            return []
+        self._at_all_places.add(id(explanation))
+        return self._with_discrepancies(explanation, self.places, best)
 
     def _with_discrepancies(
         self, explanation: RankedExplanation, at: Sequence[str], best: CauseHypothesis | None = None
@@ -111,10 +120,13 @@ class HypothesisSearch:
         return log_odds_of_law(error, self.pool.choices, len(self.places))
 
     def _climbed(self, best: CauseHypothesis) -> list[CauseHypothesis]:
-        """Hypotheses with an effect fewer or more than the best, while that improves it."""
+        """Hypotheses with an effect fewer or more than the best, or else with a discrepancy at another place, while
+        that improves it."""
         evaluated: list[CauseHypothesis] = []
         while True:
             trials = [*self._with_fewer_effects(best), *self._with_more_effects(best)]
+            if best.discrepancy and all(h.weight <= best.weight for h in trials):
+                trials += self._everywhere(best.explanation, best)
             evaluated += trials
             if not trials or likeliest(trials).weight <= best.weight:
                 return evaluated

@@ -1,17 +1,20 @@
-"""Functions of a signal with a kink or a jump, at many breakpoints.
+"""Functions of a signal with a kink or a jump, at many breakpoints, and relays with many pairs of thresholds.
 
-    factor * max(x - c, 0)        factor where x >= c, otherwise 0
+    factor * max(x - c, 0)        factor where x >= c, otherwise 0        factor where a relay of x is on, otherwise 0
 
-Their products with weights w need only sums over x >= c, of w and of x w: cumulative sums over the sorted signal. All
-breakpoints together cost hardly more than one function.
+Products of kinks and jumps with weights w need only sums over x >= c, of w and of x w: cumulative sums over the sorted
+signal. All breakpoints together cost hardly more than one function.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
+
+from fdi_torch.gap.localization.regressors import relay
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,38 @@ class Breakpoints:
         first = torch.searchsorted(x, self.at)
         above = _sums_from(weights)[:, first]
         return (above if self.jump else _sums_from(x * weights)[:, first] - self.at * above).T
+
+
+@dataclass(frozen=True)
+class Relays:
+    """x (K,): the signal. factor (K,). thresholds (N, 2): the lower and the upper one of each relay."""
+
+    x: Tensor
+    factor: Tensor
+    thresholds: Tensor
+
+    @cached_property
+    def _on(self) -> Tensor:
+        """Whether each relay is on, (N, K)."""
+        return relay(self.x, self.thresholds)
+
+    def function(self, i: int) -> Tensor:
+        """The function (K,) of the i-th relay."""
+        return self.factor * self._on[i]
+
+    def products(self, weights: Tensor) -> Tensor:
+        """Products (N, W) of all functions with weights (W, K)."""
+        return self._on.to(weights.dtype) @ (self.factor * weights).T
+
+    def functions_at(self, thresholds: Tensor) -> Tensor:
+        """The functions (M, K) with other thresholds (M, 2)."""
+        return self.factor * relay(self.x, thresholds)
+
+    def around(self, thresholds: Tensor, spacing: float) -> Tensor:
+        """Thresholds (M, 2): one pair (2,), and those whose thresholds differ by a spacing."""
+        moves = torch.tensor([-spacing, 0.0, spacing], dtype=thresholds.dtype)
+        pairs = thresholds + torch.cartesian_prod(moves, moves)
+        return pairs[pairs[:, 0] < pairs[:, 1]]
 
 
 def _sums_from(x: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.forcing import Forcing
-from fdi_torch.gap.localization.breakpoints import Breakpoints
+from fdi_torch.gap.localization.breakpoints import Breakpoints, Relays
 from fdi_torch.gap.localization.regressors import (
     LAGS,
     RAMPS,
@@ -24,7 +24,8 @@ from fdi_torch.gap.localization.regressors import (
     lagged,
     lags_and_decays,
     rate_limits,
-    relays,
+    relay,
+    relay_thresholds,
     steps_in_value,
     stictions,
 )
@@ -36,6 +37,7 @@ from fdi_torch.plant.scales import time_scale
 Signals = dict[str, Tensor]
 RELAYS = 6  # thresholds of relays
 FINER = 8  # factor by which kinks and jumps may be placed more closely than in the first grid
+FINER_RELAYS = 4  # the same for thresholds of relays, of which there are as many as pairs of these
 SLOW = (100.0, 300.0)  # time constants (s) of a side chamber of a tank
 
 
@@ -70,12 +72,21 @@ class SignalRanges:
         return Breakpoints(s[name], torch.ones_like(s[name]) if factor is None else factor, at, jump)
 
     def relays(self, s: Signals, name: str) -> list[tuple[float, Tensor]]:
-        return relays(s[name], self(name), RELAYS)
+        """The lower threshold and the output of each relay."""
+        thresholds = relay_thresholds(self(name), RELAYS)
+        on = relay(s[name], thresholds).to(s[name].dtype)
+        return list(zip(thresholds[:, 0].tolist(), on, strict=True))
+
+    def fine_relays(self, s: Signals, name: str, factor: Tensor | None = None) -> Relays:
+        """Relays with thresholds as closely spaced as those of `relays`, over FINER_RELAYS."""
+        one = torch.ones_like(s[name]) if factor is None else factor
+        return Relays(s[name], one, relay_thresholds(self(name), FINER_RELAYS * RELAYS))
 
 
 # Local signals (K,), step lengths (K,) s -> regressors (K,) each
 RegressorFunction = Callable[[Signals, Tensor, SignalRanges], list[Tensor]]
-BreakpointFunction = Callable[[Signals, SignalRanges], list[Breakpoints]]
+FineRegressors = list[Breakpoints | Relays]
+FineFunction = Callable[[Signals, SignalRanges], FineRegressors]
 
 
 @dataclass(frozen=True)
@@ -83,13 +94,13 @@ class DiscrepancyModel:
     """Regressors of one component's discrepancy.
 
     signals: the local signals along a recording. flows: regressors in m^3/s, or to be scaled to it, of a flow from
-    `source` to `target`. fine: kinks and jumps as among them on a finer grid. in_time: name of the signal that
+    `source` to `target`. fine: kinks, jumps and relays as among them on a finer grid. in_time: name of the signal that
     functions of time multiply. areas: regressors of a relative change of the target's area, as level rates in m/s.
     """
 
     signals: Callable[[Forcing], Signals]
     flows: RegressorFunction
-    fine: BreakpointFunction
+    fine: FineFunction
     in_time: str
     source: str
     target: str
@@ -116,7 +127,7 @@ def reading_regressors(s: Signals, step: Tensor, ends: SignalRanges, scale: floa
     return [*regressors, *lags_and_decays(s["reading"], step, scale), *backlashes(s["reading"], ends("reading"))]
 
 
-def fine_reading_regressors(s: Signals, ends: SignalRanges) -> list[Breakpoints]:
+def fine_reading_regressors(s: Signals, ends: SignalRanges) -> FineRegressors:
     """The kinks among `reading_regressors` on a finer grid."""
     return [ends.kinks(s, "reading", 12)]
 
@@ -139,7 +150,7 @@ def _commanded(component: FlowComponent, plant: PlantDescription) -> Discrepancy
         regressors += stictions(s["flow"], ends("flow"))
         return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
 
-    def fine(s: Signals, ends: SignalRanges) -> list[Breakpoints]:
+    def fine(s: Signals, ends: SignalRanges) -> FineRegressors:
         return [ends.kinks(s, "command", 9), ends.kinks(s, "level", 6, s["flow"])]
 
     return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
@@ -162,9 +173,10 @@ def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyMo
             regressors += lags_and_decays(s["root"] * s["opening"], step, scale)
         return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
 
-    def fine(s: Signals, ends: SignalRanges) -> list[Breakpoints]:
+    def fine(s: Signals, ends: SignalRanges) -> FineRegressors:
         of_opening = [ends.kinks(s, "opening", 9, s["root"])] if has_valve else []
-        return [ends.kinks(s, "root", 16), ends.jumps(s, "root", 24, s["flow"]), *of_opening]
+        jumps, relays = ends.jumps(s, "root", 24, s["flow"]), ends.fine_relays(s, "root", s["flow"])
+        return [ends.kinks(s, "root", 16), jumps, relays, *of_opening]
 
     return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
 
@@ -184,7 +196,7 @@ def _pair(place: str, plant: PlantDescription) -> DiscrepancyModel:
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
         return [*ends.hinges(s, "head", 10), *ends.hinges(s, "root", 10)]
 
-    def fine(s: Signals, ends: SignalRanges) -> list[Breakpoints]:
+    def fine(s: Signals, ends: SignalRanges) -> FineRegressors:
         return [ends.kinks(s, "head", 10), ends.kinks(s, "root", 10)]
 
     return DiscrepancyModel(signals, flows, fine, "root", first, second)
@@ -208,8 +220,9 @@ def _tank(place: str, plant: PlantDescription) -> DiscrepancyModel:
     def areas(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
         return [s["rate"] * b for b in ends.hinges(s, "level", 12)]
 
-    def fine(s: Signals, ends: SignalRanges) -> list[Breakpoints]:
-        return [ends.kinks(s, "level", 12), ends.jumps(s, "level", 24)]
+    def fine(s: Signals, ends: SignalRanges) -> FineRegressors:
+        relays = [ends.fine_relays(s, "level"), ends.fine_relays(s, "level", _root(s["level"]))]
+        return [ends.kinks(s, "level", 12), ends.jumps(s, "level", 24), *relays]
 
     return DiscrepancyModel(signals, flows, fine, "one", OUTSIDE, place, areas)
 

@@ -19,6 +19,7 @@ from fdi_torch.gap.forcing import Forcing
 from fdi_torch.gap.localization.breakpoints import Breakpoints
 from fdi_torch.gap.localization.component_regressors import (
     DiscrepancyModel,
+    FineRegressors,
     SignalRanges,
     Signals,
     discrepancy_model_at,
@@ -87,13 +88,13 @@ class Discrepancy:
 class Regressors:
     """Regressors of one component along one recording of K steps; of a sensor, along its K samples.
 
-    functions (M, K): of local variables, in m^3/s, or in the sensor's unit. fine: kinks and jumps on a finer grid.
-    in_time (T, K): functions of the time (K,) times `factor` (K,). areas (A, K): of a tank, changes of its level
-    rate, m/s; otherwise None.
+    functions (M, K): of local variables, in m^3/s, or in the sensor's unit. fine: kinks, jumps and relays on finer
+    grids. in_time (T, K): functions of the time (K,) times `factor` (K,). areas (A, K): of a tank, changes of its
+    level rate, m/s; otherwise None.
     """
 
     functions: Tensor
-    fine: list[Breakpoints]
+    fine: FineRegressors
     in_time: Tensor
     time: Tensor
     factor: Tensor

@@ -1,10 +1,11 @@
-"""Positions of regressors where they explain most: of a kink, a jump, a step in time; and the frequency of sinusoids.
+"""Positions of regressors where they explain most: of kinks, jumps, relays and steps in time; frequency of sinusoids.
 
 The grids of `regressors.py` are coarse. Where a discrepancy is many times the noise, a law with a kink between two
 nodes, or a change between two steps in time, would need many regressors of the grid. As in orthogonal matching pursuit
 (Pati, Rezaiifar and Krishnaprasad, 1993), the next regressor is the one with the largest gain in addition to all that
-were selected before: among kinks and jumps on a fine grid and steps in time at every step. One adjoint pass compares
-all of them.
+were selected before: among kinks, jumps and relays on fine grids and steps in time at every step. One adjoint pass
+compares all of them. The thresholds of a relay are then moved by a spacing, by half a spacing, and so on, while that
+gains (pattern search: Hooke and Jeeves, 1961).
 
 The spectrum of a residual shows a frequency to about 1/T in a recording of length T. The phase is then wrong by up to
 half a turn at its ends, which may cost hundreds of nats.
@@ -12,12 +13,15 @@ half a turn at its ends, which may cost hundreds of nats.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from fdi_torch.estimate.linear_parameters import without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.localization.breakpoints import Relays
 from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression
 from fdi_torch.gap.localization.single_regressor_gain import (
     adjoints_of,
@@ -34,12 +38,13 @@ from fdi_torch.gap.localization.sparse_regression import COLLINEAR, VISIBLE, col
 from fdi_torch.simulate.joint_collocation import with_blanks
 
 TRIED = 8  # positions with the largest estimated gains, whose gains are computed exactly
+HALVINGS = 4  # of the spacing between a relay's thresholds; then it is 1/16 of that of the fine grid
 FREQUENCIES = 17  # of one round, over twice the spacing of the round before
 FREQUENCY_ROUNDS = 3  # the last spacing is then 1/600 of 1/T
 
 
 class Positions:
-    """All positions of a kink, a jump or a step in time at a place, under one noise.
+    """All positions of a kink, a jump, a relay or a step in time at a place, under one noise.
 
     under: fitter with the disturbance noise. used (M,): the regressors of the discrepancy that are selected already.
     The strength of each position is that beside these; regressors that are added later only reduce it.
@@ -74,13 +79,44 @@ class Positions:
         if not tried or tried[0][0] < self._cost:
             return None
         columns = torch.stack([self._column(family, position) for _, family, position in tried], dim=-1)
+        best = int(self._exact_gains(columns, basis).argmax())
+        _, family, position = tried[best]
+        if self._relays(family):
+            return self._with_best_thresholds(discrepancy, basis, family, position)
+        return discrepancy.with_column(columns[..., best], self._choices)
+
+    def _with_best_thresholds(self, discrepancy: Discrepancy, basis: Tensor, family: int, position: int) -> Discrepancy:
+        """The discrepancy with a relay, its thresholds moved to where it explains most."""
+        relays = self._relays(family)
+        thresholds = relays[0].thresholds[position]
+        spacing = float(relays[0].thresholds[0, 1] - relays[0].thresholds[0, 0])
+        least = spacing / 2.0**HALVINGS
+        while spacing >= least:
+            tried = relays[0].around(thresholds, spacing)
+            columns = self._influence([r.functions_at(tried) for r in relays])
+            best = int(self._exact_gains(columns, basis).argmax())
+            if bool((tried[best] == thresholds).all()):
+                spacing *= 0.5
+            thresholds, column = tried[best], columns[..., best]
+        return discrepancy.with_column(column, self._choices + len(relays[0].thresholds) * 4**HALVINGS)
+
+    def _relays(self, family: int) -> list[Relays]:
+        """The relays of a family along each recording; none if it is no family of relays."""
+        each = [r.fine[family] for r in self.regression.at(self.place)[0] if family < len(r.fine)]
+        return [r for r in each if isinstance(r, Relays)]
+
+    def _exact_gains(self, columns: Tensor, basis: Tensor) -> Tensor:
+        """Gains (M,) of influences (S, C, M) in addition to those in the basis."""
         white = without(basis, self.under.whiten(columns).flatten(0, 1))
-        exact = gains_of((white.T @ self._residual).squeeze(1), white.square().sum(dim=0))
-        return discrepancy.with_column(columns[..., int(exact.argmax())], self._choices)
+        return gains_of((white.T @ self._residual).squeeze(1), white.square().sum(dim=0))
+
+    def _influence(self, functions: Sequence[Tensor]) -> Tensor:
+        """Influence (S, C, M) of functions (M, K) along each recording."""
+        return with_blanks([self.regression.influence(self.place, k, f) for k, f in enumerate(functions)], dim=0)
 
     def _column(self, family: int, position: int) -> Tensor:
         """Influence (S, C) of one regressor."""
-        columns = []
+        functions = []
         for k, r in enumerate(self.regression.at(self.place)[0]):
             if family < len(r.fine):
                 function = r.fine[family].function(position)
@@ -88,8 +124,8 @@ class Positions:
                 function = r.steps_in_time.function(position)
             else:
                 function = torch.zeros_like(r.factor)  # a step in time of another recording
-            columns.append(self.regression.influence(self.place, k, function.unsqueeze(0))[..., 0])
-        return with_blanks(columns, dim=0)
+            functions.append(function.unsqueeze(0))
+        return self._influence(functions)[..., 0]
 
     def _products(self, white: Tensor, basis: Tensor) -> list[Tensor]:
         """Products of all regressors with whitened columns (S C + P, W), what the basis explains projected out, by the

@@ -66,11 +66,11 @@ def stictions(x: Tensor, ends: tuple[float, float]) -> list[Tensor]:
     return [stiction(x, share * (ends[1] - ends[0])) - x for share in STICTION_BANDS]
 
 
-def relays(x: Tensor, ends: tuple[float, float], count: int) -> list[tuple[float, Tensor]]:
-    """Pairs of the lower threshold and the output of a relay, for each pair of `count` thresholds."""
+def relay_thresholds(ends: tuple[float, float], count: int) -> Tensor:
+    """All pairs of `count` thresholds between the ends, the lower one first: (N, 2)."""
     width = (ends[1] - ends[0]) / count
-    at = [ends[0] + width * (j + 0.5) for j in range(count)]
-    return [(low, relay(x, low, high)) for i, low in enumerate(at) for high in at[i + 1 :]]
+    at = ends[0] + width * (torch.arange(count, dtype=torch.float64) + 0.5)
+    return torch.combinations(at)
 
 
 def fatigues(x: Tensor, step: Tensor, ends: tuple[float, float], scale: float) -> list[Tensor]:
@@ -142,12 +142,14 @@ def stiction(x: Tensor, band: float) -> Tensor:
     return x.new_tensor(output)
 
 
-def relay(x: Tensor, low: float, high: float) -> Tensor:
-    """Relay with hysteresis: 1 after x exceeds `high`, 0 after x falls below `low`."""
+def relay(x: Tensor, thresholds: Tensor) -> Tensor:
+    """Whether relays with hysteresis are on, (N, K): from where x (K,) exceeds the upper threshold until it falls below
+    the lower one. thresholds (N, 2): the lower and the upper one of each."""
+    low, high = thresholds[:, :1], thresholds[:, 1:]
     switched = (x > high) | (x < low)
-    switched[0] = True
-    last_switch = torch.where(switched, torch.arange(len(x)), 0).cummax(dim=0).values
-    return (x > 0.5 * (low + high))[last_switch].to(x)
+    switched[:, 0] = True
+    last_switch = torch.where(switched, torch.arange(len(x)), 0).cummax(dim=1).values
+    return x[last_switch] > 0.5 * (low + high)
 
 
 def rate_limited(x: Tensor, step: Tensor, rate: float) -> Tensor:

@@ -3,9 +3,9 @@
     r_c(theta + s) = r_c - J_c s
     s  maximises  -1/2 sum_c n_c |r_c - J_c s|^2 / (N_c v_c) - chi^2(tolerances) / 2,     v_c of r_c - J_c s
 
-r_c: residuals of sensor c; J_c: their sensitivities to the constants, those of the fit; N_c: valid samples; v_c and n_c
-as in `blockwise_likelihood.py`. The products J_c' J_c and the block means of J_c are common to all corrections that leave
-a sensor's valid samples as they are, so that one correction costs a fraction of an evaluation of the fit.
+r_c: residuals of sensor c; J_c: their sensitivities to the constants, those of the fit; N_c: valid samples; v_c and
+n_c as in `blockwise_likelihood.py`. The products J_c' J_c and the block means of J_c are common to all corrections that
+leave a sensor's valid samples as they are, so that one correction costs a fraction of an evaluation of the fit.
 """
 
 from __future__ import annotations
