@@ -37,7 +37,7 @@ def surveyed(request: pytest.FixtureRequest) -> tuple[DiscrepancyRegression, Fit
 
 
 def gain_at(survey: DiscrepancyRegression, under: Fitter, null: Fit, place: str) -> float:
-    return promise.SingleRegressorGains(survey, under, null, torch.Generator().manual_seed(5)).at(place)
+    return promise.SingleRegressorGains(survey, under, null, torch.Generator().manual_seed(5)).at(place).net
 
 
 def products(

@@ -86,7 +86,8 @@ class HypothesisSearch:
         if all((id(explanation), place) in self._evaluated for place in at):
             return [h for place in at for h in self._evaluated[id(explanation), place]]
         needed, rival = (self._needed(explanation, best), best.noise) if best else (-math.inf, None)
-        localization = localize(explanation.fitter, explanation.fit, explanation.noise, at, needed, rival)
+        fitter, fit, noise = explanation.fitter, explanation.fit, explanation.noise
+        localization = localize(fitter, fit, noise, at, needed, rival, self._log_odds)
         hypotheses = {
             (id(explanation), d.location): self._with_discrepancy(explanation, d) for d in localization.discrepancies
         }

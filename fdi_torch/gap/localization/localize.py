@@ -32,7 +32,7 @@ from fdi_torch.gap.localization.regressors import dominant_frequency, step_funct
 from fdi_torch.gap.localization.single_regressor_gain import SingleRegressorGains
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, occam, with_disturbances
 
-CALIBRATION_PLACES = 3  # places always evaluated; they show by how much first-order gains are too low
+CALIBRATION_PLACES = 3  # places always evaluated; they show how far first-order gains are too low
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,13 @@ def localize(
     places: Sequence[str],
     needed: float = -math.inf,
     rival: StateNoise | None = None,
+    log_odds: float = 0.0,
 ) -> Localization:
-    """Evaluate a discrepancy at each of the places.
+    """Evaluate a discrepancy at each of the places. One that selects no regressor is not in the result.
 
     fitter: with the disturbance noise of the fit. needed: gain in log evidence below which a discrepancy is irrelevant;
-    there are none in the result if none can reach it. rival: the noise that a likelier hypothesis left.
+    there are none in the result if none can reach it. rival: the noise that a likelier hypothesis left. log_odds: prior
+    log odds of a discrepancy at one place against none.
     """
     base = log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     scale = torch.minimum(noise.scale, rival.scale) if rival else noise.scale
@@ -75,15 +77,19 @@ def localize(
     starts += [replace(rival, wander=None, apart=None)] if rival else []
     first_order = _first_order_gains(regression, starts, fit, places, base)
     evaluated: dict[str, LocalizedDiscrepancy] = {}
-    excess = -math.inf  # largest difference seen so far between a gain and its first-order estimate
-    for place, (expected, start) in sorted(first_order.items(), key=lambda item: -item[1][0]):
-        if len(evaluated) >= CALIBRATION_PLACES and expected + excess < needed:
-            break
-        best = ascent.evaluate(regression, regression.of(place), place, start)
+    growth, examined = -math.inf, 0  # growth: largest ratio so far of what a first-order gain lacks to that gain
+    for place, first in sorted(first_order.items(), key=lambda item: -item[1].expected):
+        if examined >= CALIBRATION_PLACES and first.expected + growth * first.gain < needed:
+            continue
+        best = ascent.evaluate(regression, regression.of(place), place, first.noise)
         best = ascent.climbed(ascent.with_finer_positions(best), needed)
-        itself = max(itself, best.without if best.regression is regression else -math.inf)
-        excess = max(excess, best.gain - expected)
-        if not is_rounding_error(fitter, place, float(best.explained.square().mean(dim=0).max().sqrt())):
+        examined += 1
+        growth = max(growth, (best.gain - first.expected) / max(first.gain, 1.0))
+        selected = bool(best.regressed.used.any())
+        itself = max(itself, best.without if best.regression is regression or not selected else -math.inf)
+        needed = max(needed, itself - log_odds + math.log(RARE))
+        largest = float(best.explained.square().mean(dim=0).max().sqrt())
+        if selected and not is_rounding_error(fitter, place, largest):
             needed, evaluated[place] = max(needed, best.gain + math.log(RARE)), best.localized(fitter)
     before = needed - CONVERGED  # nothing is compared about an irrelevant discrepancy
     while evaluated and (likeliest := max(evaluated.values(), key=gain_of)).gain - before > CONVERGED:
@@ -124,24 +130,35 @@ def localize_beside(
     return ascent.climbed(ascent.with_finer_positions(first), needed).localized(fitter)
 
 
+@dataclass(frozen=True)
+class _FirstOrder:
+    """expected: gain in log evidence of the best single regressor of a place, with that of the noise. gain: of the
+    regressor alone, without the cost of its selection. noise: under which the expected gain is largest."""
+
+    expected: float
+    gain: float
+    noise: StateNoise
+
+
 def _first_order_gains(
     regression: DiscrepancyRegression,
     starts: Sequence[StateNoise],
     fit: Fit,
     places: Sequence[str],
     base: float,
-) -> dict[str, tuple[float, StateNoise]]:
-    """Gain in log evidence of the best single regressor of each place, under the best of the noises, and that noise."""
+) -> dict[str, _FirstOrder]:
+    """First-order gains of each place, under the best of the noises."""
     under_each = []
     for noise in starts:
         under = with_disturbances(regression.fitter, fit, noise, regression.linearised)
         without = log_likelihood(under, fit, regression.linearised) + noise.log_prior() - base
         gains = SingleRegressorGains(regression, under, fit, torch.Generator().manual_seed(0))
         under_each.append((without, gains, noise))
-    return {
-        place: max(((without + gains.at(place), noise) for without, gains, noise in under_each), key=lambda e: e[0])
-        for place in places
-    }
+    first_order = {}
+    for place in places:  # the regression keeps the regressors of one place only
+        each = [(without, gains.at(place), noise) for without, gains, noise in under_each]
+        first_order[place] = max((_FirstOrder(w + g.net, g.gain, n) for w, g, n in each), key=lambda f: f.expected)
+    return first_order
 
 
 def _evidence_bound(fitter: Fitter, fit: Fit, noise: StateNoise) -> float:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -40,6 +41,17 @@ class Adjoints:
     rates: list[Tensor]
 
 
+class SingleRegressorGain(NamedTuple):
+    """Gain in log evidence of one regressor without the cost of its selection, nats; and this cost."""
+
+    gain: float
+    cost: float
+
+    @property
+    def net(self) -> float:
+        return self.gain - self.cost
+
+
 class SingleRegressorGains:
     """Gain in log evidence of the best single regressor of a place, under one noise.
 
@@ -53,11 +65,11 @@ class SingleRegressorGains:
         columns = torch.cat([residual, random_signs(residual, generator)], dim=1)
         self._adjoints = adjoints_of(regression, under, columns, self._basis)
 
-    def at(self, place: str) -> float:
+    def at(self, place: str) -> SingleRegressorGain:
         channel = self.regression.sensor(place)
         weights = self._inflow_weights(place) if channel is None else self._reading_weights(place, channel)
         groups = self._products(place, weights), torch.cat(position_products(self.regression, place, weights))
-        return max(_largest_gain(group, self._largest) for group in groups)
+        return max((_largest_gain(group, self._largest) for group in groups), key=lambda g: g.net)
 
     def _inflow_weights(self, place: str) -> list[Tensor]:
         return inflow_weights(self.regression, place, self._adjoints)
@@ -83,10 +95,10 @@ class SingleRegressorGains:
         return torch.cat([torch.stack(shared).sum(dim=0), *per_recording])
 
 
-def _largest_gain(products: Tensor, largest: float) -> float:
-    """Largest gain among regressors, less its cost. products (M, 1 + SIGNS): with the residual and random signs."""
+def _largest_gain(products: Tensor, largest: float) -> SingleRegressorGain:
+    """Largest gain among regressors. products (M, 1 + SIGNS): with the residual and random signs."""
     (cost,) = column_costs(torch.tensor([float(len(products))]), largest).tolist()
-    return float(gains_of(products[:, 0], strengths_of(products[:, 1:])).max()) - cost
+    return SingleRegressorGain(float(gains_of(products[:, 0], strengths_of(products[:, 1:])).max()), cost)
 
 
 def position_products(regression: DiscrepancyRegression, place: str, weights: Sequence[Tensor]) -> list[Tensor]:
