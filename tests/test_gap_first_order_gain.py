@@ -16,6 +16,7 @@ from fdi_torch.gap.diagnose import Settings, recalibrate
 from fdi_torch.gap.localization import single_regressor_gain as promise
 from fdi_torch.gap.localization.breakpoints import Breakpoints, Relays
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
+from fdi_torch.gap.localization.fine_positions import HALVINGS, best_thresholds, pairs_around
 from fdi_torch.gap.localization.regressors import relay_thresholds
 from fdi_torch.gap.marginal_likelihood import with_estimated_noise
 from fdi_torch.gap.problem import problem_of
@@ -121,6 +122,13 @@ def test_products_of_relays_are_those_of_each_function() -> None:
     functions = torch.stack([family.function(i) for i in range(len(family.thresholds))])
     torch.testing.assert_close(family.products(weights), functions @ weights.T)
     torch.testing.assert_close(family.functions_at(family.thresholds), functions)
-    around = family.around(torch.tensor([-0.8, -0.4], dtype=torch.float64), 0.5)
+
+
+def test_thresholds_are_moved_to_the_largest_gain_and_not_along_a_plateau() -> None:
+    start, peak = torch.tensor([0.2, 0.5], dtype=torch.float64), torch.tensor([0.51, 0.94], dtype=torch.float64)
+    found = best_thresholds(lambda pairs: -1e5 * (pairs - peak).square().sum(dim=1), start, 0.1)
+    assert found.tolist() == pytest.approx(peak.tolist(), abs=0.1 / 2.0**HALVINGS)
+    assert best_thresholds(lambda pairs: pairs.new_ones(len(pairs)), start, 0.1).equal(start)
+    around = pairs_around(torch.tensor([-0.8, -0.4], dtype=torch.float64), 0.5)
     expected = [[-1.3, -0.9], [-1.3, -0.4], [-1.3, 0.1], [-0.8, -0.4], [-0.8, 0.1], [-0.3, 0.1]]
     torch.testing.assert_close(around, around.new_tensor(expected))

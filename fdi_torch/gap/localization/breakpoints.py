@@ -65,12 +65,6 @@ class Relays:
         """The functions (M, K) with other thresholds (M, 2)."""
         return self.factor * relay(self.x, thresholds)
 
-    def around(self, thresholds: Tensor, spacing: float) -> Tensor:
-        """Thresholds (M, 2): one pair (2,), and those whose thresholds differ by a spacing."""
-        moves = torch.tensor([-spacing, 0.0, spacing], dtype=thresholds.dtype)
-        pairs = thresholds + torch.cartesian_prod(moves, moves)
-        return pairs[pairs[:, 0] < pairs[:, 1]]
-
 
 def _sums_from(x: Tensor) -> Tensor:
     """Sums (W, K+1) of x (W, K) from each column to the last one."""

@@ -4,8 +4,7 @@ The grids of `regressors.py` are coarse. Where a discrepancy is many times the n
 nodes, or a change between two steps in time, would need many regressors of the grid. As in orthogonal matching pursuit
 (Pati, Rezaiifar and Krishnaprasad, 1993), the next regressor is the one with the largest gain in addition to all that
 were selected before: among kinks, jumps and relays on fine grids and steps in time at every step. One adjoint pass
-compares all of them. The thresholds of a relay are then moved by a spacing, by half a spacing, and so on, while that
-gains (pattern search: Hooke and Jeeves, 1961).
+compares all of them. The thresholds of a relay are then moved to where it explains most.
 
 The spectrum of a residual shows a frequency to about 1/T in a recording of length T. The phase is then wrong by up to
 half a turn at its ends, which may cost hundreds of nats.
@@ -13,7 +12,7 @@ half a turn at its ends, which may cost hundreds of nats.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -39,6 +38,7 @@ from fdi_torch.simulate.joint_collocation import with_blanks
 
 TRIED = 8  # positions with the largest estimated gains, whose gains are computed exactly
 HALVINGS = 4  # of the spacing between a relay's thresholds; then it is 1/16 of that of the fine grid
+MOVING = 0.1  # nats; thresholds do not move for a smaller gain
 FREQUENCIES = 17  # of one round, over twice the spacing of the round before
 FREQUENCY_ROUNDS = 3  # the last spacing is then 1/600 of 1/T
 
@@ -88,17 +88,18 @@ class Positions:
     def _with_best_thresholds(self, discrepancy: Discrepancy, basis: Tensor, family: int, position: int) -> Discrepancy:
         """The discrepancy with a relay, its thresholds moved to where it explains most."""
         relays = self._relays(family)
-        thresholds = relays[0].thresholds[position]
         spacing = float(relays[0].thresholds[0, 1] - relays[0].thresholds[0, 0])
-        least = spacing / 2.0**HALVINGS
-        while spacing >= least:
-            tried = relays[0].around(thresholds, spacing)
-            columns = self._influence([r.functions_at(tried) for r in relays])
-            best = int(self._exact_gains(columns, basis).argmax())
-            if bool((tried[best] == thresholds).all()):
-                spacing *= 0.5
-            thresholds, column = tried[best], columns[..., best]
-        return discrepancy.with_column(column, self._choices + len(relays[0].thresholds) * 4**HALVINGS)
+
+        def columns(thresholds: Tensor) -> Tensor:
+            return self._influence([r.functions_at(thresholds) for r in relays])
+
+        def gains(thresholds: Tensor) -> Tensor:
+            return self._exact_gains(columns(thresholds), basis)
+
+        best = best_thresholds(gains, relays[0].thresholds[position], spacing)
+        return discrepancy.with_column(
+            columns(best.unsqueeze(0))[..., 0], self._choices + len(relays[0].thresholds) * 4**HALVINGS
+        )
 
     def _relays(self, family: int) -> list[Relays]:
         """The relays of a family along each recording; none if it is no family of relays."""
@@ -136,6 +137,30 @@ class Positions:
         else:
             weights = [adjoints.readings[piece.rows, channel].T for piece in self.regression.pieces]
         return position_products(self.regression, self.place, weights)
+
+
+def best_thresholds(gains: Callable[[Tensor], Tensor], start: Tensor, spacing: float) -> Tensor:
+    """The pair of thresholds (2,) with the largest gain near a first one, by pattern search (Hooke and Jeeves, 1961).
+
+    gains: of pairs (M, 2), nats. spacing: of the first moves; it is halved HALVINGS times.
+    """
+    best, largest = start, float(gains(start.unsqueeze(0)))
+    for halving in range(HALVINGS + 1):
+        while True:
+            tried = pairs_around(best, spacing / 2.0**halving)
+            gained = gains(tried)
+            k = int(gained.argmax())
+            if not float(gained[k]) > largest + MOVING:
+                break
+            best, largest = tried[k], float(gained[k])
+    return best
+
+
+def pairs_around(thresholds: Tensor, spacing: float) -> Tensor:
+    """Pairs (M, 2) of thresholds that differ from one pair (2,) by a spacing at most, the lower one first."""
+    moves = torch.tensor([-spacing, 0.0, spacing], dtype=thresholds.dtype)
+    pairs = thresholds + torch.cartesian_prod(moves, moves)
+    return pairs[pairs[:, 0] < pairs[:, 1]]
 
 
 def with_best_frequency(
