@@ -126,7 +126,7 @@ def test_each_opening_and_closing_of_the_drains_raises_an_alarm_within_10_s_of_w
     opening = truth.inputs[:, truth.input_names.index("vLD")]
     half = truth.time[1:][(opening[1:] > 0.5) != (opening[:-1] > 0.5)].tolist()
     assert len(half) == 10
-    pumped = truth.time[truth.inputs[:, truth.input_names.index("qL")] > 0.0]
+    pumped = truth.time[truth.inputs[:, truth.input_names.index("qL_cmd")] > 0.0]
     for moment in half:
         shows = max(moment, float(pumped[pumped >= moment - 5.0][0]))
         assert any(moment - 5.0 <= alarm <= shows + 10.0 for alarm in alarms)
