@@ -18,7 +18,7 @@ from fdi_torch.config.plant_file import load_plant
 from fdi_torch.estimate.evidence import posterior
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.hypothesis import Hypothesis
-from fdi_torch.monitor.isolation import Prior, fit
+from fdi_torch.monitor.hypothesis_fit import Prior, fit
 from fdi_torch.monitor.monitor_settings import LOOKBACK
 from fdi_torch.monitor.monitor_setup import PreparedMonitor, fault_free_part, prepare_monitor
 from fdi_torch.monitor.observer_bank import ObserverWindow, no_change

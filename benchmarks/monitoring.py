@@ -45,7 +45,9 @@ def isolation(observer: ObserverBank, window: ObserverWindow, slow: bool) -> dic
     """Every fault alone, sudden; or sudden and slow, alone and in pairs."""
     believed, count = observer.space.nominal(), len(observer.space)
     faults = [Fault(column) for column in range(count)]
-    (spent,) = seconds_in_rounds([lambda: isolate(observer, window, believed, faults, slow, 2 if slow else 1)])
+    (spent,) = seconds_in_rounds(
+        [lambda: isolate(observer, window, believed, faults, slow, 2 if slow else 1, flows=True)]
+    )
     what = "sudden or slow, one or two" if slow else "sudden, one"
     return {"what": f"isolation, {count} faults, {what}", "samples": len(window), "seconds": spent}
 

@@ -14,7 +14,7 @@ from fdi_torch.estimate.evidence import ODDS, log_volume
 from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.monitor.events import size_of
 from fdi_torch.monitor.hypothesis import NO_CHANGE, Hypothesis, HypothesisFit, credible_set, merged, with_posterior
-from fdi_torch.monitor.isolation import Prior
+from fdi_torch.monitor.hypothesis_fit import Prior
 from fdi_torch.parameters import Parameter
 
 READINGS = 600

@@ -25,7 +25,8 @@ from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.fault_free_checks import residual_warnings
 from fdi_torch.monitor.hypothesis import Fault, Hypothesis, faults_of
-from fdi_torch.monitor.isolation import Prior, fit, isolate
+from fdi_torch.monitor.hypothesis_fit import Prior, fit
+from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.level_forecast import DRAWS, limit_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings

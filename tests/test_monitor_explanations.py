@@ -8,7 +8,9 @@ import torch
 from torch import Tensor
 
 from fdi_torch.monitor.hypothesis import Hypothesis, HypothesisFit, credible_set, merged
-from fdi_torch.monitor.isolation import Prior, fit, isolate
+from fdi_torch.monitor.hypothesis_fit import Prior, fit
+from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.observer_bank import ChangeHypotheses
 from tests.test_monitor import FAULTS, SPACE, STD, followed, from_rest, monitor, recorded, step_to
 
 
@@ -88,3 +90,16 @@ def test_no_onset_lies_in_the_part_that_is_declared_fault_free() -> None:
     state, events = watch.advance(state, samples.segment(1, 260))
     told = [e.onset for e in events if e.faults]
     assert told and all(onset is not None and onset >= 199.0 for onset in told)
+
+
+def test_misfits_of_two_isolations_of_one_window_are_those_of_the_same_noise() -> None:
+    """Known faults and new ones are fitted apart, and their misfits compared."""
+    watch, nominal = monitor(), SPACE.nominal()
+    window = from_rest(recorded(step_to("T3.leak.size", 0.05, 60.0), 140))
+    for faults in (FAULTS[1:2], FAULTS[2:]):
+        best = isolate(watch.observer, window, nominal, faults, incipient=False, deepest=1)[0]
+        assert best.fits == (faults == FAULTS[1:2])
+        onset = torch.tensor([best.onset], dtype=torch.float64)
+        lane = ChangeHypotheses(best.value[None], onset, torch.tensor([best.hypothesis.incipient]))
+        white = watch.observer.white_innovations(window, nominal, lane)
+        assert abs(0.5 * float(white.square().sum()) - best.misfit) < 1e-9 * best.misfit

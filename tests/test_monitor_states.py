@@ -17,8 +17,8 @@ from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
-from fdi_torch.monitor.monitor_state import normalized_residuals
 from fdi_torch.monitor.samples import ABSENT, ClockState, Samples, samples_of_recording, split_at_gaps
+from fdi_torch.monitor.state_update import residuals_to_test
 from fdi_torch.monitor.window_monitor import WindowMonitor
 from fdi_torch.recording import Recording
 from tests.test_monitor import SPACE, monitor, recorded
@@ -145,16 +145,16 @@ def test_a_misfit_that_has_passed_does_not_hide_a_change() -> None:
     white[100:140] += 100.0
     white[70:75, 2] = torch.nan
     white[400:, 0] += 3.0
-    state = replace(watch.start(troubled()), white=white, believed=SPACE.vector({"T1.leak.size": 0.1}))
-    scaled = normalized_residuals(state, 499, reach)
+    state = replace(watch.start(troubled()), tested=white, believed=SPACE.vector({"T1.leak.size": 0.1}))
+    scaled = residuals_to_test(state, 499, reach)
     for k in (30, 90, 120, 150, 260, 450):
         before = white[max(k - reach, 0) : k].square().nanmean(dim=0).sqrt()
         assert torch.allclose(scaled[k - 1], white[k] / before.clamp(min=1.0), rtol=1e-12)
-    assert torch.equal(normalized_residuals(state, 7, reach), scaled[-7:])
+    assert torch.equal(residuals_to_test(state, 7, reach), scaled[-7:])
     statistic = watch.detector.update(scaled[259:], None)[0]
     first = int((statistic > watch.detector.threshold).to(torch.int8).argmax())
     assert 260 + first in range(400, 410)
-    assert torch.equal(normalized_residuals(replace(state, believed=state.healthy), 499, reach)[100:], white[101:])
+    assert torch.equal(residuals_to_test(replace(state, believed=state.healthy), 499, reach)[100:], white[101:])
 
 
 def drained(mouth: float, seconds: int, folder: Path) -> list[Event]:

@@ -112,8 +112,13 @@ def test_the_valve_the_pump_and_the_offset_of_the_sensors_are_named_where_they_a
 
 
 @pytest.mark.slow
-def test_each_opening_and_closing_of_the_drains_raises_an_alarm_within_10_s(data: Path, tmp_path: Path) -> None:
-    """exp5: five times; the recorded positions, which are not shown, are the truth."""
+def test_each_opening_and_closing_of_the_drains_raises_an_alarm_within_10_s_of_when_it_shows(
+    data: Path, tmp_path: Path
+) -> None:
+    """exp5: five times; the recorded positions, which are not shown, are the truth.
+
+    The tanks are dry before the drains close, so that a closing shows only once a pump runs.
+    """
     run, alarms = load_monitor(MONITOR / "dts200_exp5_adopted.yaml", [f"output.folder={tmp_path}"]), []
     heard = [lambda share, text: None, lambda e: alarms.append(e.time) if e.kind == "alarm" else None, lambda p: None]
     run_monitor(run, MonitorCallbacks(*heard))
@@ -121,4 +126,7 @@ def test_each_opening_and_closing_of_the_drains_raises_an_alarm_within_10_s(data
     opening = truth.inputs[:, truth.input_names.index("vLD")]
     half = truth.time[1:][(opening[1:] > 0.5) != (opening[:-1] > 0.5)].tolist()
     assert len(half) == 10
-    assert all(any(-5.0 <= alarm - moment <= 10.0 for alarm in alarms) for moment in half)
+    pumped = truth.time[truth.inputs[:, truth.input_names.index("qL_cmd")] > 0.0]
+    for moment in half:
+        shows = max(moment, float(pumped[pumped >= moment - 5.0][0]))
+        assert any(moment - 5.0 <= alarm <= shows + 10.0 for alarm in alarms)

@@ -15,7 +15,6 @@ from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import with_shapes
-from fdi_torch.monitor.monitor_state import advance_observer
 from fdi_torch.monitor.monte_carlo.detector_trials import delays, detectors, white_residuals
 from fdi_torch.monitor.monte_carlo.estimator_comparison import ESTIMATOR_NAMES, compare, draw_runs, track_estimates
 from fdi_torch.monitor.monte_carlo.isolation_trials import FaultScenario, confusions, isolate_run, smallest_isolable
@@ -23,6 +22,7 @@ from fdi_torch.monitor.monte_carlo.level_control import LevelControl, moving_set
 from fdi_torch.monitor.monte_carlo.simulated_runs import FaultSchedule, SimulatedRig, fault_free_schedule
 from fdi_torch.monitor.noise_model import learn_noise
 from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.state_update import advance_observer
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.equilibrium import equilibrium

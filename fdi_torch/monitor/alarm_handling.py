@@ -29,15 +29,8 @@ from fdi_torch.monitor.known_faults import (
     with_hidden,
     with_new_sizes,
 )
-from fdi_torch.monitor.monitor_state import (
-    DetectedChange,
-    HiddenFault,
-    MonitorState,
-    PendingAlarm,
-    adopt_change,
-    adopt_sizes,
-    normalized_residuals,
-)
+from fdi_torch.monitor.monitor_state import DetectedChange, HiddenFault, MonitorState, PendingAlarm
+from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, residuals_to_test
 
 
 class AlarmHandler:
@@ -129,7 +122,7 @@ class AlarmHandler:
     def _sensor_shares(self, state: MonitorState) -> tuple[tuple[str, float], ...]:
         """The share of each sensor in the detector's statistic."""
         since = self.explainer.search_start(state, state.now)
-        white = normalized_residuals(state, max(int((state.samples.time > since).sum()), 1), self.reach)
+        white = residuals_to_test(state, max(int((state.samples.time > since).sum()), 1), self.reach)
         names = [sensor.name for sensor in self.observer.network.description.sensors]
         return tuple(zip(names, self.detector.shares(white).tolist(), strict=True))
 

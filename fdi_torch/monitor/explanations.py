@@ -62,7 +62,9 @@ class Explainer:
         s, healthy = self.settings, self.fault_free(believed)
         while True:
             window = state.window(start)
-            fits = isolate(self.observer, window, believed, self.faults, s.incipient, s.together, healthy, earlier)
+            fits = isolate(
+                self.observer, window, believed, self.faults, s.incipient, s.together, healthy, earlier, True
+            )
             plausible = [f for f in fits if f.hypothesis.columns and f.probability > SMALLEST_PROBABILITY]
             if start <= earliest or all(f.onset - start > 2.0 * f.onset_std for f in plausible):
                 return fits

@@ -5,33 +5,17 @@ Each fit starts from the onset and size at which the hypothesis' signature match
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.evidence import log_prior, log_volume
-from fdi_torch.estimate.information import certainty
-from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
-from fdi_torch.estimate.linearisation import Linearisation
-from fdi_torch.estimate.refined import held_back
-from fdi_torch.estimate.uncertainty import end_reached
-from fdi_torch.monitor.hypothesis import NO_CHANGE, Fault, Hypothesis, HypothesisFit, with_posterior
+from fdi_torch.monitor.hypothesis import Fault, Hypothesis, HypothesisFit, with_posterior
+from fdi_torch.monitor.hypothesis_fit import Prior, change_of, fit, misfit, no_change_fit, point_of
 from fdi_torch.monitor.initial_guess import oscillation_guess, recovery_guesses, recovery_hypotheses, signature_guesses
-from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
-from fdi_torch.monitor.oscillation import (
-    oscillation_columns,
-    period_step,
-    std_with_phases_at_zero,
-    with_phases_at,
-    with_wrapped_phases,
-)
-from fdi_torch.parameters import ParameterName, ParameterSpace
+from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow, no_change
 
-SIZE_STEP = 1e-4  # finite-difference step, as a share of a parameter's range
-ITERATIONS = 12
 DEEPEST = 2  # largest number of simultaneous faults
 SMALLEST_PROBABILITY = 1e-3  # explanations below it are not fitted again
 
@@ -45,12 +29,14 @@ def isolate(
     deepest: int = DEEPEST,
     healthy: Tensor | None = None,
     earlier: Sequence[HypothesisFit] = (),
+    flows: bool = False,
 ) -> list[HypothesisFit]:
     """Fits of all single changes, of the best ones combined with a further fault, and of no change, likeliest first.
 
     All faults of a hypothesis share one onset, and a window holds one change. believed (P,): parameters before the
     change. healthy (P,): the same without faults; if given, recovery of the faults in `believed` is a hypothesis too.
-    earlier: previous fits of the same change, used as further initial guesses.
+    earlier: previous fits of the same change, used as further initial guesses. flows: whether random flows are learnt
+    from the window too; the misfits of two calls are then not those of the same noise.
     """
     manners = (False, True) if incipient else (False,)
     prior = Prior(observer.space.names, len(faults) * len(manners))
@@ -68,9 +54,9 @@ def isolate(
         starts = torch.cat([starts, recovery_guesses(observer, window, believed, healthy, recoveries)])
     earlier = [f for f in earlier if f.hypothesis.columns]
     if earlier:
-        starts = torch.cat([starts, torch.stack([_point(f) for f in earlier])])
+        starts = torch.cat([starts, torch.stack([point_of(f) for f in earlier])])
     hypotheses = [*plain, *oscillating, *recoveries, *(f.hypothesis for f in earlier)]
-    fits = _best_of_each(fit(observer, window, believed, hypotheses, starts, _misfit(base), prior))
+    fits = _best_of_each(fit(observer, window, believed, hypotheses, starts, misfit(base), prior))
     for _ in range(1, deepest):
         best = [f for f in fits if f.hypothesis.count < deepest][:2]
         origin = {b.hypothesis.with_fault(f): b for b in best for f in faults if f.size not in b.hypothesis.columns}
@@ -81,10 +67,10 @@ def isolate(
         # additional fault.
         origin |= {b.hypothesis: b for b in best}
         wider += [b.hypothesis for b in best]
-        starts = torch.stack([_point(origin[h]) for h in wider])
-        fits = _best_of_each([*fits, *fit(observer, window, believed, wider, starts, _misfit(base), prior)])
+        starts = torch.stack([point_of(origin[h]) for h in wider])
+        fits = _best_of_each([*fits, *fit(observer, window, believed, wider, starts, misfit(base), prior)])
     ranked = with_posterior([*fits, no_change_fit(observer, window, believed, base)])
-    if ranked[0].hypothesis.columns and ranked[0].fits:
+    if flows and ranked[0].hypothesis.columns and ranked[0].fits:
         observer, ranked = _with_flows_of_window(observer, window, believed, ranked, prior)
     return [_beyond_range(observer, window, believed, f, prior) if f.at_bound else f for f in ranked]
 
@@ -98,24 +84,18 @@ def _with_flows_of_window(
     fitted with the flows that are most likely under the likeliest hypothesis. The evidence of each plausible one then
     gains what flows of its own add to the likelihood.
     """
-    observer, _ = observer.learning_from(window, believed, _change_of(ranked[0]))
+    observer, _ = observer.learning_from(window, believed, change_of(ranked[0]))
     base = observer.white_innovations(window, believed, no_change(believed))
     changes = [f for f in ranked if f.hypothesis.columns and f.probability > SMALLEST_PROBABILITY**2]
-    starts, hypotheses = torch.stack([_point(f) for f in changes]), [f.hypothesis for f in changes]
-    fits = fit(observer, window, believed, hypotheses, starts, _misfit(base), prior)
+    starts, hypotheses = torch.stack([point_of(f) for f in changes]), [f.hypothesis for f in changes]
+    fits = fit(observer, window, believed, hypotheses, starts, misfit(base), prior)
     fits.append(no_change_fit(observer, window, believed, base))
     likely = {f.hypothesis for f in (*ranked, *with_posterior(fits)) if f.probability > SMALLEST_PROBABILITY}
     for i, f in enumerate(fits):
         if f.hypothesis in likely:
-            gain = observer.learning_from(window, believed, _change_of(f))[1]
+            gain = observer.learning_from(window, believed, change_of(f))[1]
             fits[i] = replace(f, evidence=f.evidence + gain)
     return observer, with_posterior(fits)
-
-
-def _change_of(fit: HypothesisFit) -> ChangeHypotheses:
-    """A fit as the single lane of a bank of observers."""
-    incipient = torch.tensor([fit.hypothesis.incipient])
-    return ChangeHypotheses(fit.value[None], fit.value.new_tensor([fit.onset]), incipient)
 
 
 def _beyond_range(
@@ -129,41 +109,10 @@ def _beyond_range(
     if ended.probability < SMALLEST_PROBABILITY:
         return ended
     space = observer.search_space(ended.value)
-    [free] = fit(observer, window, believed, [ended.hypothesis], _point(ended)[None], 0.0, prior, space=space)
+    [free] = fit(observer, window, believed, [ended.hypothesis], point_of(ended)[None], 0.0, prior, space=space)
     wider = free.misfit_ratio**0.5
     onset = {"onset": free.onset, "onset_std": free.onset_std * wider}
     return replace(ended, value=free.value, std=free.std * wider, misfit=free.misfit, **onset)
-
-
-@dataclass(frozen=True)
-class Prior:
-    """Prior odds of a hypothesis. names: of the parameter space. single_changes: number of possible single changes."""
-
-    names: tuple[str, ...]
-    single_changes: int
-
-    def __call__(self, hypothesis: Hypothesis) -> float:
-        """Log of the odds against no change."""
-        new = [c for c in hypothesis.sizes if c not in hypothesis.recovered]
-        places = len({ParameterName.parse(self.names[c]).place for c in new}) + bool(hypothesis.recovered)
-        return log_prior(hypothesis.count, places, max(self.single_changes, 1))
-
-
-def no_change_fit(observer: ObserverBank, window: ObserverWindow, believed: Tensor, base: Tensor) -> HypothesisFit:
-    """The hypothesis of a false alarm. base (1, S, sensors): white innovations without a change."""
-    limit, first = _noise_limit(observer, window), float(window.samples.time[0])
-    level = float(window.readings)
-    return HypothesisFit(NO_CHANGE, believed, torch.zeros_like(believed), first, 0.0, 0.0, _misfit(base), level, limit)
-
-
-def _noise_limit(observer: ObserverBank, window: ObserverWindow) -> float:
-    """Upper limit of the innovations' sum of squares under noise alone, four standard deviations above its mean.
-
-    The variance is that of the sum itself plus that of the noise variance, which was estimated from a finite recording.
-    """
-    count, channels = window.readings, len(observer.network.description.sensors)
-    learnt = observer.whitening.samples * channels
-    return count * (1.0 + 4.0 * math.sqrt(2.0 / max(count, 1) + 2.0 / learnt))
 
 
 def _best_of_each(fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
@@ -172,136 +121,3 @@ def _best_of_each(fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
     for f in sorted(fits, key=lambda fit: -fit.evidence):
         best.setdefault(f.hypothesis, f)
     return list(best.values())
-
-
-def _point(fit: HypothesisFit) -> Tensor:
-    """Values and onset of a fit, (P+1,)."""
-    return torch.cat([fit.value, fit.value.new_tensor([fit.onset])])
-
-
-def fit(
-    observer: ObserverBank,
-    window: ObserverWindow,
-    believed: Tensor,
-    hypotheses: Sequence[Hypothesis],
-    starts: Tensor,
-    base: float,
-    prior: Prior,
-    known_onset: bool = False,
-    space: ParameterSpace | None = None,
-) -> list[HypothesisFit]:
-    """Sizes and onset of each hypothesis by Levenberg-Marquardt on the white innovations, all in parallel.
-
-    believed (P,): parameters before the change; starts (H, P+1): initial values and onset (s); base: misfit without a
-    change. known_onset: the onsets of `starts` are exact. space: its ranges bound the sizes; those of the observer's
-    `search_space` by default.
-    """
-    free = torch.zeros(len(hypotheses), len(believed) + 1, dtype=torch.bool)
-    free[:, -1] = not known_onset
-    for i, hypothesis in enumerate(hypotheses):
-        free[i, hypothesis.free] = True
-    incipient = torch.tensor([h.incipient for h in hypotheses])
-    first, last = window.samples.time[0], window.samples.time[-2]
-    oscillations, middle = oscillation_columns(observer.space.names), 0.5 * float(first + last)
-
-    def linearise(point: Tensor, lanes: Tensor) -> Linearisation:
-        return _expansion(observer, window, believed, point, free[lanes], incipient[lanes], middle)
-
-    fixed = torch.cat([believed, first[None]]).repeat(len(starts), 1)
-    fixed[:, -1] = starts[:, -1]
-    for i, hypothesis in enumerate(hypotheses):
-        fixed[i, list(hypothesis.recovered)] = starts[i, list(hypothesis.recovered)]
-    space = observer.search_space(believed) if space is None else space
-    low = torch.where(free, torch.cat([space.low(believed), first[None]]), fixed)
-    high = torch.where(free, torch.cat([space.high(believed), last[None]]), fixed)
-    starts = with_phases_at(torch.where(free, starts.clamp(low, high), fixed), oscillations, free, middle)
-    for _, phase in oscillations:  # a full turn either way, so that no fit stops at +-pi
-        low[:, phase] = torch.where(free[:, phase], starts[:, phase] - 2.0 * math.pi, low[:, phase])
-        high[:, phase] = torch.where(free[:, phase], starts[:, phase] + 2.0 * math.pi, high[:, phase])
-    settings = RefineSettings(iterations=ITERATIONS, decrease_tolerance=1e-3, step_tolerance=1e-6)
-    refined = levenberg_marquardt(linearise, starts, low, high, settings)
-    final = linearise(refined.theta, torch.arange(len(hypotheses)))
-    theta = with_wrapped_phases(with_phases_at(refined.theta, oscillations, free, -middle), oscillations, free)
-    std = std_with_phases_at_zero(certainty(final.curvature, held=~free), theta, oscillations, free, middle)
-    width = torch.cat([observer.space_width(), (last - first)[None]])
-    level, limit = float(window.readings), _noise_limit(observer, window)
-    held = free & held_back(refined.theta, final.gradient, low, high)
-    slope = torch.where(held, final.gradient.abs(), 0.0)
-    return [
-        HypothesisFit(
-            hypothesis,
-            theta[i, :-1],
-            std[i, :-1],
-            float(theta[i, -1]),
-            float(std[i, -1]),
-            base
-            - float(final.cost[i])
-            + prior(hypothesis)
-            + _log_occam_factor(final.curvature[i], slope[i], width, free[i], hypothesis),
-            float(final.cost[i]),
-            level,
-            limit,
-            tuple(
-                c
-                for c in hypothesis.sizes
-                if free[i, c] and end_reached(space.parameters[c], float(theta[i, c])) is not None
-            ),
-        )
-        for i, hypothesis in enumerate(hypotheses)
-    ]
-
-
-def _log_occam_factor(curvature: Tensor, slope: Tensor, width: Tensor, free: Tensor, hypothesis: Hypothesis) -> float:
-    """Log of the posterior's volume over the prior's, of the free columns.
-
-    Independent faults have independent onsets; each further fault therefore costs as much as an onset of its own.
-    """
-    chosen, further = free.nonzero().flatten(), len(set(hypothesis.sizes) - set(hypothesis.recovered)) - 1
-    onset = log_volume(curvature[-1:, -1:], width[-1:])
-    return log_volume(curvature[chosen][:, chosen], width[chosen], slope[chosen]) + max(further, 0) * onset
-
-
-def _expansion(
-    observer: ObserverBank,
-    window: ObserverWindow,
-    believed: Tensor,
-    point: Tensor,
-    free: Tensor,
-    incipient: Tensor,
-    middle: float,
-) -> Linearisation:
-    """Half the sum of squares of the white innovations about points (L, P+1), with slopes by central differences.
-
-    Free phases are those at `middle` s.
-    """
-    count, width = point.shape
-    oscillations = oscillation_columns(observer.space.names)
-    length = float(window.samples.time[-1] - window.samples.time[0])
-    steps = torch.cat([SIZE_STEP * observer.space_width(), 0.5 * torch.diff(window.samples.time).median()[None]])
-    steps = steps.repeat(count, 1)
-    for period, _ in oscillations:
-        steps[:, period] = period_step(point[:, period], length)
-    varied = free.nonzero()  # (K, 2): lane, column
-    step = steps[varied[:, 0], varied[:, 1]]
-    ahead, behind = point[varied[:, 0]].clone(), point[varied[:, 0]].clone()
-    rows = torch.arange(len(varied))
-    ahead[rows, varied[:, 1]] += step
-    behind[rows, varied[:, 1]] -= step
-    source = torch.cat([torch.arange(count), varied[:, 0], varied[:, 0]])
-    lanes = with_phases_at(torch.cat([point, ahead, behind]), oscillations, free[source], -middle)
-    changes = ChangeHypotheses(lanes[:, :-1], lanes[:, -1], incipient[source])
-    blocks = observer.in_blocks(window, changes)
-    white = torch.cat([observer.white_innovations(window, believed, block).flatten(1) for block in blocks])
-    error = white[:count]
-    slope = (white[count : count + len(varied)] - white[count + len(varied) :]) / (2.0 * step).unsqueeze(1)
-    gradient, curvature = error.new_zeros(count, width), error.new_zeros(count, width, width)
-    gradient[varied[:, 0], varied[:, 1]] = (slope * error[varied[:, 0]]).sum(-1)
-    for lane in range(count):
-        rows = (varied[:, 0] == lane).nonzero().flatten()
-        columns = varied[rows, 1]
-        curvature[lane, columns.unsqueeze(1), columns] = slope[rows] @ slope[rows].mT
-    return Linearisation(0.5 * error.square().sum(-1), gradient, curvature)
-
-
-def _misfit(white: Tensor) -> float:
-    return 0.5 * float(white.square().sum())

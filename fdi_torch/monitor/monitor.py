@@ -20,16 +20,11 @@ from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.explanations import Explainer
 from fdi_torch.monitor.hypothesis import faults_of
 from fdi_torch.monitor.monitor_settings import MonitorSettings, usual_settings
-from fdi_torch.monitor.monitor_state import (
-    MonitorState,
-    advance_observer,
-    drop_old_samples,
-    initial_state,
-    normalized_residuals,
-)
+from fdi_torch.monitor.monitor_state import MonitorState
 from fdi_torch.monitor.noise_model import NoiseModel
 from fdi_torch.monitor.observer_bank import LONG_AGO, ObserverBank
 from fdi_torch.monitor.samples import Samples, split_at_gaps
+from fdi_torch.monitor.state_update import advance_observer, drop_old_samples, initial_state, residuals_to_test
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 
@@ -92,7 +87,9 @@ class Monitor:
         no alarm, because it would use noise estimates from readings that are still to come.
         """
         theta = self.space.nominal() if believed is None else believed
-        state = initial_state(self.observer, samples, theta, self.alarms.explainer.fault_free(theta), levels)
+        state = initial_state(
+            self.observer, samples, theta, self.alarms.explainer.fault_free(theta), levels, self.settings.lookback
+        )
         return replace(state, learning_until=learning_until)
 
     def advance(
@@ -121,7 +118,9 @@ class Monitor:
 
     def _restart(self, state: MonitorState, samples: Samples, notice: str) -> tuple[MonitorState, list[Event]]:
         """Restart the observer after a gap. Isolated faults stay in its parameters; a pending alarm is retired."""
-        fresh = initial_state(self.observer, samples.segment(0, 1), state.believed, state.healthy)
+        fresh = initial_state(
+            self.observer, samples.segment(0, 1), state.believed, state.healthy, None, self.settings.lookback
+        )
         fresh = replace(
             fresh,
             alarms=state.alarms,
@@ -171,6 +170,6 @@ class Monitor:
     def _observed(self, state: MonitorState, samples: Samples) -> tuple[MonitorState, Tensor]:
         """The state after the samples, and the detector's statistic (S,) at each of them."""
         moved = advance_observer(self.observer, state, samples)
-        residuals = normalized_residuals(moved, len(samples), self.alarms.reach)
+        residuals = residuals_to_test(moved, len(samples), self.alarms.reach)
         statistic, memory = self.detector.update(residuals, state.detector_memory)
         return replace(moved, detector_memory=memory), statistic

@@ -12,9 +12,10 @@ from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.monitor.detection import Detector
 from fdi_torch.monitor.events import Event, Explanation, Kind, size_of
 from fdi_torch.monitor.monitor import ResidualTrace
-from fdi_torch.monitor.monitor_state import MonitorState, advance_observer, drop_old_samples, initial_state
+from fdi_torch.monitor.monitor_state import MonitorState
 from fdi_torch.monitor.observer_bank import ObserverBank
 from fdi_torch.monitor.samples import Samples, split_at_gaps
+from fdi_torch.monitor.state_update import advance_observer, drop_old_samples, initial_state
 from fdi_torch.monitor.window_estimators import ESTIMATORS, WindowData, WindowEstimate
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording

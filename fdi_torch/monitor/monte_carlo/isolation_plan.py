@@ -13,7 +13,6 @@ from fdi_torch.estimate.proportion import wilson
 from fdi_torch.monitor.detection import Chart, make_detector
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
-from fdi_torch.monitor.monitor_state import advance_observer
 from fdi_torch.monitor.monte_carlo.isolation_trials import FaultScenario, confusions, isolate_run, smallest_isolable
 from fdi_torch.monitor.monte_carlo.simulated_runs import (
     FaultSchedule,
@@ -23,6 +22,7 @@ from fdi_torch.monitor.monte_carlo.simulated_runs import (
 from fdi_torch.monitor.monte_carlo.tasks import Numbers, ResultTable, Task, quantiles, seeded_generator
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.state_update import advance_observer
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.scales import time_scale
 

@@ -1,0 +1,201 @@
+"""The fit of hypotheses about a change: sizes and onset by Levenberg-Marquardt, and their evidence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.evidence import log_prior, log_volume
+from fdi_torch.estimate.information import certainty
+from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
+from fdi_torch.estimate.linearisation import Linearisation
+from fdi_torch.estimate.refined import held_back
+from fdi_torch.estimate.uncertainty import end_reached
+from fdi_torch.monitor.hypothesis import NO_CHANGE, Hypothesis, HypothesisFit
+from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow
+from fdi_torch.monitor.oscillation import (
+    oscillation_columns,
+    period_step,
+    std_with_phases_at_zero,
+    with_phases_at,
+    with_wrapped_phases,
+)
+from fdi_torch.parameters import ParameterName, ParameterSpace
+
+SIZE_STEP = 1e-4  # finite-difference step, as a share of a parameter's range
+ITERATIONS = 12
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Prior odds of a hypothesis. names: of the parameter space. single_changes: number of possible single changes."""
+
+    names: tuple[str, ...]
+    single_changes: int
+
+    def __call__(self, hypothesis: Hypothesis) -> float:
+        """Log of the odds against no change."""
+        new = [c for c in hypothesis.sizes if c not in hypothesis.recovered]
+        places = len({ParameterName.parse(self.names[c]).place for c in new}) + bool(hypothesis.recovered)
+        return log_prior(hypothesis.count, places, max(self.single_changes, 1))
+
+
+def no_change_fit(observer: ObserverBank, window: ObserverWindow, believed: Tensor, base: Tensor) -> HypothesisFit:
+    """The hypothesis of a false alarm. base (1, S, sensors): white innovations without a change."""
+    limit, first = _noise_limit(observer, window), float(window.samples.time[0])
+    level = float(window.readings)
+    return HypothesisFit(NO_CHANGE, believed, torch.zeros_like(believed), first, 0.0, 0.0, misfit(base), level, limit)
+
+
+def _noise_limit(observer: ObserverBank, window: ObserverWindow) -> float:
+    """Upper limit of the innovations' sum of squares under noise alone, four standard deviations above its mean.
+
+    The variance is that of the sum itself plus that of the noise variance, which was estimated from a finite recording.
+    """
+    count, channels = window.readings, len(observer.network.description.sensors)
+    learnt = observer.whitening.samples * channels
+    return count * (1.0 + 4.0 * math.sqrt(2.0 / max(count, 1) + 2.0 / learnt))
+
+
+def point_of(fit: HypothesisFit) -> Tensor:
+    """Values and onset of a fit, (P+1,)."""
+    return torch.cat([fit.value, fit.value.new_tensor([fit.onset])])
+
+
+def change_of(fit: HypothesisFit) -> ChangeHypotheses:
+    """A fit as the single lane of a bank of observers."""
+    incipient = torch.tensor([fit.hypothesis.incipient])
+    return ChangeHypotheses(fit.value[None], fit.value.new_tensor([fit.onset]), incipient)
+
+
+def fit(
+    observer: ObserverBank,
+    window: ObserverWindow,
+    believed: Tensor,
+    hypotheses: Sequence[Hypothesis],
+    starts: Tensor,
+    base: float,
+    prior: Prior,
+    known_onset: bool = False,
+    space: ParameterSpace | None = None,
+) -> list[HypothesisFit]:
+    """Sizes and onset of each hypothesis by Levenberg-Marquardt on the white innovations, all in parallel.
+
+    believed (P,): parameters before the change; starts (H, P+1): initial values and onset (s); base: misfit without a
+    change. known_onset: the onsets of `starts` are exact. space: its ranges bound the sizes; those of the observer's
+    `search_space` by default.
+    """
+    free = torch.zeros(len(hypotheses), len(believed) + 1, dtype=torch.bool)
+    free[:, -1] = not known_onset
+    for i, hypothesis in enumerate(hypotheses):
+        free[i, hypothesis.free] = True
+    incipient = torch.tensor([h.incipient for h in hypotheses])
+    first, last = window.samples.time[0], window.samples.time[-2]
+    oscillations, middle = oscillation_columns(observer.space.names), 0.5 * float(first + last)
+
+    def linearise(point: Tensor, lanes: Tensor) -> Linearisation:
+        return _expansion(observer, window, believed, point, free[lanes], incipient[lanes], middle)
+
+    fixed = torch.cat([believed, first[None]]).repeat(len(starts), 1)
+    fixed[:, -1] = starts[:, -1]
+    for i, hypothesis in enumerate(hypotheses):
+        fixed[i, list(hypothesis.recovered)] = starts[i, list(hypothesis.recovered)]
+    space = observer.search_space(believed) if space is None else space
+    low = torch.where(free, torch.cat([space.low(believed), first[None]]), fixed)
+    high = torch.where(free, torch.cat([space.high(believed), last[None]]), fixed)
+    starts = with_phases_at(torch.where(free, starts.clamp(low, high), fixed), oscillations, free, middle)
+    for _, phase in oscillations:  # a full turn either way, so that no fit stops at +-pi
+        low[:, phase] = torch.where(free[:, phase], starts[:, phase] - 2.0 * math.pi, low[:, phase])
+        high[:, phase] = torch.where(free[:, phase], starts[:, phase] + 2.0 * math.pi, high[:, phase])
+    settings = RefineSettings(iterations=ITERATIONS, decrease_tolerance=1e-3, step_tolerance=1e-6)
+    refined = levenberg_marquardt(linearise, starts, low, high, settings)
+    final = linearise(refined.theta, torch.arange(len(hypotheses)))
+    theta = with_wrapped_phases(with_phases_at(refined.theta, oscillations, free, -middle), oscillations, free)
+    std = std_with_phases_at_zero(certainty(final.curvature, held=~free), theta, oscillations, free, middle)
+    width = torch.cat([observer.space_width(), (last - first)[None]])
+    level, limit = float(window.readings), _noise_limit(observer, window)
+    held = free & held_back(refined.theta, final.gradient, low, high)
+    slope = torch.where(held, final.gradient.abs(), 0.0)
+    return [
+        HypothesisFit(
+            hypothesis,
+            theta[i, :-1],
+            std[i, :-1],
+            float(theta[i, -1]),
+            float(std[i, -1]),
+            base
+            - float(final.cost[i])
+            + prior(hypothesis)
+            + _log_occam_factor(final.curvature[i], slope[i], width, free[i], hypothesis),
+            float(final.cost[i]),
+            level,
+            limit,
+            tuple(
+                c
+                for c in hypothesis.sizes
+                if free[i, c] and end_reached(space.parameters[c], float(theta[i, c])) is not None
+            ),
+        )
+        for i, hypothesis in enumerate(hypotheses)
+    ]
+
+
+def _log_occam_factor(curvature: Tensor, slope: Tensor, width: Tensor, free: Tensor, hypothesis: Hypothesis) -> float:
+    """Log of the posterior's volume over the prior's, of the free columns.
+
+    Independent faults have independent onsets; each further fault therefore costs as much as an onset of its own.
+    """
+    chosen, further = free.nonzero().flatten(), len(set(hypothesis.sizes) - set(hypothesis.recovered)) - 1
+    onset = log_volume(curvature[-1:, -1:], width[-1:])
+    return log_volume(curvature[chosen][:, chosen], width[chosen], slope[chosen]) + max(further, 0) * onset
+
+
+def _expansion(
+    observer: ObserverBank,
+    window: ObserverWindow,
+    believed: Tensor,
+    point: Tensor,
+    free: Tensor,
+    incipient: Tensor,
+    middle: float,
+) -> Linearisation:
+    """Half the sum of squares of the white innovations about points (L, P+1), with slopes by central differences.
+
+    Free phases are those at `middle` s.
+    """
+    count, width = point.shape
+    oscillations = oscillation_columns(observer.space.names)
+    length = float(window.samples.time[-1] - window.samples.time[0])
+    steps = torch.cat([SIZE_STEP * observer.space_width(), 0.5 * torch.diff(window.samples.time).median()[None]])
+    steps = steps.repeat(count, 1)
+    for period, _ in oscillations:
+        steps[:, period] = period_step(point[:, period], length)
+    varied = free.nonzero()  # (K, 2): lane, column
+    step = steps[varied[:, 0], varied[:, 1]]
+    ahead, behind = point[varied[:, 0]].clone(), point[varied[:, 0]].clone()
+    rows = torch.arange(len(varied))
+    ahead[rows, varied[:, 1]] += step
+    behind[rows, varied[:, 1]] -= step
+    source = torch.cat([torch.arange(count), varied[:, 0], varied[:, 0]])
+    lanes = with_phases_at(torch.cat([point, ahead, behind]), oscillations, free[source], -middle)
+    changes = ChangeHypotheses(lanes[:, :-1], lanes[:, -1], incipient[source])
+    blocks = observer.in_blocks(window, changes)
+    white = torch.cat([observer.white_innovations(window, believed, block).flatten(1) for block in blocks])
+    error = white[:count]
+    slope = (white[count : count + len(varied)] - white[count + len(varied) :]) / (2.0 * step).unsqueeze(1)
+    gradient, curvature = error.new_zeros(count, width), error.new_zeros(count, width, width)
+    gradient[varied[:, 0], varied[:, 1]] = (slope * error[varied[:, 0]]).sum(-1)
+    for lane in range(count):
+        rows = (varied[:, 0] == lane).nonzero().flatten()
+        columns = varied[rows, 1]
+        curvature[lane, columns.unsqueeze(1), columns] = slope[rows] @ slope[rows].mT
+    return Linearisation(0.5 * error.square().sum(-1), gradient, curvature)
+
+
+def misfit(white: Tensor) -> float:
+    """Half the sum of squares of white innovations."""
+    return 0.5 * float(white.square().sum())

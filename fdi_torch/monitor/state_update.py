@@ -1,0 +1,158 @@
+"""How a monitor's state moves on: along further samples, and from the onset of a change with other parameters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from fdi_torch.monitor.hypothesis import HypothesisFit, faults_of
+from fdi_torch.monitor.law_errors import STEP, LawErrors, normalized
+from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
+from fdi_torch.monitor.observer_bank import LONG_AGO, ChangeHypotheses, ObserverBank, ObserverWindow
+from fdi_torch.monitor.samples import ClockState, Samples, concatenated
+
+
+def initial_state(
+    observer: ObserverBank,
+    samples: Samples,
+    believed: Tensor,
+    healthy: Tensor,
+    levels: Tensor | None = None,
+    correlation_time: float = 1.0,
+) -> MonitorState:
+    """The state after the first sample. levels (tanks,) m: taken from the readings if None. correlation_time: of the
+    errors of known faults' laws, s.
+    """
+    first = samples.segment(0, 1)
+    state, residual = observer.first_state(samples, believed, levels)
+    innovations, memory = observer.whitening.innovations(residual[None])
+    white, now = observer.whitening.of_innovations(innovations), float(first.time[0])
+    known = _known_columns(observer, believed, healthy)
+    return MonitorState(
+        samples=first,
+        state=state[None],
+        residual=residual[None],
+        innovations=innovations,
+        white=white,
+        tested=white,
+        memory=memory,
+        errors=LawErrors.at_start(known, correlation_time, state, memory[0], innovations[: observer.whitening.order]),
+        number=1,
+        believed=believed,
+        healthy=healthy,
+        reachable=now,
+        clock=ClockState(now),
+    )
+
+
+def _known_columns(observer: ObserverBank, believed: Tensor, healthy: Tensor) -> list[int]:
+    """Columns of the sizes of the known faults."""
+    return [f.size for f in faults_of(observer.space.names) if float(believed[f.size]) != float(healthy[f.size])]
+
+
+def advance_observer(observer: ObserverBank, state: MonitorState, samples: Samples) -> MonitorState:
+    """Run the observer along further samples."""
+    last = len(state.samples) - 1
+    further = concatenated(state.samples.segment(last, last + 1), samples)
+    lanes = torch.cat([state.state[-1:], state.errors.state]), torch.cat([state.memory[-1:], state.errors.memory])
+    window = ObserverWindow(further, lanes[0], state.number, lanes[1])
+    state = replace(state, samples=concatenated(state.samples, samples), number=state.number + len(samples))
+    return _run(observer, state, window, state.believed, LONG_AGO)
+
+
+def adopt_change(observer: ObserverBank, state: MonitorState, change: DetectedChange, believed: Tensor) -> MonitorState:
+    """Run the observer again from the change's onset with new parameters (P,), and restart the detector."""
+    fit = change.best
+    state = replace(state, change=change, pending=None)
+    return _adopt(observer, state, believed, change.before, fit.onset, fit.hypothesis.incipient)
+
+
+def adopt_sizes(observer: ObserverBank, state: MonitorState, fit: HypothesisFit) -> MonitorState:
+    """Run the observer again from the fit's onset with new sizes of the known faults."""
+    return _adopt(observer, state, fit.value, state.believed, fit.onset)
+
+
+def _adopt(
+    observer: ObserverBank,
+    state: MonitorState,
+    believed: Tensor,
+    before: Tensor,
+    onset: float,
+    incipient: bool = False,
+) -> MonitorState:
+    """Run the observer again from the onset of a change from `before` to `believed`, and restart the detector."""
+    window = state.window(onset)
+    first, known = len(state.samples) - len(window), _known_columns(observer, believed, state.healthy)
+    past, time = _innovations_before(observer, state, first), state.errors.correlation_time
+    errors = LawErrors.at_start(known, time, window.state, state.memory[first - 1], past)
+    state = replace(state, believed=believed, errors=errors, detector_memory=None)
+    return _run(observer, state, window, before, onset, incipient)
+
+
+def _innovations_before(observer: ObserverBank, state: MonitorState, first: int) -> Tensor:
+    """The innovations on which the white residual of sample `first` depends."""
+    return state.innovations[max(first - observer.whitening.order, 0) : first]
+
+
+def drop_old_samples(state: MonitorState, fewest: int) -> MonitorState:
+    """Remove the samples that no window can reach, except the last `fewest`.
+
+    What is kept depends on the time only, so that no result depends on how many samples are processed at once.
+    """
+    first = max(min(int((state.samples.time < state.earliest_start).sum()) - 1, len(state.samples) - fewest), 0)
+    return replace(
+        state,
+        samples=state.samples.segment(first, len(state.samples)),
+        state=state.state[first:],
+        residual=state.residual[first:],
+        innovations=state.innovations[first:],
+        white=state.white[first:],
+        tested=state.tested[first:],
+        memory=state.memory[first:],
+    )
+
+
+def residuals_to_test(state: MonitorState, count: int, reach: int) -> Tensor:
+    """The last white residuals (count, sensors) for the detector. reach: samples over which those beside known faults
+    are normalized.
+    """
+    return normalized(state.tested, count, reach) if bool(state.off_nominal.any()) else state.tested[-count:]
+
+
+def _run(
+    observer: ObserverBank,
+    state: MonitorState,
+    window: ObserverWindow,
+    before: Tensor,
+    onset: float,
+    incipient: bool = False,
+) -> MonitorState:
+    """Run the observer along a window at the end of the samples, and replace the stored results there.
+
+    The parameters change from `before` to `state.believed` at `onset` s. The window's state, its memory and the
+    errors of the known faults are those at its beginning.
+    """
+    first, errors, order = len(state.samples) - len(window), state.errors, observer.whitening.order
+    theta = state.believed.repeat(1 + len(errors.columns), 1)
+    for lane, column in enumerate(errors.columns, start=1):
+        theta[lane, column] += STEP * (state.believed - state.healthy)[column]
+    change = ChangeHypotheses(theta, theta.new_full((len(theta),), onset), torch.full((len(theta),), incipient))
+    path, residual = observer.run(window, before, change)
+    innovations, memory = observer.whitening.innovations(residual, window.number, window.memory)
+    past = torch.cat([_innovations_before(observer, state, first)[None], errors.innovations])
+    history = torch.cat([past, innovations], dim=1)
+    white = observer.whitening.of_innovations(history)[:, past.shape[1] :]
+    errors, tested = errors.after(white[0], (white[1:] - white[0]) / STEP, torch.diff(window.samples.time))
+    latest = history[1:, max(history.shape[1] - order, 0) :]
+    return replace(
+        state,
+        state=torch.cat([state.state[:first], path[0]]),
+        residual=torch.cat([state.residual[:first], residual[0]]),
+        innovations=torch.cat([state.innovations[:first], innovations[0]]),
+        white=torch.cat([state.white[:first], white[0]]),
+        tested=torch.cat([state.tested[:first], tested]),
+        memory=torch.cat([state.memory[:first], memory[0]]),
+        errors=replace(errors, state=path[1:, -1], memory=memory[1:, -1], innovations=latest),
+    )

@@ -1,0 +1,59 @@
+"""Errors of sizes and laws of known faults in the residuals of the monitor."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.evidence import ODDS
+from fdi_torch.monitor.law_errors import SIZE_ERROR, LawErrors
+from fdi_torch.parameters import ParameterSpace
+from tests.test_monitor import NETWORK, SPACE, followed, monitor, recorded
+
+DTYPE = torch.float64
+
+
+def start(faults: int, correlation_time: float) -> LawErrors:
+    nothing = torch.zeros(3, dtype=DTYPE)
+    return LawErrors.at_start(range(faults), correlation_time, nothing, nothing, torch.zeros(0, 3, dtype=DTYPE))
+
+
+def test_innovations_beside_known_faults_are_those_of_the_normal_distribution_of_all_residuals() -> None:
+    """Its covariance is I + D (SIZE_ERROR^2 + law_error^2 exp(-|t - t'| / T)) D', for the readings that are there."""
+    generator = torch.Generator().manual_seed(3)
+    count, sensors, faults, time = 40, 3, 2, 25.0
+    white, effects = (torch.randn(*n, count, sensors, generator=generator, dtype=DTYPE) for n in ((), (faults,)))
+    effects = 5.0 * effects
+    intervals = 0.5 + torch.rand(count, generator=generator, dtype=DTYPE)
+    white[10, 1] = white[11, 1] = white[20] = torch.nan
+    at = intervals.cumsum(0)
+    shared = SIZE_ERROR**2 + ODDS.law_error**2 * torch.exp(-(at[:, None] - at).abs() / time)
+    joint = torch.einsum("fsc,ftd,st->sctd", effects, effects, shared).reshape(count * sensors, -1)
+    present = torch.isfinite(white).flatten()
+    covariance = (joint + torch.eye(count * sensors, dtype=DTYPE))[present][:, present]
+    expected = torch.linalg.solve_triangular(
+        torch.linalg.cholesky(covariance), white.flatten()[present][:, None], upper=False
+    ).flatten()
+    errors, first = start(faults, time).after(white[:15], effects[:, :15], intervals[:15])
+    _, second = errors.after(white[15:], effects[:, 15:], intervals[15:])
+    got = torch.cat([first, second]).flatten()
+    assert torch.equal(torch.isfinite(got), present)
+    assert torch.allclose(got[present], expected, rtol=1e-9, atol=1e-9)
+
+
+def test_the_detector_gets_residuals_without_the_error_of_a_known_law() -> None:
+    """A hole 25 cm above the floor, modelled as one in the floor, leaves more than noise in the residual."""
+    space = ParameterSpace([NETWORK.constants["T1.leak.size"], NETWORK.constants["T1.leak.height"]])
+
+    def truth(time: float) -> Tensor:
+        return space.vector({"T1.leak.size": 0.3, "T1.leak.height": 0.25} if time >= 200.0 else {})
+
+    state, _ = followed(monitor(), recorded(truth, 420, NETWORK, space), 50)
+    own, left = (x[-60:].square().mean().sqrt() for x in (state.white, state.tested))
+    assert float(own) > 1.5
+    assert 0.8 < float(left) < 1.3
+
+
+def test_a_detector_beside_no_known_fault_gets_the_white_residuals() -> None:
+    state, _ = followed(monitor(), recorded(lambda t: SPACE.nominal(), 100))
+    assert torch.equal(state.white, state.tested)
