@@ -188,3 +188,12 @@ def test_a_batch_of_plants_trains_inside_a_module() -> None:
 
     optimiser.step(closure)  # type: ignore[arg-type]
     assert torch.allclose(torch.sigmoid(module.raw), truth, atol=2e-3)
+
+
+@pytest.mark.parametrize("kind", ["compiled", "traced", "reference"])
+def test_an_engine_prints_what_it_simulates(kind: str) -> None:
+    engine = engine_of(kind)
+    names, samples = engine.space.names, len(engine.experiment.sample_times)  # type: ignore[attr-defined]
+    shown = repr(engine)
+    assert shown.startswith(f"{kind} engine: ") and f"{samples} samples" in shown
+    assert f"columns of theta: {', '.join(names)}" in shown

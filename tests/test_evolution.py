@@ -399,3 +399,17 @@ def test_cma_es_learns_the_scales_and_the_rotation_of_the_cost() -> None:
 def test_the_state_of_no_strategy_is_refused() -> None:
     with pytest.raises(ValueError, match="expected the state of a search, got cost"):
         state_from_dict({"cost": torch.zeros(1)})
+
+
+@ALL
+def test_a_search_and_its_result_print_in_one_line(settings: EvolutionSettings) -> None:
+    low, high = torch.full((3, 2), -1.0, dtype=DOUBLE), torch.full((3, 2), 1.0, dtype=DOUBLE)
+    searches: list[Search] = []
+    short = replace(settings, evaluations=3 * settings.population)
+    result = evolve(lambda x, lanes: sphere(x), low, high, short, on_generation=searches.append)
+    running = searches[0]
+    assert repr(running).startswith("Search of 3 problems; running: 3 problems, 2 parameters, generation 1, best cost ")
+    assert repr(running.state).startswith("3 problems, 2 parameters, generation 1, best cost ")
+    assert repr(result).startswith("EvolutionResult: 3 problems, 2 parameters; ")
+    assert all(reason in repr(result) for reason in result.reasons())
+    assert all("\n" not in repr(x) for x in (running, running.state, result))

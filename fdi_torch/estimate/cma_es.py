@@ -25,7 +25,7 @@ from fdi_torch.estimate.strategy import Proposal, SearchState, before_first_gene
 FIRST_STEP = 0.3  # in widths of the box (Hansen 2016, section B.1: about a quarter, so that the optimum is within 3 s)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class CmaState(SearchState):
     """State of CMA-ES. `population` holds the last candidates, with the best of all in place of the worst."""
 

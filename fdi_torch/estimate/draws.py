@@ -23,7 +23,7 @@ _ROUNDS = ((30, _signed(0xBF58476D1CE4E5B9)), (27, _signed(0x94D049BB133111EB)),
 
 
 def mix(words: Tensor) -> Tensor:
-    """Finaliser of splitmix64 (Steele, Lea & Flood 2014), elementwise on int64 of any shape."""
+    """Scramble the bits of each int64 (last stage of splitmix64: Steele, Lea & Flood 2014); any shape."""
     words = words.clone()
     shifted = torch.empty_like(words)
     for shift, factor in _ROUNDS:

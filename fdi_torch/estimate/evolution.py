@@ -7,6 +7,7 @@ indices in the flattened batch are `lanes`. A stopped problem drops out without 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -44,6 +45,11 @@ class EvolutionResult:
     evaluations: Tensor  # (*problems) int64
     reason: Tensor  # (*problems) int64, index into REASONS
 
+    def __repr__(self) -> str:
+        counts = Counter(self.reasons())
+        reasons = ", ".join(f"{count} {reason}" for reason, count in counts.items())
+        return f"EvolutionResult: {self.reason.numel()} problems, {self.best.shape[-1]} parameters; {reasons}"
+
     @property
     def converged(self) -> Tensor:
         """Whether the population contracted to a point or reached the target, (*problems) bool."""
@@ -65,6 +71,9 @@ class Search:
     lanes: Tensor  # (L,) int64
     finished: EvolutionResult  # of all problems, flat
     shape: tuple[int, ...]  # of the batch of problems
+
+    def __repr__(self) -> str:
+        return f"Search of {self.finished.reason.numel()} problems; running: {self.state!r}"
 
     def to_dict(self) -> dict[str, Tensor]:
         """The search as plain tensors; `from_dict` restores it."""

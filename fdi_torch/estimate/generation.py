@@ -24,7 +24,7 @@ from fdi_torch.estimate.strategy import Proposal, SearchState, before_first_gene
 _VARIATION, _ARCHIVE = 0, 2  # indices of the random streams of one generation
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class State(SearchState):
     """State of differential evolution.
 

@@ -25,7 +25,7 @@ from torch import Tensor
 from fdi_torch.estimate.evolution_settings import STRATEGIES, EvolutionSettings
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class SearchState:
     """What every strategy keeps. Members are sorted, best first; one without a valid cost has an infinite one.
 
@@ -45,6 +45,13 @@ class SearchState:
     first_population: int
     generation: int = 0
     evaluations: int = 0
+
+    def __repr__(self) -> str:
+        best = f"{float(self.cost.min()):.6g}" if self.cost.numel() else "none"
+        return (
+            f"{self.low[..., 0].numel()} problems, {self.low.shape[-1]} parameters, generation {self.generation}, "
+            f"best cost {best}"
+        )
 
     def select(self, keep: Tensor) -> Self:
         """The problems selected by the mask `keep` (*problems), with one flat leading dimension."""

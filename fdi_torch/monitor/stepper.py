@@ -23,7 +23,7 @@ _USUAL_STEP = 1.0
 
 
 def usual_step(plant: PlantDescription) -> float:
-    """Default of an observer's longest integration step, s."""
+    """Longest integration step of an observer, s, where none is given."""
     return _USUAL_STEP * time_scale(plant)
 
 

@@ -10,6 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.network import TankNetwork
+from fdi_torch.simulate.experiment import Experiment
+
 
 @dataclass(frozen=True)
 class Readings:
@@ -86,6 +90,24 @@ class Engine(Protocol):
     def gram(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C W W"]:
         """Weighted sums of the products of [d prediction/d theta, r, y', 1]; W = P + 3."""
         ...
+
+
+class EngineText:
+    """The text by which an engine prints: what it simulates, and the columns of theta."""
+
+    name: str
+    why: str
+    network: TankNetwork
+    space: ParameterSpace
+    experiment: Experiment
+
+    def __repr__(self) -> str:
+        sensors, samples = len(self.network.description.sensors), len(self.experiment.sample_times)
+        reason = f" ({self.why})" if self.why else ""
+        return (
+            f"{self.name} engine: {self.network.description.name}, {sensors} sensors, {samples} samples{reason}; "
+            f"columns of theta: {', '.join(self.space.names)}"
+        )
 
 
 def expect_problems(theta: Float[Tensor, "*problems N P"], data: Readings) -> None:

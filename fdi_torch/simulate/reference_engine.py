@@ -16,13 +16,13 @@ from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.operating_point import Constants
 from fdi_torch.plant.signals import Clock
-from fdi_torch.simulate.engine import Readings, expect_problems, gram_of, moments_of
+from fdi_torch.simulate.engine import EngineText, Readings, expect_problems, gram_of, moments_of
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.forward_mode import ZeroSlopes, directions, stack_with_slope, value_and_slope, with_slope
 from fdi_torch.simulate.gradient import expect_no_gradient
 
 
-class ReferenceEngine:
+class ReferenceEngine(EngineText):
     """Readings of many parameter vectors at once, by torchdiffeq's fixed-step RK4 (3/8 rule) or an adaptive solver.
 
     method: 'rk4' for populations, or any adaptive method of torchdiffeq for single runs (rtol; atol in m). Adaptive

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.simulate.engine import Readings, expect_problems, gram_of, moments_of
+from fdi_torch.simulate.engine import EngineText, Readings, expect_problems, gram_of, moments_of
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.gradient import expect_no_gradient, is_differentiated, readings_with_gradient
 from fdi_torch.simulate.implicit import ImplicitStep
@@ -24,7 +24,7 @@ from fdi_torch.simulate.reference_engine import hermite
 from fdi_torch.simulate.step_control import accept_steps, next_step
 
 
-class TracedEngine:
+class TracedEngine(EngineText):
     """Readings and their Jacobians (forward mode) of many parameter vectors at once, by fixed-step RK4 or adaptive
     steps.
     """

@@ -196,7 +196,7 @@ def _other_readings(recording: Recording, stuck: StuckSegment) -> Tensor:
 
 
 def _may_be_clipped(plant: PlantDescription, recording: Recording, stuck: StuckSegment) -> bool:
-    """Whether the value is an end of the readings' range, or of the tank's if nothing else is read."""
+    """Whether the stuck value may be a limit: an extreme of the readings or, without others, of the tank or sensor."""
     sensor, rest = stuck.sensor, _other_readings(recording, stuck)
     if len(rest):
         return not float(rest.min()) < stuck.value < float(rest.max())

@@ -131,7 +131,7 @@ def _beside(shared: Sequence[Mapping[str, Any]], causes: Sequence[Mapping[str, A
 
 
 def _up_to_all(figure: Figure) -> None:
-    """Remove ticks beyond 100 %, where only the values of the bars are."""
+    """Remove ticks beyond 100 %: that part of the axis only makes room for the numbers beside the bars."""
     axes = figure.axes[0]
     axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= 100.0])
 
