@@ -17,6 +17,7 @@ from typing import Any
 
 _HOMES: dict[str, tuple[str, ...]] = {
     "fdi_torch.config.loaded_recordings": ("load_recordings", "read_frame", "read_recording"),
+    "fdi_torch.recordings.csv_writing": ("write_csv",),
     "fdi_torch.config.plant_file": ("load_plant",),
     "fdi_torch.config.plant_in_code": ("Plant",),
     "fdi_torch.config.plant_writer": ("dump_plant",),

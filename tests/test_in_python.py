@@ -321,6 +321,16 @@ def test_a_recording_comes_back_from_its_data_frame() -> None:
     assert torch.equal(again.outputs, recording.outputs) and again.source == "data frame"
 
 
+def test_a_recording_comes_back_from_its_csv_file(tmp_path: Path) -> None:
+    recording = simulated()
+    missing = replace(recording, mask=recording.mask & (torch.arange(len(recording)) != 2).unsqueeze(1))
+    again = fdi_torch.read_recording(str(fdi_torch.write_csv(missing, str(tmp_path / "run.csv"))), RIG)
+    for name in ("time", "inputs", "outputs", "mask"):
+        then, now = getattr(missing, name), getattr(again, name)
+        torch.testing.assert_close(now[again.mask[:, 0]], then[missing.mask[:, 0]], rtol=1e-11, atol=0.0)
+    assert torch.equal(again.mask, missing.mask)
+
+
 def test_a_data_frame_follows_the_rules_of_files() -> None:
     pandas = pytest.importorskip("pandas")
     stamps = pandas.date_range("2026-03-29 08:30", periods=4, freq="2s", tz="UTC")

@@ -14,10 +14,12 @@ from fdi_torch.recording import Recording
 from fdi_torch.recordings.header import header_unit
 
 
-def write_csv(recording: Recording, path: Path) -> Path:
+def write_csv(recording: Recording, path: Path | str) -> Path:
     """Write the recording as CSV whose headers need no mapping: t_s, Q1_cm3_s, h1_cm ..., in the units for display.
-    Masked readings become empty cells.
+
+    Masked readings become empty cells. `read_recording` reads the same recording from it. Returns the path.
     """
+    path = Path(path)
     inputs = dict(zip(recording.input_names, recording.input_units, strict=True))
     outputs = dict(zip(recording.output_names, recording.output_units, strict=True))
     factors = [unit_factor(si, _file_unit(name, si)) for name, si in (*inputs.items(), *outputs.items())]
