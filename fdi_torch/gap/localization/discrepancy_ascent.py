@@ -10,7 +10,8 @@ from torch import Tensor
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression
+from fdi_torch.gap.localization.discrepancy_columns import Discrepancy
+from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.fine_positions import Positions, with_best_frequency
 from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy, log_likelihood, unexplained_norm
 from fdi_torch.gap.localization.single_regressor_gain import largest_influence

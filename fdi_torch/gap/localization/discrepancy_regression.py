@@ -26,6 +26,7 @@ from fdi_torch.gap.localization.component_regressors import (
     fine_reading_regressors,
     reading_regressors,
 )
+from fdi_torch.gap.localization.discrepancy_columns import Columns, Discrepancy
 from fdi_torch.gap.localization.regressors import harmonics, step_functions, time_functions
 from fdi_torch.gap.marginal_likelihood import predicted_levels
 from fdi_torch.plant.description import OUTSIDE, Sensor
@@ -38,50 +39,6 @@ from fdi_torch.simulate.resampling import interpolate
 from fdi_torch.simulate.scan import product, scan_in_time
 
 BATCH = 64  # regressors whose influence is computed, or whitened, together
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Columns (S, C, M) in blocks (S, C, .), so that a change of one block copies no other."""
-
-    blocks: tuple[Tensor, ...]
-
-    def __len__(self) -> int:
-        return sum(b.shape[-1] for b in self.blocks)
-
-    def __getitem__(self, used: Tensor) -> Tensor:
-        """Some columns (S, C, .). used (M,) bool."""
-        parts = used.split([b.shape[-1] for b in self.blocks])
-        return torch.cat([b[..., part] for b, part in zip(self.blocks, parts, strict=True)], dim=-1)
-
-
-@dataclass(frozen=True)
-class Discrepancy:
-    """Influence of a component's regressors on the readings, columns (S, C, M), about a linearised trajectory.
-
-    choices (M,): number of regressors among which each was selected. frequency: of the sinusoids, Hz, or None if there
-    are none. sinusoids (M,) bool: which columns they are.
-    """
-
-    columns: Columns
-    linearised: Linearised
-    choices: Tensor
-    frequency: float | None
-    sinusoids: Tensor
-
-    def with_column(self, column: Tensor, choices: int) -> Discrepancy:
-        """The same with one more column (S, C)."""
-        return replace(
-            self,
-            columns=Columns((*self.columns.blocks, column.unsqueeze(-1))),
-            choices=torch.cat([self.choices, self.choices.new_tensor([choices])]),
-            sinusoids=torch.cat([self.sinusoids, self.sinusoids.new_zeros(1)]),
-        )
-
-    def with_sinusoids(self, frequency: float, columns: Tensor) -> Discrepancy:
-        """The same with sinusoids of another frequency; columns (S, C, W): their influence."""
-        grid, _, *added = self.columns.blocks
-        return replace(self, columns=Columns((grid, columns, *added)), frequency=frequency)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from fdi_torch.estimate.linear_parameters import without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.breakpoints import Relays
-from fdi_torch.gap.localization.discrepancy_regression import Discrepancy, DiscrepancyRegression
+from fdi_torch.gap.localization.discrepancy_columns import Discrepancy
+from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.single_regressor_gain import (
     adjoints_of,
     gains_of,

@@ -91,23 +91,37 @@ def localize(
         largest = float(best.explained.square().mean(dim=0).max().sqrt())
         if selected and not is_rounding_error(fitter, place, largest):
             needed, evaluated[place] = max(needed, best.gain + math.log(RARE)), best.localized(fitter)
+    evaluated = _under_the_noise_of_the_likeliest(ascent, evaluated, needed)
+    processes = [*drifting_sensors(regression, likely, places, base, needed)]
+    processes += random_flows(regression, likely, places, base, needed)
+    return Localization(_likeliest_of_each_place([*evaluated.values(), *processes]), itself)
+
+
+def _under_the_noise_of_the_likeliest(
+    ascent: Ascent, evaluated: dict[str, LocalizedDiscrepancy], needed: float
+) -> dict[str, LocalizedDiscrepancy]:
+    """The discrepancies, each also evaluated under the noise that the likeliest one left.
+
+    A larger noise hides what another place explains as well.
+    """
+    best_of = dict(evaluated)
     before = needed - CONVERGED  # nothing is compared about an irrelevant discrepancy
-    while evaluated and (likeliest := max(evaluated.values(), key=gain_of)).gain - before > CONVERGED:
+    while best_of and (likeliest := max(best_of.values(), key=gain_of)).gain - before > CONVERGED:
         before = likeliest.gain
-        for place, earlier in evaluated.items():
-            # A larger noise than that which the likeliest discrepancy left hides what another place explains as well.
+        for place, earlier in best_of.items():
             if earlier is not likeliest:
-                best = ascent.about(earlier.fit, earlier.explained, likeliest.noise, place, earlier.frequency)
-                best = ascent.climbed(ascent.with_finer_positions(best), needed)
-                evaluated[place] = max(earlier, best.localized(fitter), key=gain_of)
-    localized = list(evaluated.values())
-    random = [*drifting_sensors(regression, likely, places, base, needed)]
-    random += random_flows(regression, likely, places, base, needed)
-    for process in random:
-        localized = [p for p in localized if p.location != process.location or p.gain > process.gain]
-        if all(p.location != process.location for p in localized):
-            localized.append(process)
-    return Localization(tuple(sorted(localized, key=gain_of, reverse=True)), itself)
+                about = ascent.about(earlier.fit, earlier.explained, likeliest.noise, place, earlier.frequency)
+                climbed = ascent.climbed(ascent.with_finer_positions(about), needed)
+                best_of[place] = max(earlier, climbed.localized(ascent.fitter), key=gain_of)
+    return best_of
+
+
+def _likeliest_of_each_place(discrepancies: Sequence[LocalizedDiscrepancy]) -> tuple[LocalizedDiscrepancy, ...]:
+    """Of each place the discrepancy with the largest gain, the likeliest place first."""
+    best: dict[str, LocalizedDiscrepancy] = {}
+    for discrepancy in sorted(discrepancies, key=gain_of, reverse=True):
+        best.setdefault(discrepancy.location, discrepancy)
+    return tuple(best.values())
 
 
 def localize_beside(

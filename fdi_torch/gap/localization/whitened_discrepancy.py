@@ -11,7 +11,8 @@ from torch import Tensor
 from fdi_torch.estimate.linear_parameters import decomposed, without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.localization.discrepancy_regression import BATCH, Columns, Discrepancy
+from fdi_torch.gap.localization.discrepancy_columns import Columns, Discrepancy
+from fdi_torch.gap.localization.discrepancy_regression import BATCH
 from fdi_torch.gap.localization.sparse_regression import SparseFit, sparse_fit
 
 MOST_ROWS = 1000  # rows per channel from which columns are selected; more samples are summed in groups
