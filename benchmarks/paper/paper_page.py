@@ -154,9 +154,9 @@ where the faults bring tanks 2 and 3 to nearly equal levels (3- to 5-dim), the r
 
 ## Table 3: one fault at five noise levels
 
-The noise is one draw, scaled: errors at different SNR are not independent. θ₅ = 1 lies on the edge of the box,
-where a boxed estimate is biased and its error smaller than the bound on one side; the last columns show the
-estimate that is free of the box.
+All noise levels use the same random draw, scaled, so that their errors are not independent. The true θ₅ = 1 is the upper bound of the
+search. An estimate that may not exceed this bound is biased, and its error can be smaller than the Cramér-Rao bound; the last columns show
+the estimate without bounds.
 
 {table_3}
 

@@ -33,7 +33,7 @@ def table_2(cases: Sequence[Case], published: Mapping[str, Sequence[float | None
 def table_3(cases: Sequence[Case], published: Mapping[str, Sequence[float | None]]) -> str:
     """One row per parameter and SNR, with the bounded and the unbounded estimate."""
     header = ("SNR", "", "true", "paper", "DE alone", "refined", "paper's error", "DE's error", "refined error",
-              "standard error", "bound", "free of the box", "its error / bound")  # fmt: skip
+              "standard error", "bound", "without bounds", "its error / bound")  # fmt: skip
     rows = []
     for case in cases:
         for i, row in enumerate(_rows(case, published[case.name], f"{case.snr_db:g} dB")):

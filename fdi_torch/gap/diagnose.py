@@ -107,7 +107,7 @@ def verdict_of(credible_set: Sequence[CauseHypothesis], sure: bool, from_reading
 
 
 def _free_form(posterior: Posterior, reach: OperatingRange) -> Fit | None:
-    """The free discrepancy of the likeliest hypothesis as a fit, if the hypothesis has an unknown."""
+    """The fit of free functions at the unknown of the likeliest hypothesis; None if it has no unknown."""
     best = posterior.best
     if best.unknown is None:
         return None

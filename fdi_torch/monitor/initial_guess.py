@@ -45,7 +45,7 @@ def recovery_guesses(
     healthy: Tensor,
     hypotheses: Sequence[Hypothesis],
 ) -> Tensor:
-    """Values and onset (H, P+1) for recovery hypotheses: the onset with the smallest sum of squares."""
+    """Starting values and onset of H recoveries, (H, P+1): the onset with the least sum of squared innovations."""
     onsets = _onsets(window, ONSETS)
     theta = believed.repeat(len(hypotheses), ONSETS, 1)
     for i, hypothesis in enumerate(hypotheses):

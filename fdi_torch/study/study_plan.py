@@ -106,7 +106,7 @@ class Plan:
             offset += setting.trials
 
     def blocks_of(self, numbers: Iterable[int]) -> Iterator[Block]:
-        """Blocks with exactly these trials. Raises ValueError for a trial that the study does not have."""
+        """The trials with these numbers, grouped into blocks. Raises ValueError for a number that no trial has."""
         chosen_numbers = set(numbers)
         for number in sorted(chosen_numbers):
             if not 0 <= number < self.trials:

@@ -66,7 +66,7 @@ class Summary:
     rho: Ratio
 
     def numbers(self) -> dict[str, float]:
-        """All values as named numbers."""
+        """The summary as one flat mapping from dotted names, such as `lm.T1.leak.size.bias`, to numbers."""
         flat: dict[str, float] = {"converged": self.converged, "undetermined": self.undetermined}
         flat |= _ends("rho", self.rho)
         flat |= {f"{name}.failures": count for name, count in self.failures.items()}

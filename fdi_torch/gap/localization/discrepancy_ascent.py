@@ -1,4 +1,4 @@
-"""Ascent of the evidence of a discrepancy at one place: over its noise, its regressors, and the fit's parameters."""
+"""The most probable discrepancy at a place: its noise, its regressors and the fit's parameters are improved in turn."""
 
 from __future__ import annotations
 
