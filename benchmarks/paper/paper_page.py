@@ -154,9 +154,9 @@ where the faults bring tanks 2 and 3 to nearly equal levels (3- to 5-dim), the r
 
 ## Table 3: one fault at five noise levels
 
-All noise levels use the same random draw, scaled, so that their errors are not independent. The true θ₅ = 1 is the upper bound of the
-search. An estimate that may not exceed this bound is biased, and its error can be smaller than the Cramér-Rao bound; the last columns show
-the estimate without bounds.
+All noise levels use the same random draw, scaled, so that their errors are not independent. The true θ₅ = 1 is the
+upper bound of the search. An estimate that may not exceed this bound is biased, and its error can be smaller than the
+Cramér-Rao bound; the last columns show the estimate without bounds.
 
 {table_3}
 
