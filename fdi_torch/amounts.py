@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from fdi_torch.parameters import ParameterName, display_unit, significant
+from fdi_torch.parameters import ParameterName
+from fdi_torch.quantities import display_unit, significant
 
 RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 

@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import Any, Self, TypeVar, cast
 
 from fdi_torch.amounts import rounded
-from fdi_torch.parameters import display_unit, displayed_in, displayed_units
+from fdi_torch.quantities import display_unit, displayed_in, displayed_units
 
 MOST_ROWS = 60
 """Number of displayed rows; a data frame has all of them."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from fdi_torch.parameters import displayed_in
+from fdi_torch.quantities import displayed_in
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

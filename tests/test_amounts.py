@@ -6,7 +6,7 @@ import pytest
 
 from fdi_torch.amounts import estimate_words, parameter_words, rounded, sized_words, with_error
 from fdi_torch.monitor.events import Explanation, Size, headline
-from fdi_torch.parameters import displayed_in
+from fdi_torch.quantities import displayed_in
 
 
 def size(name: str, value: float, std: float, unit: str = "1") -> Size:

@@ -23,6 +23,7 @@ LAYERS = (
         "names",
         "untrusted_input",
         "parameters",
+        "quantities",
         "recording",
         "tables",
         "units",

@@ -128,6 +128,20 @@ def test_swapped_commands_are_refused() -> None:
         usable(nominal_plant(), replace(run, inputs=run.inputs.flip(1)))
 
 
+def test_a_correction_that_masks_readings_is_compared_to_first_order() -> None:
+    """About a fit to swapped commands, so that the constants move; the fit may know the mask beforehand or not."""
+    plant, run = nominal_plant(), sound()
+    mask = run.mask.clone()
+    mask[300:1500, 0] = False
+    masked, swapped = (
+        blocked_recording(plant, thinned(r), noise_of(plant, run))
+        for r in (replace(run, mask=mask), replace(run, inputs=run.inputs.flip(1)))
+    )
+    fit = blockwise_fit(swapped)
+    known = FirstOrderLikelihood(replace(fit, blocked=replace(masked, recording=swapped.recording)))
+    assert FirstOrderLikelihood(fit)(masked) == pytest.approx(known(masked), rel=1e-9)
+
+
 def test_a_swap_is_compared_to_first_order() -> None:
     plant, run = nominal_plant(), sound()
     swapped = replace(run, inputs=run.inputs.flip(1))

@@ -17,8 +17,8 @@ from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.gap.answer import with_constants
 from fdi_torch.jobs.report import report
-from fdi_torch.parameters import display_in, display_unit, displayed_in, quantity_text
 from fdi_torch.plant.description import PlacedEffect
+from fdi_torch.quantities import display_in, display_unit, displayed_in, quantity_text
 
 PLANT = """name: rig
 tanks:

@@ -94,6 +94,7 @@ def test_large_random_flows_are_no_unknown_cause(flow: float, hold: int, seed: i
     under, likely = with_estimated_noise(fitter, null)
     found = localize(under, null, likely.noise, possible_places(nominal_plant()))
     odds = ODDS.unknown / len(possible_places(nominal_plant()))
+    assert all(place.parameters > 0 for place in found.discrepancies), "a discrepancy without regressors is none"
     gains = [place.gain - found.itself for place in found.discrepancies]
     assert gains and sum(odds * math.exp(gain) for gain in gains) < 0.5
 

@@ -6,6 +6,8 @@ import math
 import random
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 import torch
@@ -14,7 +16,10 @@ from fdi_torch.cli.gap_text import next_steps
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.gap.answer import Answer
+from fdi_torch.gap.cause_hypothesis import CauseHypothesis
 from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.explanation_pool import ExplanationPool
+from fdi_torch.gap.hypothesis_search import HypothesisSearch
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
@@ -86,3 +91,23 @@ def test_a_change_in_time_is_named_where_there_was_one(plugged: bool) -> None:
     found = diagnose(PLANT, recording, settings=Settings(library=library, most=3, named_only=True))
     timed = {name for c in found.causes for name in c.parameters} & {"onset", "rate", "phase", "begin"}
     assert bool(timed) is plugged
+
+
+def test_a_discrepancy_is_tried_at_other_places_beside_the_same_effects(monkeypatch: pytest.MonkeyPatch) -> None:
+    search = HypothesisSearch(cast(ExplanationPool, SimpleNamespace()), (), ("T1", "OUT1"))
+    explanation = SimpleNamespace()
+    at_tank, at_outlet = (
+        cast(CauseHypothesis, SimpleNamespace(weight=weight, explanation=explanation, discrepancy=object()))
+        for weight in (3.0, 5.0)
+    )
+    tried = []
+
+    def with_discrepancies(self: HypothesisSearch, explanation: object, at: object, best: object) -> list[object]:
+        tried.append((explanation, at))
+        return [at_tank, at_outlet]
+
+    for name in ("_with_fewer_effects", "_with_more_effects"):
+        monkeypatch.setattr(HypothesisSearch, name, lambda self, best: [])
+    monkeypatch.setattr(HypothesisSearch, "_with_discrepancies", with_discrepancies)
+    assert at_outlet in search._climbed(at_tank)
+    assert tried == [(explanation, ("T1", "OUT1"))], "once for each explanation"

@@ -10,7 +10,7 @@ from fdi_torch.cli.gap_text import next_steps, show
 from fdi_torch.cli.screen import Screen
 from fdi_torch.gap.answer import Amount, Answer, Cause, ProbableExplanation, adopted
 from fdi_torch.gap.verdict_words import causes_of, probability_words, verdict_sentence
-from fdi_torch.parameters import displayed_in
+from fdi_torch.quantities import displayed_in
 from fdi_torch.report.random_flows import flows_that_matter
 from tests.test_gap import nominal_plant
 

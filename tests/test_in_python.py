@@ -17,7 +17,7 @@ from fdi_torch import Pipe, PlacedEffect, Plant, Pump, Recording, Sensor, Tank
 from fdi_torch.config import plant_in_code
 from fdi_torch.config.plant_file import build_plant
 from fdi_torch.config.yaml_files import shipped_plants
-from fdi_torch.parameters import displayed_in
+from fdi_torch.quantities import displayed_in
 from tests.rigs import blank_recording
 
 IN_YAML = """

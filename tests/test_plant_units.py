@@ -11,8 +11,8 @@ import pytest
 import fdi_torch
 from fdi_torch.cli import DONE, MISUSE, main
 from fdi_torch.config.plant_file import load_plant
-from fdi_torch.parameters import display_in
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import display_in
 from fdi_torch.recordings.plant_units import wrong_units
 
 PLANT = """

@@ -112,12 +112,12 @@ def test_the_valve_the_pump_and_the_offset_of_the_sensors_are_named_where_they_a
 
 
 @pytest.mark.slow
-def test_each_opening_and_closing_of_the_drains_raises_an_alarm_within_10_s_of_when_it_shows(
+def test_each_opening_of_the_drains_raises_an_alarm_within_5_s_and_each_closing_within_10_s(
     data: Path, tmp_path: Path
 ) -> None:
     """exp5: five times; the recorded positions, which are not shown, are the truth.
 
-    The tanks are dry before the drains close, so that a closing shows only once a pump runs.
+    The tanks are dry before the drains close, so that a closing shows only once a pump runs, up to 2.4 s later.
     """
     run, alarms = load_monitor(MONITOR / "dts200_exp5_adopted.yaml", [f"output.folder={tmp_path}"]), []
     heard = [lambda share, text: None, lambda e: alarms.append(e.time) if e.kind == "alarm" else None, lambda p: None]
@@ -127,6 +127,7 @@ def test_each_opening_and_closing_of_the_drains_raises_an_alarm_within_10_s_of_w
     half = truth.time[1:][(opening[1:] > 0.5) != (opening[:-1] > 0.5)].tolist()
     assert len(half) == 10
     pumped = truth.time[truth.inputs[:, truth.input_names.index("qL_cmd")] > 0.0]
-    for moment in half:
-        shows = max(moment, float(pumped[pumped >= moment - 5.0][0]))
-        assert any(moment - 5.0 <= alarm <= shows + 10.0 for alarm in alarms)
+    for k, moment in enumerate(half):
+        opens = k % 2 == 0
+        latest = moment + 5.0 if opens else max(moment, float(pumped[pumped >= moment - 5.0][0])) + 10.0
+        assert any(moment - 5.0 <= alarm <= latest for alarm in alarms), (opens, moment)

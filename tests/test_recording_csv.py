@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from fdi_torch.parameters import si_unit_of, unit_factor
+from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_csv
 from fdi_torch.recordings.header import header_unit

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from fdi_torch.parameters import parse_quantity, si_unit_of, unit_factor
+from fdi_torch.quantities import parse_quantity, si_unit_of, unit_factor
 from fdi_torch.recordings.header import header_unit
 
 GOOD = [

@@ -11,8 +11,8 @@ from fdi_torch.blind.conditions import HELD_OUT
 from fdi_torch.blind.places import Cause, canonical, effect_places
 from fdi_torch.blind.sizes import size_errors
 from fdi_torch.blind.statistics import clopper_pearson, mean_interval, median_interval
-from fdi_torch.parameters import unit_factor
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
+from fdi_torch.quantities import unit_factor
 
 Answer = Mapping[str, Any]
 Row = dict[str, Any]

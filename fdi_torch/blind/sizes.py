@@ -11,8 +11,8 @@ from typing import Any
 from fdi_torch.blind.scaling import Scales
 from fdi_torch.blind.simulator import conductance
 from fdi_torch.blind.statistics import clopper_pearson, root_mean_square_interval
-from fdi_torch.parameters import unit_factor
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import unit_factor
 
 NORMAL_95 = 1.96
 

@@ -18,9 +18,9 @@ from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.run_file import load_run
 from fdi_torch.gap.preprocess.acquisition import examined
-from fdi_torch.parameters import display_unit, significant
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
 from fdi_torch.plant.scales import emptying_time
+from fdi_torch.quantities import display_unit, significant
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.channel_finding import ChannelFinding
 from fdi_torch.recordings.check import ChannelSummary, RecordingCheck, check_recording

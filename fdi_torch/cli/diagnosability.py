@@ -17,9 +17,10 @@ from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.effects import full_name
 from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
 from fdi_torch.monitor.monitor_setup import usual_faults
-from fdi_torch.parameters import ParameterName, display_unit, parse_quantity
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
+from fdi_torch.quantities import display_unit, parse_quantity
 from fdi_torch.recording import Recording
 
 

@@ -13,7 +13,8 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.effects.catalogue import Entry, effects
-from fdi_torch.parameters import Parameter, display_unit
+from fdi_torch.parameters import Parameter
+from fdi_torch.quantities import display_unit
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:

@@ -18,8 +18,9 @@ from fdi_torch.gap.verdict_words import (
     rounds,
     verdict_sentence,
 )
-from fdi_torch.parameters import ParameterName, display_unit
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import display_unit
 from fdi_torch.report.random_flows import flows_that_matter
 
 MOST_ROWS = 5

@@ -24,7 +24,7 @@ from fdi_torch.logbook import Listener
 from fdi_torch.logbook.channel import Channel
 from fdi_torch.monitor.events import FORMAT, Event
 from fdi_torch.monitor.monitor_setup import PreparedMonitor
-from fdi_torch.parameters import quantity_text
+from fdi_torch.quantities import quantity_text
 
 Publish = Callable[[dict[str, Any]], None]
 

@@ -23,8 +23,8 @@ from fdi_torch.config.yaml_files import find_data
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import Misfit, misfit_of
 from fdi_torch.gap.free_runs.prediction import Prediction, predict
-from fdi_torch.parameters import display_unit, quantity_text
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import save

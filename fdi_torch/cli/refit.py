@@ -27,8 +27,9 @@ from fdi_torch.gap.free_runs.between_runs import between_run_spread
 from fdi_torch.gap.free_runs.prediction import LeftOutRun, leave_one_file_out
 from fdi_torch.gap.free_runs.refit import Refit, refit
 from fdi_torch.jobs.gap import one_thread
-from fdi_torch.parameters import ParameterSpace, display_unit
+from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import display_unit
 from fdi_torch.recording import Recording
 
 DISTURBED = (

@@ -23,7 +23,8 @@ from fdi_torch.clock import clock_unit, show_clock
 from fdi_torch.config.run_file import load_run
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.jobs.windowed_fit import fit_windows
-from fdi_torch.parameters import ParameterName, display_unit, quantity_text
+from fdi_torch.parameters import ParameterName
+from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import data_warnings
 

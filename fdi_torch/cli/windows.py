@@ -6,7 +6,7 @@ from fdi_torch.amounts import parameter_words
 from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.estimate.windows import Stretch, WindowFault
 from fdi_torch.jobs.windowed_fit import WindowedFit
-from fdi_torch.parameters import display_unit
+from fdi_torch.quantities import display_unit
 
 LARGEST_RELATIVE_ERROR = 10.0  # a size with a larger standard error is not shown as a number
 MARKS = {"absent": "-", "cannot tell": "?"}

@@ -8,8 +8,8 @@ from pathlib import Path
 from fdi_torch.config.recording_config import ColumnConfig, FileConfig
 from fdi_torch.config.strict import Amount, quantity
 from fdi_torch.names import shortened, unknown
-from fdi_torch.parameters import si_unit_of
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import si_unit_of
 from fdi_torch.recordings.csv_files import read_header
 from fdi_torch.recordings.header import header_unit
 from fdi_torch.recordings.source import ChannelSource, ClockSource

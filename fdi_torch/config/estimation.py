@@ -14,9 +14,10 @@ from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity
 from fdi_torch.effects import all_placements, build_network, full_name, placements_for
 from fdi_torch.estimate.evolution_settings import STRATEGIES, EvolutionSettings
 from fdi_torch.names import shortened, unknown
-from fdi_torch.parameters import Parameter, ParameterSpace, display_unit
+from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
+from fdi_torch.quantities import display_unit
 
 Objective = Literal["correlation", "likelihood"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from importlib.resources import files
 from string import Template
 
-from fdi_torch.parameters import quantity_text
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import quantity_text
 from fdi_torch.recordings.csv_writing import header_of
 
 

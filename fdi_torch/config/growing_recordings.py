@@ -14,8 +14,8 @@ from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recording_config import ColumnConfig, RecordingConfig
 from fdi_torch.config.yaml_files import find_data
 from fdi_torch.logbook import LogError, Message, follow, number_at
-from fdi_torch.parameters import si_unit_of, unit_factor
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_growing import GrowingCsv
 from fdi_torch.recordings.mcap_files import expect_keys_of_logs
 from fdi_torch.recordings.source import ChannelSource

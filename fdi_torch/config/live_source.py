@@ -17,8 +17,8 @@ from fdi_torch.live.address import Address, address_of
 from fdi_torch.live.row_buffer import LiveChannel, Row, RowBuffer
 from fdi_torch.live.values import Connection
 from fdi_torch.names import unknown
-from fdi_torch.parameters import si_unit_of, unit_factor
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recording import Hold
 
 POLL = 0.1

@@ -18,8 +18,8 @@ from fdi_torch.config.recording_config import FileConfig, RecordingConfig, Start
 from fdi_torch.config.yaml_files import find_data, find_file, read_extended
 from fdi_torch.logbook import LogError
 from fdi_torch.names import unknown
-from fdi_torch.parameters import display_also_in
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import display_also_in
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_csv_files
 from fdi_torch.recordings.database import is_query, write_query

@@ -17,9 +17,10 @@ from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import find_plant, read_yaml
 from fdi_torch.effects import units_for_display
 from fdi_torch.names import unknown
-from fdi_torch.parameters import SI_UNITS, ParameterName, display_in, unit_factor
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, READING_UNITS, FaultPriority, PlacedEffect, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent
+from fdi_torch.quantities import SI_UNITS, display_in, unit_factor
 from fdi_torch.untrusted_input import MOST_COMPONENTS
 
 

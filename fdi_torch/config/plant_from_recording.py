@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import torch
 
-from fdi_torch.parameters import significant, unit_factor
 from fdi_torch.plant.description import OUTSIDE
+from fdi_torch.quantities import significant, unit_factor
 from fdi_torch.recordings.csv_binding import bind_clock
 from fdi_torch.recordings.csv_files import read_csv, read_header
 from fdi_torch.recordings.header import header_unit

@@ -17,8 +17,8 @@ from fdi_torch.config.plant_writer import dump_plant, plant_mapping
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.yaml_files import compose_yaml, parse_yaml
 from fdi_torch.effects import units_for_display
-from fdi_torch.parameters import display_unit, displayed_in, si_unit_of
 from fdi_torch.plant.description import FLOW_KINDS, PlacedEffect, PlantDescription
+from fdi_torch.quantities import display_unit, displayed_in, si_unit_of
 from fdi_torch.units import UnitError, in_unit, number_and_unit, si_factor
 
 DIGITS = 7

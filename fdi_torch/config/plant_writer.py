@@ -9,7 +9,7 @@ from fdi_torch.config.plant_in_code import absolute_units, effect_parameters
 from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import write_yaml
 from fdi_torch.effects import effect_at
-from fdi_torch.parameters import ParameterName, display_unit, displayed_in, parse_quantity
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import (
     FLOW_KINDS,
     OUTSIDE,
@@ -21,6 +21,7 @@ from fdi_torch.plant.description import (
     Tank,
 )
 from fdi_torch.plant.flow_component import FlowComponent
+from fdi_torch.quantities import display_unit, displayed_in, parse_quantity
 
 _UNITS = {
     "m": ("cm", "mm", "m", "ft", "in"),

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from fdi_torch.names import unknown
-from fdi_torch.parameters import parse_quantity
 from fdi_torch.plant.description import PlantDescription, Sensor
+from fdi_torch.quantities import parse_quantity
 
 
 def reading_noise(text: str, plant: PlantDescription) -> list[float]:

@@ -25,8 +25,9 @@ from fdi_torch.monitor.monte_carlo.false_alarm_plan import FalseAlarmPlan
 from fdi_torch.monitor.monte_carlo.isolation_plan import IsolationPlan
 from fdi_torch.monitor.monte_carlo.level_control import moving_commands, moving_set_points
 from fdi_torch.monitor.monte_carlo.simulated_runs import SimulatedRig
-from fdi_torch.parameters import ParameterSpace, parse_quantity
+from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import parse_quantity
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.equilibrium import equilibrium
 

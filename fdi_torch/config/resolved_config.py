@@ -16,9 +16,9 @@ from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Config, Strict, scaled_to_plant
 from fdi_torch.config.yaml_files import find_file, read_extended, with_overrides, write_yaml
 from fdi_torch.effects import units_for_display
-from fdi_torch.parameters import display_in
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
+from fdi_torch.quantities import display_in
 
 LONGEST_NAME = 200
 

@@ -9,7 +9,7 @@ from pydantic.fields import FieldInfo
 
 from fdi_torch.config.problems import UnknownKeyError
 from fdi_torch.names import unknown
-from fdi_torch.parameters import parse_quantity
+from fdi_torch.quantities import parse_quantity
 from fdi_torch.recording import LARGEST
 
 

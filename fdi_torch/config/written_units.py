@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from fdi_torch.parameters import SI_UNITS
 from fdi_torch.plant.description import READING_UNITS
+from fdi_torch.quantities import SI_UNITS
 from fdi_torch.units import UnitError, number_and_unit, same_kind, spelled
 
 _FIRST = ("tanks", "sensors", "pumps")

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from fdi_torch.amounts import with_error
 from fdi_torch.estimate.information import Certainty, determined_combinations
-from fdi_torch.parameters import ParameterSpace, display_unit
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.quantities import display_unit
 
 # A parameter whose coefficient is below this fraction of the largest one does not belong to the combination.
 _ROUNDING = 1e-6

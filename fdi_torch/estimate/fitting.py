@@ -11,12 +11,13 @@ from torch import Tensor
 
 from fdi_torch.effects import build_network, full_name, placements_for
 from fdi_torch.estimate.objectives import Objective, Problem, Term
-from fdi_torch.parameters import Parameter, ParameterSpace, name_in_recording, quantity_text
+from fdi_torch.parameters import Parameter, ParameterSpace, name_in_recording
 from fdi_torch.plant.description import PlantDescription, Tank
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.inverted_sensor import levels_from_readings
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.scales import time_scale
+from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.engine import Engine, Readings
 from fdi_torch.simulate.engine_choice import adaptive_engine, make_engine

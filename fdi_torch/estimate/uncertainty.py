@@ -13,7 +13,8 @@ from torch import Tensor
 
 from fdi_torch.estimate.combinations import Combination, undetermined_groups
 from fdi_torch.estimate.information import certainty
-from fdi_torch.parameters import Parameter, ParameterSpace, quantity_text
+from fdi_torch.parameters import Parameter, ParameterSpace
+from fdi_torch.quantities import quantity_text
 
 if TYPE_CHECKING:
     from fdi_torch.estimate.posterior_draws import Draws

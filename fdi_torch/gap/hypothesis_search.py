@@ -69,7 +69,7 @@ class HypothesisSearch:
         """An explanation without a discrepancy, linearised about the levels that it predicts, where discrepancies are:
         their gains shall not contain that of another point. best: weight of the likeliest explanation."""
         needed = best + math.log(RARE) - explanation.log_weight
-        gain = localize(explanation.fitter, explanation.fit, explanation.noise, (), needed).itself
+        gain = localize(explanation.fitter, explanation.fit, explanation.noise, (), needed=needed).itself
         return CauseHypothesis(explanation, causes_in_order(explanation.fit), explanation.log_weight + gain)
 
     def _everywhere(self, explanation: RankedExplanation, best: CauseHypothesis) -> list[CauseHypothesis]:
@@ -87,7 +87,7 @@ class HypothesisSearch:
             return [h for place in at for h in self._evaluated[id(explanation), place]]
         needed, rival = (self._needed(explanation, best), best.noise) if best else (-math.inf, None)
         fitter, fit, noise = explanation.fitter, explanation.fit, explanation.noise
-        localization = localize(fitter, fit, noise, at, needed, rival, self._log_odds)
+        localization = localize(fitter, fit, noise, at, needed=needed, rival=rival, log_odds=self._log_odds)
         hypotheses = {
             (id(explanation), d.location): self._with_discrepancy(explanation, d) for d in localization.discrepancies
         }

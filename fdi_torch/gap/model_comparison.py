@@ -27,8 +27,9 @@ from fdi_torch.gap.diagnosis_result import DiagnosisResult
 from fdi_torch.gap.free_form import free_form
 from fdi_torch.gap.free_form_coefficients import coefficients_of, without_time_course
 from fdi_torch.gap.holdout import Closure, HeldOut, Model, closure, free_run, model_of
-from fdi_torch.parameters import ParameterName, display_unit
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import display_unit
 
 FROZEN = {"recalibrated": "augmented_on_recalibrated", "nominal": "augmented_on_nominal"}
 

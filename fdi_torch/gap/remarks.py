@@ -19,8 +19,9 @@ from fdi_torch.gap.diagnosis_result import DiagnosisResult, unexplained_chi_squa
 from fdi_torch.gap.free_form import discrepancy_tables
 from fdi_torch.gap.holdout import HeldOut
 from fdi_torch.gap.preprocess.outliers import SensorOutliers
-from fdi_torch.parameters import ParameterName, display_unit
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import display_unit
 from fdi_torch.recordings.check import data_warnings
 
 SHOWN_TIMES = 5  # outliers whose times are listed

@@ -11,7 +11,7 @@ from typing import Any
 from fdi_torch.amounts import effect_words
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import UNKNOWN
-from fdi_torch.parameters import quantity_text
+from fdi_torch.quantities import quantity_text
 
 FORMAT_1 = "fdi_torch.gap/1"
 Named = Mapping[str, Any]

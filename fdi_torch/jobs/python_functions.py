@@ -34,8 +34,8 @@ from fdi_torch.jobs.python_results import FreeRun, GapResult, MonitorResult, Ref
 from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.monitor.events import Event
 from fdi_torch.names import unknown
-from fdi_torch.parameters import display_in
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import display_in
 from fdi_torch.recording import Recording
 
 Tell = Callable[[float, str], None]

@@ -15,8 +15,9 @@ from fdi_torch.gap.free_runs.refit import Refit, narrowed
 from fdi_torch.gap.verdict_words import explanation_words, verdict_sentence
 from fdi_torch.logbook import read_run
 from fdi_torch.monitor.events import Event
-from fdi_torch.parameters import ParameterName, quantity_text
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.material import gather

@@ -11,7 +11,8 @@ from fdi_torch.amounts import amount_words, estimate_words, parameter_words, siz
 from fdi_torch.clock import clock_text
 from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.monitor.alarm_state import State
-from fdi_torch.parameters import Parameter, ParameterName, display_unit, significant
+from fdi_torch.parameters import Parameter, ParameterName
+from fdi_torch.quantities import display_unit, significant
 
 Kind = Literal[
     "watching",

@@ -63,7 +63,7 @@ class Explainer:
         while True:
             window = state.window(start)
             fits = isolate(
-                self.observer, window, believed, self.faults, s.incipient, s.together, healthy, earlier, True
+                self.observer, window, believed, self.faults, s.incipient, s.together, healthy, earlier, flows=True
             )
             plausible = [f for f in fits if f.hypothesis.columns and f.probability > SMALLEST_PROBABILITY]
             if start <= earliest or all(f.onset - start > 2.0 * f.onset_std for f in plausible):

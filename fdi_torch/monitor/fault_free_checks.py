@@ -17,9 +17,10 @@ from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow
 from fdi_torch.monitor.observer_gain import kalman_gain, start_uncertainty
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.whitening import Whitening
-from fdi_torch.parameters import ParameterSpace, quantity_text
+from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.network import TankNetwork
+from fdi_torch.quantities import quantity_text
 
 # Process noise over reading noise that counts as no process noise.
 NO_PROCESS_NOISE = 1e-3

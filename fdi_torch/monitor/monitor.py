@@ -88,7 +88,12 @@ class Monitor:
         """
         theta = self.space.nominal() if believed is None else believed
         state = initial_state(
-            self.observer, samples, theta, self.alarms.explainer.fault_free(theta), levels, self.settings.lookback
+            self.observer,
+            samples,
+            theta,
+            self.alarms.explainer.fault_free(theta),
+            levels=levels,
+            correlation_time=self.settings.lookback,
         )
         return replace(state, learning_until=learning_until)
 
@@ -119,7 +124,11 @@ class Monitor:
     def _restart(self, state: MonitorState, samples: Samples, notice: str) -> tuple[MonitorState, list[Event]]:
         """Restart the observer after a gap. Isolated faults stay in its parameters; a pending alarm is retired."""
         fresh = initial_state(
-            self.observer, samples.segment(0, 1), state.believed, state.healthy, None, self.settings.lookback
+            self.observer,
+            samples.segment(0, 1),
+            state.believed,
+            state.healthy,
+            correlation_time=self.settings.lookback,
         )
         fresh = replace(
             fresh,

@@ -19,6 +19,7 @@ def initial_state(
     samples: Samples,
     believed: Tensor,
     healthy: Tensor,
+    *,
     levels: Tensor | None = None,
     correlation_time: float = 1.0,
 ) -> MonitorState:

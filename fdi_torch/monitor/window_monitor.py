@@ -70,7 +70,7 @@ class WindowMonitor:
     def start(self, samples: Samples, believed: Tensor | None = None, levels: Tensor | None = None) -> WindowState:
         """The state after the first sample."""
         theta = self.space.nominal() if believed is None else believed
-        state = initial_state(self._observer, samples, theta, theta, levels)
+        state = initial_state(self._observer, samples, theta, theta, levels=levels)
         return WindowState(state, state.reachable + self.length)
 
     def advance(

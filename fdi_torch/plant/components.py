@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import parse_quantity
+from fdi_torch.quantities import parse_quantity
 from fdi_torch.recording import LARGEST as LARGEST_QUANTITY
 
 OUTSIDE = "outside"

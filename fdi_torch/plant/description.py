@@ -81,7 +81,7 @@ class PlantDescription:
     offset, a start level or an effect's parameter ('Q1.pump_lag.time_constant') in its unit. varying: constants that
     differ between recordings, such as the offset of a sensor that is zeroed before each run. matters: least
     reported size and urgency of single faults; the monitor reports any other fault at any size. units: units for
-    display, see `fdi_torch.parameters.display_in`; they do not count for equality.
+    display, see `fdi_torch.quantities.display_in`; they do not count for equality.
     """
 
     name: str

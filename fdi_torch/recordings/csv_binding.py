@@ -11,7 +11,7 @@ from math import isnan
 from pathlib import Path
 
 from fdi_torch.names import shortened
-from fdi_torch.parameters import si_unit_of, unit_factor
+from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_cells import BAD, GOOD_WORDS, Columns, Rule
 from fdi_torch.recordings.csv_text import Heading
 from fdi_torch.recordings.header import header_unit

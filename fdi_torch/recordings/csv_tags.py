@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_torch.parameters import si_unit_of, unit_factor
+from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_binding import Bound, bind_clock, column_of, rule_of
 from fdi_torch.recordings.csv_cells import apply_rule, number_in
 from fdi_torch.recordings.csv_text import heading_of, open_csv, rows_of

@@ -14,7 +14,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, TextIO
 
-from fdi_torch.parameters import si_unit_of
+from fdi_torch.quantities import si_unit_of
 from fdi_torch.recordings.header import header_unit
 from fdi_torch.recordings.table_files import TableText, format_of, table_text
 from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_LINE, MOST_UNPACKED, expect_unpacked

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from fdi_torch.disk import replacing
-from fdi_torch.parameters import display_unit, unit_factor
+from fdi_torch.quantities import display_unit, unit_factor
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.header import header_unit
 

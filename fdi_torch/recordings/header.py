@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from fdi_torch.parameters import si_unit_of
+from fdi_torch.quantities import si_unit_of
 from fdi_torch.units import MOST_CHARACTERS
 
 

@@ -10,7 +10,7 @@ import torch
 
 from fdi_torch.logbook import Signals, mapped_signals, own_signals, read_run
 from fdi_torch.names import unknown
-from fdi_torch.parameters import si_unit_of, unit_factor
+from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recording import Hold, Recording
 from fdi_torch.recordings.source import ChannelSource, file_sha256
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import quantity_text
 from fdi_torch.plant.description import PlantDescription, Sensor
 from fdi_torch.plant.metered_flow import MeteredFlow
+from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.channel_finding import ChannelFinding
 

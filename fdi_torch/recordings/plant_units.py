@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from fdi_torch.parameters import display_unit, unit_factor
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import display_unit, unit_factor
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.volume_balance import DEVIATION, Volumes, volumes_along
 from fdi_torch.units import same_kind

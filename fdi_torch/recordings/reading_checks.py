@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from fdi_torch.parameters import quantity_text
+from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.channel_finding import ChannelFinding
 from fdi_torch.recordings.repeated_readings import resolution

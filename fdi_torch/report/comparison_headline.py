@@ -13,7 +13,7 @@ import orjson
 
 from fdi_torch.amounts import effect_words
 from fdi_torch.logbook import Comparison
-from fdi_torch.parameters import quantity_text
+from fdi_torch.quantities import quantity_text
 from fdi_torch.report.html import short
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import percent

@@ -15,8 +15,8 @@ from fdi_torch.clock import clock_shown, of_stamp
 from fdi_torch.effects import units_for_display
 from fdi_torch.gap.verdict_words import FORMAT_1
 from fdi_torch.logbook import Inspection, LogError, Run, Signals, arrays, inspect_log, own_signals, series
-from fdi_torch.parameters import displayed_in
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import displayed_in
 
 CLOCK = "/source/clock"
 # Only these topics are kept as messages; signals and search populations are read as arrays when needed.

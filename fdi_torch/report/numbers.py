@@ -9,7 +9,7 @@ import numpy as np
 
 from fdi_torch import amounts
 from fdi_torch.amounts import RAISED
-from fdi_torch.parameters import display_unit, significant
+from fdi_torch.quantities import display_unit, significant
 
 
 def shown_unit(si_unit: str, name: str = "") -> tuple[str, float]:

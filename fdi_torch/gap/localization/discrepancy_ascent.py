@@ -12,7 +12,7 @@ from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_columns import Discrepancy
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
-from fdi_torch.gap.localization.fine_positions import Positions, with_best_frequency
+from fdi_torch.gap.localization.fine_positions import CONVERGED, Positions, with_best_frequency
 from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy, log_likelihood, unexplained_norm
 from fdi_torch.gap.localization.single_regressor_gain import largest_influence
 from fdi_torch.gap.localization.sparse_regression import SparseFit, column_costs
@@ -22,7 +22,6 @@ from fdi_torch.gap.trajectory_problem import SHARE
 
 STEPS = 120  # step functions of time
 MOST_TURNS = 12  # alternations between the disturbance noise, one more regressor, and the parameters of the fit
-CONVERGED = 0.1  # nats; a smaller gain ends the alternation, as does one below SHARE of what is still needed
 
 
 @dataclass(frozen=True)

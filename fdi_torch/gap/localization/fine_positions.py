@@ -39,7 +39,7 @@ from fdi_torch.simulate.joint_collocation import with_blanks
 
 TRIED = 8  # positions with the largest estimated gains, whose gains are computed exactly
 HALVINGS = 4  # of the spacing between a relay's thresholds; then it is 1/16 of that of the fine grid
-MOVING = 0.1  # nats; thresholds do not move for a smaller gain
+CONVERGED = 0.1  # nats; a search for a discrepancy ends at a smaller gain
 FREQUENCIES = 17  # of one round, over twice the spacing of the round before
 FREQUENCY_ROUNDS = 3  # the last spacing is then 1/600 of 1/T
 
@@ -151,7 +151,7 @@ def best_thresholds(gains: Callable[[Tensor], Tensor], start: Tensor, spacing: f
             tried = pairs_around(best, spacing / 2.0**halving)
             gained = gains(tried)
             k = int(gained.argmax())
-            if not float(gained[k]) > largest + MOVING:
+            if not float(gained[k]) > largest + CONVERGED:
                 break
             best, largest = tried[k], float(gained[k])
     return best

@@ -18,8 +18,9 @@ from fdi_torch.estimate.evidence import RARE
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.localization.discrepancy_ascent import CONVERGED, STEPS, Ascent, gain_of
+from fdi_torch.gap.localization.discrepancy_ascent import STEPS, Ascent, gain_of
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
+from fdi_torch.gap.localization.fine_positions import CONVERGED
 from fdi_torch.gap.localization.localized_discrepancy import (
     LocalizedDiscrepancy,
     is_rounding_error,
@@ -49,6 +50,7 @@ def localize(
     fit: Fit,
     noise: StateNoise,
     places: Sequence[str],
+    *,
     needed: float = -math.inf,
     rival: StateNoise | None = None,
     log_odds: float = 0.0,

@@ -24,8 +24,8 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
 )
 from fdi_torch.gap.preprocess.recording_fault_decision import SURE, log_odds, recording_fault
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, not_held
-from fdi_torch.parameters import quantity_text
 from fdi_torch.plant.description import PlantDescription, Sensor, with_tolerances
+from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.input_sampling import inputs_not_held
 from fdi_torch.recordings.plant_units import refusal, wrong_units

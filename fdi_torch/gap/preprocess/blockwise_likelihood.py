@@ -90,6 +90,11 @@ class BlockwiseFit:
     prior_chi_square: float
 
     @property
+    def fitter(self) -> Fitter:
+        """A fitter whose noise has the size of the residuals."""
+        return _fitter(self.blocked.data, self.variance, self.means)
+
+    @property
     def readings(self) -> Tensor:
         """Predicted readings (S, C)."""
         return self.fit.linearised.readings[0]

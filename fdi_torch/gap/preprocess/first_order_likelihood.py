@@ -13,8 +13,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.preprocess.blockwise_likelihood import ROUNDS, BlockedRecording, BlockwiseFit, prior_chi_square
 from fdi_torch.gap.trajectory_problem import corrected_trajectories
 
@@ -23,12 +21,10 @@ class FirstOrderLikelihood:
     """The log-likelihood of corrected recordings to first order about the fit to the uncorrected one."""
 
     def __init__(self, base: BlockwiseFit) -> None:
-        self.base, blocked = base, base.blocked
-        unit = torch.ones(len(base.variance), dtype=torch.float64)
-        self._fitter = Fitter(blocked.data, Noise(unit, torch.zeros_like(unit)))
-        self._scale, self._prior, self._deviation = self._fitter.priors(base.fit.space, base.fit.theta)
+        self.base = base
+        self._scale, self._prior, self._deviation = base.fitter.priors(base.fit.space, base.fit.theta)
         self._jacobian = base.fit.linearised.jacobian[0].movedim(1, 0) * self._scale  # (C, S, P)
-        self._products = [self._products_of(c, mask) for c, mask in enumerate(blocked.data.mask.T)]
+        self._products = [self._products_of(c, mask) for c, mask in enumerate(base.blocked.data.mask.T)]
 
     def __call__(self, corrected: BlockedRecording) -> float:
         """The log-likelihood of a corrected recording. Its constants and its v_c are found alternately."""
@@ -63,7 +59,7 @@ class FirstOrderLikelihood:
         fit, before, after = self.base.fit, self.base.blocked.recording, corrected.recording
         if after.input_names == before.input_names and torch.equal(after.inputs, before.inputs):
             return fit.linearised.readings[0]
-        theta, fitter = fit.theta.unsqueeze(0), self._fitter.of(corrected.data)
+        theta, fitter = fit.theta.unsqueeze(0), self.base.fitter.of(corrected.data)
         engine = fitter.engine(fit.candidate, ())
         levels, _ = corrected_trajectories(engine, theta, fit.linearised.levels, fitter.far)
         return engine.read(levels, theta)[0]

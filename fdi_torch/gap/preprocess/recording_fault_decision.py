@@ -17,8 +17,6 @@ import torch
 
 from fdi_torch.estimate.evidence import RARE
 from fdi_torch.gap.candidate import Candidate
-from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.library import library_of
 from fdi_torch.gap.marginal_likelihood import log_prior
 from fdi_torch.gap.preprocess.blockwise_likelihood import (
@@ -126,7 +124,7 @@ def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str], target: float
         fit = parent.fit
         ranges = operating_range_of_all([blocked.recording], plant)
         reach = with_simulated_levels(ranges, plant, fit.linearised.levels[0])
-        fitter = _fitter(parent)
+        fitter = parent.fitter
         further = [p for p in placements if (p.effect.name, p.location) not in fit.key]
         screening = screen(fitter, fit, options_of(further, fitter, reach))
         best: dict[tuple[str, str], Option] = {}
@@ -147,10 +145,3 @@ def _log_weight(fitted: BlockwiseFit, choices: int) -> float:
     """Log posterior weight: log-likelihood, half a log n per effect parameter (BIC), and the log prior."""
     shape = 0.5 * len(fitted.fit.effect_values) * math.log(float(fitted.means.sum()))
     return fitted.log_likelihood - shape + log_prior(fitted.fit.key, choices)
-
-
-def _fitter(fitted: BlockwiseFit) -> Fitter:
-    """A fitter whose noise has the size of the residuals of a fit."""
-    data = fitted.blocked.data
-    each = torch.sqrt(fitted.variance * data.mask.sum(dim=0).clamp(min=1) / fitted.means.clamp(min=1.0))
-    return Fitter(data, Noise(each, torch.zeros_like(each)))

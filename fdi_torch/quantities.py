@@ -1,0 +1,111 @@
+"""Quantities as text: conversion to SI, and the units in which results are displayed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from functools import lru_cache
+
+from fdi_torch.names import shortened
+from fdi_torch.parameters import common_name
+from fdi_torch.units import UnitError, factor, in_unit, number_and_unit, same_kind
+
+SI_UNITS = ("m", "s", "V", "Pa", "A", "1/s", "m^2", "m^3", "m^3/s", "m/s", "1")
+
+
+@lru_cache(maxsize=4096)
+def parse_quantity(text: str, unit: str) -> float:
+    """'160 cm^2' -> 0.016 for unit 'm^2'. A bare number is accepted only for the unit '1'.
+
+    Raises ValueError for text that is not a quantity, or has another dimension.
+    """
+    try:
+        return in_unit(*number_and_unit(text), unit)
+    except UnitError as error:
+        raise ValueError(f"expected a quantity in {unit} such as '1 {unit}', got '{shortened(text)}'") from error
+
+
+@lru_cache(maxsize=256)
+def unit_factor(unit: str, si_unit: str) -> float:
+    """The value of one `unit` in `si_unit`: unit_factor('cm', 'm') = 0.01."""
+    try:
+        return factor(unit, si_unit)
+    except UnitError as error:
+        raise ValueError(f"expected a unit that converts to {si_unit}, got '{shortened(unit)}'") from error
+
+
+def si_unit_of(unit: str) -> str:
+    """The SI unit of a quantity given in `unit`: 'cm3_s' -> 'm^3/s'."""
+    si_unit = same_kind(unit, SI_UNITS)
+    if si_unit is not None:
+        return si_unit
+    raise ValueError(
+        "expected a unit of level, pressure, flow, time, voltage, current, frequency or share, "
+        f"got '{shortened(unit)}'; write for example cm, mbar, cm3_s, V, mA, pct"
+    )
+
+
+def display_unit(si_unit: str, name: str = "") -> tuple[str, float]:
+    """The unit for display, and the value of one SI unit in it: 'm' -> ('cm', 100.0).
+
+    It is the unit set by `display_in` for that kind of quantity; name: a channel or a parameter, which may have its
+    own. A quotient without a unit of its own is displayed in the units of its parts.
+    """
+    chosen = _DISPLAYED.get()
+    unit = _in_chosen_unit(si_unit, chosen)
+    name = common_name(name) if "@" in name else name
+    if name in chosen:
+        with suppress(ValueError):  # the channel of that name may be of another recording
+            return chosen[name], 1.0 / unit_factor(chosen[name], si_unit)
+    return ("" if unit == "1" else unit), 1.0 if unit == si_unit else 1.0 / unit_factor(unit, si_unit)
+
+
+def significant(value: float, digits: int) -> str:
+    """A number with significant digits, such as '0.0123'; with an exponent only below 1e-4 and from 1e6 on."""
+    text = f"{value:.{digits}g}"
+    return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
+
+
+def quantity_text(value: float, si_unit: str, digits: int = 4, name: str = "") -> str:
+    """An SI value as text in the unit for display, such as '4.2 cm'; name: as for `display_unit`."""
+    unit, scale = display_unit(si_unit, name)
+    return f"{significant(scale * value, digits)} {unit}".rstrip()
+
+
+def displayed_units() -> Mapping[str, str]:
+    """The units for display of this context."""
+    return _DISPLAYED.get()
+
+
+def display_in(units: Mapping[str, str]) -> None:
+    """Set the units for display in this context: SI unit, or name of a channel or parameter -> unit."""
+    _DISPLAYED.set(dict(units))
+
+
+def display_also_in(units: Mapping[str, str]) -> None:
+    """Add units for display to those of this context."""
+    _DISPLAYED.set({**_DISPLAYED.get(), **units})
+
+
+@contextmanager
+def displayed_in(units: Mapping[str, str]) -> Iterator[None]:
+    """Context within which quantities are displayed in these units, as `display_in` sets them."""
+    token = _DISPLAYED.set(dict(units))
+    try:
+        yield
+    finally:
+        _DISPLAYED.reset(token)
+
+
+def _in_chosen_unit(si_unit: str, chosen: Mapping[str, str]) -> str:
+    if unit := chosen.get(si_unit) or _DEFAULT_UNITS.get(si_unit):
+        return unit
+    quantity, divided, by = si_unit.rpartition("/")
+    if divided and (quantity in _DEFAULT_UNITS or by in _DEFAULT_UNITS):
+        return f"{_in_chosen_unit(quantity, chosen)}/{_in_chosen_unit(by, chosen)}"
+    return si_unit
+
+
+_DEFAULT_UNITS = {"m": "cm", "m^2": "cm^2", "m^3": "cm^3", "m^3/s": "cm^3/s", "Pa": "mbar", "A": "mA"}
+_DISPLAYED: ContextVar[Mapping[str, str]] = ContextVar("units for display", default=_DEFAULT_UNITS)
