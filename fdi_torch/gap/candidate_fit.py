@@ -135,21 +135,11 @@ class Fitter:
         )
 
     def first_trajectory(self, engine: Collocation | JointCollocation, theta: Tensor) -> Tensor:
-        """The model's levels (L, K+1, n) at theta (L, P), found from the levels that the sensors show.
-
-        Newton's method from constant levels is the second choice: it misses trajectories where levels become equal or
-        reach a rim, because the flow has a sharp bend there.
-        """
+        """The model's levels (L, K+1, n) at theta (L, P), found from the levels that the sensors show."""
         constant = engine.constant_guess(theta)
         measured = torch.cat([self._measured_levels(part) for part in self.data.parts])
         levels = constant[..., : measured.shape[-1]]
-        first = engine.converge(theta, torch.where(measured.isfinite(), measured, levels))
-        lost = (~(first.defect <= self.far)).nonzero().flatten()
-        if not len(lost):
-            return first.levels
-        second = engine.converge(theta[lost], constant[lost])
-        better = second.defect < first.defect[lost].nan_to_num(nan=torch.inf)
-        return first.levels.index_copy(0, lost[better], second.levels[better])
+        return engine.converge(theta, torch.where(measured.isfinite(), measured, levels)).levels
 
     def _measured_levels(self, part: RecordingPart) -> Tensor:
         """Measured levels at the ends of the steps (K+1, n); NaN for a tank without a sensor."""

@@ -140,7 +140,7 @@ def _planned_run(planned_fitter: Fitter, fit: Fit) -> tuple[Tensor, Tensor, Tens
     values = {n: v for n, v in fit.values.items() if n in engine.space}
     theta = engine.space.vector(values).unsqueeze(0)
     linearised, tanks = (
-        engine.converge(theta, engine.constant_guess(theta), rounds=30),
+        engine.converge(theta, engine.constant_guess(theta)),
         len(planned_fitter.data.plant.tanks),
     )
     columns = [engine.space.index(n) for n in _in_one_run(fit)]

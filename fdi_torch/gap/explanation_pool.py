@@ -103,12 +103,14 @@ class ExplanationPool:
     def without(self, explanation: RankedExplanation, cause: CauseName) -> RankedExplanation:
         """The explanation without one of its effects, refitted from its present values.
 
-        A start near the optimum may avoid a local minimum in which an earlier fit of the same effects ended.
+        A start near the optimum may avoid a local minimum in which an earlier fit of the same effects ended. The refit
+        is given up if it does not approach that fit, or this explanation without one.
         """
         fit = explanation.fit
+        target = explanation.fitter.cost(self.explanations.get(explanation.key - {cause}, explanation).fit)
         placements = tuple(p for p in fit.candidate.placements if (p.effect.name, p.location) != cause)
         candidate = Candidate(placements, (fit.values_of(placements),))
-        self.evaluate(explanation.fitter.fit(candidate, fit), explanation.noise)
+        self.evaluate(explanation.fitter.fit(candidate, fit, target), explanation.noise)
         return self.explanations[explanation.key - {cause}]
 
     def best_of(self, effects: int) -> list[RankedExplanation]:

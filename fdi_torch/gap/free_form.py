@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import ClassVar
 
 import torch
@@ -57,14 +58,11 @@ class _Free(Effect):
         """Piecewise linear function of x, constant beyond its grid; 0 if the effect has no such variable."""
         if variable not in self.nodes:
             return torch.zeros_like(x)
-        grid = x.new_tensor(self.nodes[variable])
-        inside = torch.minimum(torch.maximum(x, grid[0]), grid[-1])
-        left = (torch.searchsorted(grid, inside.detach().contiguous(), right=True) - 1).clamp(0, len(grid) - 2)
-        share = (inside - grid[left]) / (grid[left + 1] - grid[left])
-        total = torch.zeros_like(x)
-        for j in range(len(grid)):
-            weight = torch.where(left == j, 1.0 - share, torch.where(left + 1 == j, share, 0.0))
-            total = total + p[f"{variable}_{j}"] * weight
+        grid = self.nodes[variable]
+        total = p[f"{variable}_0"] + torch.zeros_like(x)
+        for j, (left, right) in enumerate(pairwise(grid)):
+            share = torch.clamp((x - left) / (right - left), 0.0, 1.0)
+            total = total + (p[f"{variable}_{j + 1}"] - p[f"{variable}_{j}"]) * share
         return total
 
     def waves(self, clock: Clock, p: Values) -> Tensor | float:

@@ -114,7 +114,7 @@ def _noise_free(
     white = Noise(torch.full((sensors,), noise, dtype=torch.float64), torch.zeros(sensors, dtype=torch.float64))
     engine = Fitter(data, white).engine(Candidate(), ())
     theta = engine.space.nominal().unsqueeze(0)
-    readings = engine.converge(theta, engine.constant_guess(theta), rounds=30).readings[0]
+    readings = engine.converge(theta, engine.constant_guess(theta)).readings[0]
     return Fitter(replace(data, readings=readings, recording=replace(planned, outputs=readings)), white)
 
 

@@ -183,6 +183,9 @@ class _Varied:
     def corrected(self, theta: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:
         return self.engine.corrected(self._full(theta), levels)
 
+    def converge_in_segments(self, theta: Tensor) -> Tensor:
+        return self.engine.converge_in_segments(self._full(theta))
+
     def read(self, levels: Tensor, theta: Tensor) -> Tensor:
         return self.engine.read(levels, self._full(theta))
 

@@ -105,6 +105,8 @@ class Engine(Protocol):
 
     def corrected(self, theta: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]: ...
 
+    def converge_in_segments(self, theta: Tensor) -> Tensor: ...
+
     def read(self, levels: Tensor, theta: Tensor) -> Tensor: ...
 
 
@@ -224,7 +226,7 @@ def _correct(
     linearised: Linearised,
     far: float,
 ) -> Linearised:
-    """Correct the lanes whose defect is too large until they converge or diverge."""
+    """Correct the lanes whose defect is too large until they converge, if need be segment by segment."""
     lost = torch.zeros_like(linearised.defect, dtype=torch.bool)
     for _ in range(CORRECTIONS):
         lanes = (~lost & (linearised.defect > far)).nonzero().flatten()
@@ -233,6 +235,10 @@ def _correct(
         before = linearised.defect
         linearised = linearised.replaced(lanes, engine.linearise(theta[lanes], linearised.levels[lanes]))
         lost = lost | _diverged(linearised.defect, before, far)
+    lanes = (~(linearised.defect <= NEARLY * far)).nonzero().flatten()
+    if len(lanes):
+        levels = engine.converge_in_segments(theta[lanes])
+        linearised = linearised.replaced(lanes, engine.linearise(theta[lanes], levels))
     return linearised
 
 

@@ -2,10 +2,10 @@
 
     h_{k+1} = h_k + dt f((h_k + h_{k+1}) / 2, u_k, theta)
 
-One call evaluates the right-hand side of all steps, one backward pass per tank its slopes. Newton's correction of the
-trajectory and the sensitivities to theta then obey one linear recurrence. A Gauss-Newton fit can therefore correct
-parameters and trajectory together (Bock, 1987) at the cost of one evaluation per iteration, and nothing has to be
-compiled. Local error of the rule: dt^2 h'''/24 per second; below 1e-3 cm for 1 s steps on the three-tank plant.
+One call evaluates the right-hand side of all steps and its slopes, from one trace of the equations. Newton's correction
+of the trajectory and the sensitivities to theta then obey one linear recurrence. A Gauss-Newton fit can therefore
+correct parameters and trajectory together (Bock, 1987) at the cost of one evaluation per iteration. Local error of the
+rule: dt^2 h'''/24 per second; below 1e-3 cm for 1 s steps on the three-tank plant.
 
 Internally time is the last dimension; the documented shapes are those of arguments and results. L lanes (parameter
 vectors), K steps, S samples, C sensors, P parameters.
@@ -29,13 +29,16 @@ from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.midpoint import newton_correction, newton_step
 from fdi_torch.simulate.output_map import LinearisedOutputs, OutputMap
-from fdi_torch.simulate.pointwise import partials, partials_of
+from fdi_torch.simulate.pointwise import partials
 from fdi_torch.simulate.scan import scan_in_time
+from fdi_torch.simulate.traced_rates import traced_rates
 
 # Newton's method has converged at corrections below these, in units of the plant's length scale: of the whole plant,
 # of one tank.
 CONVERGED, ONE_CONVERGED = 1e-7, 1e-5
 ONE_ROUNDS = 8  # most corrections of one tank
+ROUNDS = 12  # most corrections of a whole trajectory, or of one segment
+SEGMENT = 64  # steps of a segment that is converged by itself
 
 
 class Collocation:
@@ -57,6 +60,8 @@ class Collocation:
         self._effect_states = network.order - len(tanks)
         self._length = length_scale(network.description)
         self._names = [self.by[q] for q in self._moving]
+        self._moved = [space.index(name) for name in self._names]
+        self._column_of = dict(zip(self._moved, self._moving, strict=True))
         self._actuation = Actuation(network, experiment, self._names)
         self._output_map = OutputMap(network, experiment, self._names)
         self._fixed_commands: list[Tensor] | None = None
@@ -73,7 +78,7 @@ class Collocation:
         path = self._path(theta, levels)
         middle = 0.5 * (path[..., :-1] + path[..., 1:])
         values = self.network.bind(self.space, theta.unsqueeze(-2))
-        rates, by_level, by_theta = self._rate_slopes(middle, values, self._columns(theta), len(self.by))
+        rates, by_level, by_theta = self._rate_slopes(middle, theta, slopes=True)
         step = self.experiment.steps
         start, start_slopes = self._start(theta, values)
         corrected, slopes, transition, gain, defect = newton_step(
@@ -97,18 +102,51 @@ class Collocation:
         """The levels and defect of `linearise` without derivatives, at a fraction of the cost."""
         path = self._path(theta, levels)
         values = self.network.bind(self.space, theta.unsqueeze(-2))
-        rates, by_level, _ = self._rate_slopes(0.5 * (path[..., :-1] + path[..., 1:]), values, [], 0)
+        rates, by_level, _ = self._rate_slopes(0.5 * (path[..., :-1] + path[..., 1:]), theta)
         start = self._start(theta, values, slopes=False)[0]
         corrected, defect = newton_correction(self.experiment.steps, path, rates, by_level, start)
         return corrected.movedim(2, 1), defect
 
-    def converge(self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L nodes n"], rounds: int = 12) -> Linearised:
-        """Newton steps at fixed theta from `levels`, m, until they converge or `rounds` are used up."""
-        for _ in range(rounds - 1):
+    def converge(self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L nodes n"]) -> Linearised:
+        """Newton steps at fixed theta from `levels`, m, until they converge; segment by segment where they do not."""
+        for _ in range(ROUNDS - 1):
             levels, defect = self.corrected(theta, levels)
             if float(defect.max()) < CONVERGED * self._length:
                 break
+        else:
+            lost = (~(defect < CONVERGED * self._length)).nonzero().flatten()
+            levels = levels.index_copy(0, lost, self.converge_in_segments(theta[lost]))
         return self.linearise(theta, levels)
+
+    def converge_in_segments(self, theta: Float[Tensor, "L P"]) -> Float[Tensor, "L nodes n"]:
+        """Trajectories, m, by Newton steps on one segment of time after the other, each from the end of the last.
+
+        Newton steps on a whole trajectory that reaches a rim or a floor move the time of the kink by few steps at a
+        time, because the slopes on the other side of it hold until then. A segment that does not converge is halved.
+        """
+        path = self._path(theta, self.constant_guess(theta))
+        first, length, last = 0, SEGMENT, path.shape[-1] - 1
+        while first < last:
+            part = slice(first, min(first + length, last))
+            piece, converged = self._converged_segment(theta, path[..., first], part)
+            if not converged and length > 1:
+                length = length // 2
+                continue
+            path[..., first : part.stop + 1] = piece
+            first, length = part.stop, min(2 * length, SEGMENT)
+        return path.movedim(1, 2)
+
+    def _converged_segment(self, theta: Tensor, start: Tensor, part: slice) -> tuple[Tensor, bool]:
+        """The trajectories (L, n, k+1) in the k steps of a segment from their states (L, n) at its start, and whether
+        Newton's method converged."""
+        piece = start.unsqueeze(-1).expand(-1, -1, part.stop - part.start + 1).contiguous()
+        for _ in range(ROUNDS):
+            middle = 0.5 * (piece[..., :-1] + piece[..., 1:])
+            rates, by_level, _ = self._rate_slopes(middle, theta, part=part)
+            piece, defect = newton_correction(self.experiment.steps[part], piece, rates, by_level, start)
+            if float(defect.max()) < CONVERGED * self._length:
+                return piece, True
+        return piece, False
 
     def simulate_tank(
         self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L nodes tanks"], tank: int
@@ -117,8 +155,7 @@ class Collocation:
         levels = self._path(theta, levels).movedim(1, 2).clone()
         for _ in range(ONE_ROUNDS):
             path = levels.movedim(1, 2)
-            values = self.network.bind(self.space, theta.unsqueeze(-2))
-            rates, by_level, _ = self._rate_slopes(0.5 * (path[..., :-1] + path[..., 1:]), values, [], 0)
+            rates, by_level, _ = self._rate_slopes(0.5 * (path[..., :-1] + path[..., 1:]), theta)
             level, step = path[:, tank], self.experiment.steps
             inverse = 1.0 / (1.0 - 0.5 * step * by_level[:, tank, tank])
             misfit = step * rates[:, tank] - torch.diff(level)
@@ -217,46 +254,35 @@ class Collocation:
         return look.along(slopes, moves)
 
     def _rate_slopes(
-        self, middle: Tensor, values: PlaceValues, moving: Sequence[Tensor], width: int
+        self, middle: Tensor, theta: Tensor, slopes: bool = False, part: slice = slice(None)
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Rates (L, n, K) at mid-step levels (L, n, K), their slopes by level (L, n, n, K) and by theta (L, n, P, K).
 
-        moving: parameters by which to differentiate, each (L, 1); width: P.
+        slopes: whether to differentiate by theta; otherwise P is 0. part: the steps of `middle`.
         """
-        lanes, n, steps = middle.shape
-        shape = (lanes, steps)
         reaches_rim = bool((middle[:, : len(self._rims)] >= middle.new_tensor(self._rims).unsqueeze(-1)).any())
         network = self.network if reaches_rim else self._without_overflow
-        commands, command_slopes, columns = self._commands(values, moving, lanes)
-        driven = [i for i, slopes in enumerate(command_slopes) if slopes is not None]
-
-        def rates(x: list[Tensor]) -> list[Tensor]:
-            commands_at = list(commands)
-            for i, value in zip(driven, x[n : n + len(driven)], strict=True):
-                commands_at[i] = value
-            bound = with_parameters(values, self._names, x[n + len(driven) :])
-            return network.rates(x[:n], commands_at, self._actuation.clock, bound)
-
-        inputs = [*middle.unbind(1), *(commands[i] for i in driven), *moving]
-        moved = tuple(self._names) if moving else ()
-        plant, placements = network.description, tuple(p.prefix for p in network.placements)
-        components = plant.tanks, *plant.flow_components()
-        known = partials_of(components, placements, moved, tuple(driven), reaches_rim)
-        values_at, rows = known(rates, inputs, shape)
-        by_level, by_theta = (middle.new_zeros(lanes, n, m, steps) for m in (n, width))
-        for i, row in enumerate(rows):
-            for j in range(n):
-                if (slope := row[j]) is not None:
-                    by_level[:, i, j] = slope
-            for q, slope in enumerate(row[n + len(driven) :]):
-                if slope is not None:
-                    by_theta[:, i, self._moving[q]] = slope
-            for d, slope in zip(driven, row[n : n + len(driven)], strict=True):
-                course = command_slopes[d]
-                if slope is not None and course is not None:
-                    for q, column in enumerate(columns):
-                        by_theta[:, i, self._moving[column]] += slope * course[:, q]
-        return torch.stack(values_at, dim=1), by_level, by_theta
+        values, moving = self.network.bind(self.space, theta.unsqueeze(-2)), self._columns(theta) if slopes else []
+        commands, command_slopes, columns = self._commands(values, moving, len(theta))
+        clock = self._actuation.clock
+        found = traced_rates(network, self.space.names)(
+            middle,
+            [command[:, part] for command in commands],
+            theta,
+            network.nominal,
+            Clock(clock.start[part], clock.step[part], clock.resolution),
+            driven=[i for i, slopes in enumerate(command_slopes) if slopes is not None],
+            moved=self._moved if slopes else [],
+        )
+        by_theta = middle.new_zeros(*middle.shape[:2], len(self.by) if slopes else 0, middle.shape[-1])
+        for (i, p), slope in found.by_parameter.items():
+            by_theta[:, i, self._column_of[p]] = slope
+        for (i, d), slope in found.by_command.items():
+            course = command_slopes[d]
+            assert course is not None
+            for q, column in enumerate(columns):
+                by_theta[:, i, self._moving[column]] += slope * course[:, q, part]
+        return found.rates, found.by_state, by_theta
 
     def _commands(
         self, values: PlaceValues, moving: Sequence[Tensor], lanes: int

@@ -54,10 +54,15 @@ class JointCollocation:
         corrected = [part.corrected(columns, piece) for part, columns, piece in pieces]
         return torch.cat([c[0] for c in corrected], dim=1), torch.stack([c[1] for c in corrected]).amax(dim=0)
 
-    def converge(self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L N n"], rounds: int = 12) -> Linearised:
+    def converge(self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L N n"]) -> Linearised:
         """Newton steps at fixed theta from levels (L, N, tanks), m, until every recording has converged."""
         pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
-        return self._joined([part.converge(columns, piece, rounds) for part, columns, piece in pieces])
+        return self._joined([part.converge(columns, piece) for part, columns, piece in pieces])
+
+    def converge_in_segments(self, theta: Float[Tensor, "L P"]) -> Float[Tensor, "L N n"]:
+        """Trajectories, m, by Newton steps on one segment of time after the other."""
+        pairs = zip(self.parts, self._own(theta), strict=True)
+        return torch.cat([part.converge_in_segments(columns) for part, columns in pairs], dim=1)
 
     def simulate_tank(
         self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L N tanks"], tank: int

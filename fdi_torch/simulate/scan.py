@@ -97,7 +97,7 @@ def product(a: Float[Tensor, "L n n K"], x: Float[Tensor, "L n m K"]) -> Float[T
 def run_loop(name: str, shape: torch.Size, inputs: Sequence[Tensor | None], outputs: Sequence[Tensor | None]) -> bool:
     """Run a loop of recurrence.hpp, which fills the outputs; False where it cannot. shape: (L, n, columns, K)."""
     lanes, n, columns, steps = shape
-    library = _library(n) if n <= MOST and all(t is None or _is_plain(t) for t in inputs) else None
+    library = _library(n) if n <= MOST and all(t is None or is_plain(t) for t in inputs) else None
     if library is None:
         return False
     contiguous = [None if t is None else t.contiguous() for t in inputs]
@@ -106,7 +106,7 @@ def run_loop(name: str, shape: torch.Size, inputs: Sequence[Tensor | None], outp
     return True
 
 
-def _is_plain(tensor: Tensor) -> bool:
+def is_plain(tensor: Tensor) -> bool:
     """Whether a tensor holds float64 numbers on the CPU without gradients."""
     return not tensor.requires_grad and tensor.dtype is torch.float64 and tensor.device.type == "cpu"
 

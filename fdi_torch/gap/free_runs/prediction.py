@@ -33,7 +33,7 @@ from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
 
 START_SAMPLES = 50  # for the initial levels
-CORRECTIONS, HALVINGS = 80, 4  # Newton steps, and halvings of the simulation step
+HALVINGS = 4  # halvings of the simulation step
 CONVERGED = 1e-5  # largest defect of a converged trajectory, in units of the plant's length scale
 NEARLY = 10.0  # in units of CONVERGED: a defect that shorter steps need not improve
 MOST_STEPS = 4000  # in the first attempt; levels change more slowly than close samples
@@ -126,7 +126,7 @@ def _run(data: DataSet, start_samples: int, skipped: int) -> Prediction:
     std = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     fitter = Fitter(replace(data, mask=early), Noise(1e-2 * std, torch.zeros_like(std)))
     engine, theta, levels = _start_from_segment(fitter, skipped) if skipped else _start_from_samples(fitter, data)
-    run = engine.converge(theta, levels, CORRECTIONS)
+    run = engine.converge(theta, levels)
     readings = run.readings[0]
     residuals = torch.where(data.mask, data.readings - readings, torch.zeros_like(readings))
     rmse = torch.sqrt((residuals[skipped:] ** 2).sum(dim=0) / data.mask[skipped:].sum(dim=0))

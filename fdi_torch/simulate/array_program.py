@@ -1,0 +1,236 @@
+"""Execution of an expression graph on arrays in time, without compilation for each plant.
+
+A compiled interpreter carries out one instruction after the other on a block of steps. Every plant and every set of
+effects uses the same interpreter, so that a new structure costs a trace instead of a compilation. Without a compiler,
+and for tensors that it cannot take (gradients, float32, GPU), torch does the same on whole arrays.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from fdi_torch.simulate.build import BuildError, load_library
+from fdi_torch.simulate.cpp_source import primitives
+from fdi_torch.simulate.expression import Graph, Varies
+from fdi_torch.simulate.operations import OPERATIONS
+from fdi_torch.simulate.scan import is_plain
+from fdi_torch.simulate.section import Place
+
+BLOCK = 64
+"""Steps in a block; a multiple of the numbers in a vector register."""
+_SKELETON = Path(__file__).with_name("array_program.hpp")
+_NUMBER = {name: i for i, name in enumerate(OPERATIONS)}
+
+
+@dataclass
+class _Registers:
+    """Allocation of registers; one that is free is used again."""
+
+    count: int = 0
+    free: list[int] = field(default_factory=list)
+
+    def take(self) -> int:
+        if self.free:
+            return self.free.pop()
+        self.count += 1
+        return self.count - 1
+
+
+class ArrayProgram:
+    """The values of some nodes of a graph on arrays in time.
+
+    Inputs that vary in time (`Varies.STEP`) are arrays (L or 1, K), all others are numbers (L or 1,) of a lane.
+    outputs: the nodes to compute, in this order.
+    """
+
+    def __init__(self, graph: Graph, outputs: Sequence[int]) -> None:
+        self._graph, self._nodes = graph, graph.reach(outputs)
+        self._outputs = list(outputs)
+        leaves = [i for i in self._nodes if not graph.nodes[i].arguments]
+        self._arrays = [i for i in leaves if self._varies_in_time(i)]
+        self._scalars = [i for i in leaves if not self._varies_in_time(i)]
+
+    def run(self, inputs: Mapping[Place, Tensor], into: Sequence[Tensor], lanes: int, steps: int) -> None:
+        """Write each output into its array (lanes, steps). inputs: by kind and index."""
+        scalars = [self._scalar(i, inputs, into[0]) for i in self._scalars]
+        arrays = [inputs[self._place(i)].expand(lanes, steps) for i in self._arrays]
+        library = _library() if all(is_plain(x) for x in (*scalars, *arrays, *into)) else None
+        if library is None:
+            return self._by_torch(scalars, arrays, into)
+        return self._by_interpreter(library, scalars, arrays, into)
+
+    def _place(self, i: int) -> Place:
+        return self._graph.nodes[i].kind, self._graph.nodes[i].index
+
+    def _varies_in_time(self, i: int) -> bool:
+        return bool(self._graph.nodes[i].varies & Varies.STEP)
+
+    def _scalar(self, i: int, inputs: Mapping[Place, Tensor], like: Tensor) -> Tensor:
+        value = self._graph.nodes[i].value
+        return inputs[self._place(i)] if value is None else like.new_full((1,), value)
+
+    def _by_torch(self, scalars: Sequence[Tensor], arrays: Sequence[Tensor], into: Sequence[Tensor]) -> None:
+        values = dict(zip(self._scalars, (s.unsqueeze(-1) for s in scalars), strict=True))
+        values |= dict(zip(self._arrays, arrays, strict=True))
+        for i in self._nodes:
+            if i not in values:
+                node = self._graph.nodes[i]
+                values[i] = OPERATIONS[node.operation].torch(*(values[a] for a in node.arguments))
+        for node_index, array in zip(self._outputs, into, strict=True):
+            array.copy_(values[node_index])
+
+    def _by_interpreter(
+        self, library: ctypes.CDLL, scalars: Sequence[Tensor], arrays: Sequence[Tensor], into: Sequence[Tensor]
+    ) -> None:
+        code, (lanes, steps) = self._code, into[0].shape
+        together = torch.cat([s.expand(lanes).unsqueeze(-1) for s in scalars], dim=-1) if scalars else into[0][:, :0]
+        rows = [a if a.stride(-1) == 1 or steps == 1 else a.contiguous() for a in arrays]
+        library.run_on_arrays(
+            ctypes.c_int64(lanes),
+            ctypes.c_int64(steps),
+            ctypes.c_int64(code.registers),
+            ctypes.byref(_Scalars(len(scalars), len(scalars), together.data_ptr(), code.scalar_registers.data_ptr())),
+            ctypes.byref(_arrays(rows, code.array_registers)),
+            ctypes.byref(_Code(len(code.fixed), code.fixed.data_ptr())),
+            ctypes.byref(_Code(len(code.varying), code.varying.data_ptr())),
+            ctypes.c_void_p(code.stores.data_ptr()),
+            ctypes.byref(_arrays([into[k] for k in code.order], code.output_registers)),
+        )
+
+    @cached_property
+    def _code(self) -> _Instructions:
+        return _assemble(self._graph, self._nodes, self._scalars, self._arrays, self._outputs)
+
+
+@dataclass(frozen=True)
+class _Instructions:
+    """Instructions (N, 5), int32. order: of the outputs, as they are completed; stores and output_registers follow it.
+
+    stores: number of varying instructions after which an output is complete.
+    """
+
+    registers: int
+    scalar_registers: Tensor
+    array_registers: Tensor
+    fixed: Tensor
+    varying: Tensor
+    order: list[int]
+    stores: Tensor
+    output_registers: Tensor
+
+
+def _assemble(
+    graph: Graph, nodes: Sequence[int], scalars: Sequence[int], arrays: Sequence[int], outputs: Sequence[int]
+) -> _Instructions:
+    registers, places = _Registers(), {}
+    for i in (*scalars, *arrays):
+        places[i] = registers.take()
+    computed = [i for i in nodes if graph.nodes[i].arguments]
+    fixed = [i for i in computed if not graph.nodes[i].varies & Varies.STEP]
+    varying = [i for i in computed if graph.nodes[i].varies & Varies.STEP]
+    code: dict[str, list[tuple[int, ...]]] = {"fixed": [], "varying": []}
+
+    def write(part: str, i: int, arguments: Sequence[int]) -> None:
+        used = [*(places[a] for a in arguments), 0, 0]
+        code[part].append((_NUMBER[graph.nodes[i].operation], places[i], *used[:3]))
+
+    for i in fixed:
+        places[i] = registers.take()
+        write("fixed", i, graph.nodes[i].arguments)
+    last_use = {a: i for i in varying for a in graph.nodes[i].arguments}
+    wanted: dict[int, list[int]] = {}
+    for k, i in enumerate(outputs):
+        wanted.setdefault(i, []).append(k)
+    order, stores = [k for i, ks in wanted.items() if i not in set(varying) for k in ks], []
+    stores += [0] * len(order)
+    output_registers = [places[outputs[k]] for k in order]
+    for done, i in enumerate(varying, 1):
+        arguments = graph.nodes[i].arguments
+        places[i] = registers.take()  # before its arguments are freed: an operation may not overwrite them
+        write("varying", i, arguments)
+        for k in wanted.get(i, ()):
+            order.append(k)
+            stores.append(done)
+            output_registers.append(places[i])
+        ended = {a for a in arguments if last_use[a] == i and a in places and graph.nodes[a].arguments}
+        ended |= {i} if i not in last_use else set()
+        registers.free += [places[a] for a in ended if graph.nodes[a].varies & Varies.STEP]
+    return _Instructions(
+        registers.count,
+        _int32([places[i] for i in scalars]),
+        _int32([places[i] for i in arrays]),
+        _int32(code["fixed"]),
+        _int32(code["varying"]),
+        order,
+        torch.tensor(stores, dtype=torch.int64),
+        _int32(output_registers),
+    )
+
+
+def _int32(values: Sequence[object]) -> Tensor:
+    return torch.tensor(values, dtype=torch.int32)
+
+
+class _Scalars(ctypes.Structure):
+    """`Scalars` of array_program.hpp."""
+
+    _fields_ = (
+        ("count", ctypes.c_int64),
+        ("stride", ctypes.c_int64),
+        ("values", ctypes.c_void_p),
+        ("registers", ctypes.c_void_p),
+    )
+
+
+class _Arrays(ctypes.Structure):
+    """`Arrays` of array_program.hpp."""
+
+    _fields_ = (
+        ("count", ctypes.c_int64),
+        ("starts", ctypes.POINTER(ctypes.c_void_p)),
+        ("strides", ctypes.POINTER(ctypes.c_int64)),
+        ("registers", ctypes.c_void_p),
+    )
+
+
+class _Code(ctypes.Structure):
+    """`Code` of array_program.hpp."""
+
+    _fields_ = (("count", ctypes.c_int64), ("instructions", ctypes.c_void_p))
+
+
+def _arrays(rows: Sequence[Tensor], registers: Tensor) -> _Arrays:
+    """Pointers to rows (L, K) of contiguous steps."""
+    count = len(rows)
+    starts = (ctypes.c_void_p * count)(*(r.data_ptr() for r in rows))
+    strides = (ctypes.c_int64 * count)(*(r.stride(0) for r in rows))
+    return _Arrays(count, starts, strides, registers.data_ptr())
+
+
+@lru_cache(maxsize=1)
+def _library() -> ctypes.CDLL | None:
+    loops = _SKELETON.read_text(encoding="utf-8").replace("//@OPERATIONS@", "\n".join(_cases()))
+    source = f"#define BLOCK {BLOCK}\n#define LANES BLOCK\n{primitives('double')}\n{loops}"
+    try:
+        return load_library(source, "run_on_arrays")
+    except BuildError:
+        return None
+
+
+def _cases() -> list[str]:
+    """One case of the interpreter's switch for each operation; truth values are kept as 1 and 0."""
+    truth = {"and": "abc", "or": "abc", "not": "abc", "where": "a"}
+    cases = []
+    for name, number in _NUMBER.items():
+        arguments = [f"DIFFERENT(AT({x}), real(0))" if x in truth.get(name, "") else f"AT({x})" for x in "abc"]
+        expression = OPERATIONS[name].c.format(*arguments)
+        result = f"WHERE({expression}, real(1), real(0))" if OPERATIONS[name].boolean else expression
+        cases.append(f"case {number}: EACH_VECTOR AT(out) = wide({result}); break;")
+    return cases
