@@ -33,7 +33,9 @@ def summary_section(material: Material) -> Section | None:
     names = list(dict.fromkeys(k for m in settings for k, v in m.items() if k not in _OWN and _shown(v) is not None))
     header = ["", *(str(m.get("group", "")) for m in settings)]
     rows = [["trials", *(str(m.get("trials", "")) for m in settings)]]
-    rows += [[name, *(_shown(m.get(name)) or "" for m in settings)] for name in names]
+    for name in names:
+        label, scale = _label_and_scale(material, name)
+        rows.append([label, *(_shown(m.get(name), scale) or "" for m in settings)])
     shown = table(header, rows)
     if len(rows) <= MOST_ROWS:
         return Section("Settings", [shown])
@@ -43,6 +45,15 @@ def summary_section(material: Material) -> Section | None:
     ]
     blocks = [table(header, [rows[0], *main]), folded(f"All {len(rows)} numbers of each setting", shown, printed=False)]
     return Section("Settings", [f"Estimator: {estimator}.", *blocks] if main else blocks[1:])
+
+
+def _label_and_scale(material: Material, name: str) -> tuple[str, float]:
+    """The name of a number, with its unit for display if it is an error of a parameter, and that unit's scale."""
+    parameter, _, quantity = name.partition(".")[2].rpartition(".")
+    if quantity not in ("bias", "bias_error", "rmse"):
+        return name, 1.0
+    unit, scale = _unit_of(material, parameter)
+    return axis(name, unit), scale
 
 
 def _main_words(name: str) -> str:
@@ -144,12 +155,12 @@ def _column(trials: Sequence[Payload], group: str, name: str) -> np.ndarray:
     return np.array([float(v) for v in own if isinstance(v, int | float)])
 
 
-def _shown(value: Any) -> str | None:
+def _shown(value: Any, scale: float = 1.0) -> str | None:
     """Numbers, texts and short lists of them as text; None for values that do not fit a table."""
     if isinstance(value, bool | str):
         return str(value)
     if isinstance(value, int | float):
-        return number(float(value))
+        return number(scale * float(value))
     if isinstance(value, list) and len(value) <= 8:
         return ", ".join(number(float(v), 3) if isinstance(v, int | float) else str(v) for v in value)
     return None
