@@ -57,11 +57,36 @@ def test_every_template_is_a_file_of_its_kind_for_every_shipped_plant(name: str,
     assert load_study(paths["study"]).plan.trials == 600
 
 
-def test_a_new_plant_file_does_not_wait_for_torch(tmp_path: Path) -> None:
+def test_a_new_plant_file_does_not_wait_for_the_library_of_units(tmp_path: Path) -> None:
     words = ["-X", "importtime", "-m", "fdi_torch", "new", "plant", "--out", str(tmp_path / "rig.yaml")]
     imported = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True).stderr
-    assert "fdi_torch.cli.screen" in imported and "torch._C" not in imported and "fdi_torch.units" not in imported
+    assert "fdi_torch.cli.screen" in imported and "fdi_torch.units" not in imported
     assert load_plant(tmp_path / "rig.yaml").name == "rig"
+
+
+WITHOUT_TORCH = [
+    *("new plant --out rig.yaml", "new run --out run.yaml", "new monitor --out watch.yaml", "new study --out st.yaml"),
+    *("effects", "effects leak pump_lag", "effects --plant quadruple_tank --json", "completion bash"),
+]
+
+
+@pytest.mark.parametrize("words", WITHOUT_TORCH)
+def test_a_command_that_computes_nothing_does_not_load_torch(words: str, tmp_path: Path) -> None:
+    """A file of `effects` or `plant` writes `torch.Tensor`: `from torch import Tensor` would load torch."""
+    if words.startswith("completion"):
+        pytest.importorskip("shtab")
+    code = "import sys; from fdi_torch.cli import main; main(sys.argv[1:]); sys.exit('torch._C' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code, *words.split()], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout, done.stderr
+
+
+def test_a_quick_command_loads_torch_where_it_needs_it(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text("t_s,Q_l/min,h_cm\n" + "".join(f"{k},{1 + k % 2},{10 + k}\n" for k in range(30)))
+    code = "import sys; from fdi_torch.cli import main; main(sys.argv[1:]); sys.exit('torch._C' not in sys.modules)"
+    words = ["new", "plant", "--recording", "run.csv", "--out", "rig.yaml"]
+    done = subprocess.run([sys.executable, "-c", code, *words], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "h:" in (tmp_path / "rig.yaml").read_text()
 
 
 def test_what_is_commented_out_in_a_new_file_holds_too(tmp_path: Path) -> None:

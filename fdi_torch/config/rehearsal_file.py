@@ -79,7 +79,7 @@ class RivalConfig(Strict):
 
 class RehearsalConfig(Strict):
     plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
-    inputs: list[str] = Field(description="constant commands, one per channel")
+    inputs: list[str] = Field(description="list of constant commands, one per channel of the plant, in its order")
     reading_noise: str = Field("1 mm", description="standard deviation: 1 mm (of the level), or h1 = 1 mm, p2 = 2 mV")
     sampling: ScaledSeconds = Field(1.0, gt=0, description="sampling interval, s")
     false_alarms_every: ScaledSeconds = Field(20000.0, description="design mean time between false alarms, s")

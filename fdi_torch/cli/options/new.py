@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 STEP, SUMMARY = "describe", "write a commented minimal file: a plant, run, monitor or study"
+QUICK = True
 EXAMPLES = """
 examples:
   fdi new plant --out rig.yaml                     then fdi check --plant rig.yaml
