@@ -173,8 +173,9 @@ def _constants(constants: Mapping[str, Any], screen: Screen) -> None:
     for name, c in constants.items():
         if max(_tolerances_off(c, stage) for stage in ("recalibrated", "augmented")) > MOVED:
             unit, scale = display_unit(c["unit"], name)
-            numbers = [c["nominal"], c["tolerance"], c["recalibrated"], c["augmented"], c["std"]]
-            rows.append([name, *(f"{scale * v:.4g}" for v in numbers[:4]), f"{scale * numbers[4]:.2g}", unit])
+            numbers = [f"{scale * c[stage]:.4g}" for stage in ("nominal", "tolerance", "recalibrated")]
+            fitted = [rounded(scale * c[stage], scale * c["std"]) for stage in ("augmented", "std")]
+            rows.append([name, *numbers, *fitted, unit])
     if rows:
         header = ("constant", "nominal", "tolerance", "recalibrated", "with the causes", "std error", "unit")
         screen.table(f"constants more than {MOVED:g} tolerances off", header, rows)
