@@ -193,6 +193,7 @@ def _confusability(impostors: Mapping[str, Any] | None) -> list[str]:
         return []
     confused, passed, draws = simulated["confused"], simulated["passed"], simulated["draws"]
     return [
-        f"check by simulation: a gap of this size from any of {simulated['rivals']} other causes would be given this "
-        f"name in {confused} of {draws} recordings, or in {passed} if the library lacked that cause"
+        f"reliability of the name: of {draws} simulated recordings with a gap of this size from one of "
+        f"{simulated['rivals']} other causes, {confused} were given this name, and {passed} if the library lacked the "
+        "true cause"
     ]
