@@ -16,6 +16,8 @@ from fdi_torch.config.file_templates import template
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.rehearsal_file import load_rehearsal
 from fdi_torch.config.run_file import load_run
 from fdi_torch.config.study_file import load_study
 from fdi_torch.config.yaml_files import read_yaml, shipped_plants
@@ -48,13 +50,27 @@ def test_from_nothing_to_a_diagnosis_with_new_files_alone(
 @pytest.mark.parametrize("name", shipped_plants())
 def test_every_template_is_a_file_of_its_kind_for_every_shipped_plant(name: str, tmp_path: Path) -> None:
     plant = load_plant(name)
-    paths = {kind: tmp_path / f"{kind}.yaml" for kind in ("plant", "run", "monitor", "study")}
+    paths = {kind: tmp_path / f"{kind}.yaml" for kind in ("plant", "run", "monitor", "rehearsal", "study")}
     for kind, path in paths.items():
         path.write_text(template(kind, plant, name, kind))
         assert "${" not in path.read_text()
     assert load_plant(paths["plant"]).name == "rig"
     assert load_run(paths["run"]).plant == plant and load_monitor(paths["monitor"]).plant == plant
     assert load_study(paths["study"]).plan.trials == 600
+    assert len(load_rehearsal(paths["rehearsal"]).plans) == 2
+
+
+def test_a_plant_file_in_place_of_a_run_file_is_called_one(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(template("plant", load_plant("three_tank"), "", ""))
+    for load in (load_run, load_monitor, load_study, load_rehearsal):
+        with pytest.raises(ConfigError, match=r"got a plant file; .*: fdi new run --plant .*rig.yaml writes one"):
+            load(path)
+
+
+def test_an_effect_of_the_catalogue_is_shown_with_its_parameters() -> None:
+    shown = repr(effects()["pump_lag"])
+    assert shown.startswith("Entry: pump_lag, at a pump or a transfer: A pump ") and "time_constant" in shown
 
 
 def test_a_new_plant_file_does_not_wait_for_the_library_of_units(tmp_path: Path) -> None:
