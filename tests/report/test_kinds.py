@@ -340,3 +340,14 @@ def test_runs_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> Non
 def test_words_of_a_table_are_left_aligned() -> None:
     assert _texts([["5 %", "fixed", "20"], ["20 %", "glr", "7"]]) == 2
     assert _texts([["white", "24 (18 .. 40)"]]) == 1 and _texts([]) == 1
+
+
+def test_an_unfinished_study_names_its_parameters(tmp_path: Path) -> None:
+    asked = {"estimate": {"parameters": [{"name": "Q1.pump_offset"}]}}
+    with RunLog(tmp_path / "run.mcap", "study", config=asked, env={}, git={}) as log:
+        for k in range(4):
+            numbers = {"truth": [2e-6], "free": [2e-6 + 1e-7 * (k + 1)], "bound": [1e-7]}
+            log.trial(k, numbers, group="SNR 40 dB", seed=k, status="converged")
+    made = report_of(material_of(tmp_path / "run.mcap", load_plant("three_tank")))
+    axes = next(p for p in made.pictures if p.name == "errors_1").figure.axes[0]
+    assert axes.get_title(loc="left") == "pump offset at Q1" and axes.get_ylabel() == "size of the error, cm³/s"

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import orjson
 from matplotlib.figure import Figure
 
 from fdi_torch.amounts import parameter_words
-from fdi_torch.effects import build_network, effect
+from fdi_torch.effects import build_network, effect, full_name
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.effect import Placement
 from fdi_torch.report.html import folded, short, table
@@ -100,10 +101,22 @@ def _unit_of(material: Material, name: str) -> tuple[str, float]:
 
 
 def _parameters(material: Material, estimator: str, count: int) -> list[str]:
-    """Names of the parameters, from the summary's ESTIMATOR.PARAMETER.rmse; numbers if the summary has none."""
+    """Names of the parameters, from the summary's ESTIMATOR.PARAMETER.rmse or, in an unfinished study, from its
+    configuration; numbers if neither has them.
+    """
     keys = [k for m in material.of(SUMMARY)[:1] for k in m if k.startswith(f"{estimator}.") and k.endswith(".rmse")]
-    names = [key.removeprefix(f"{estimator}.").removesuffix(".rmse") for key in keys]
+    names = [key.removeprefix(f"{estimator}.").removesuffix(".rmse") for key in keys] or _configured(material)
     return names if len(names) == count else [f"parameter {i + 1}" for i in range(count)]
+
+
+def _configured(material: Material) -> list[str]:
+    """The parameters that the configuration in the log asks for; none if it cannot be read."""
+    try:
+        asked = orjson.loads(material.about("config").get("estimate.parameters", "[]"))
+        names = [str(each["name"]) for each in asked]
+        return [full_name(name, material.plant) for name in names] if material.plant else names
+    except (ValueError, TypeError, KeyError):
+        return []
 
 
 def trials_section(material: Material) -> Section | None:
