@@ -143,7 +143,7 @@ def _titled(sheet: Sheet) -> Markup:
 
 
 def _shown(sheet: Sheet) -> Markup:
-    return table(sheet.header, sheet.rows, left=sheet.left)
+    return table([name.replace("`", "") for name in sheet.header], sheet.rows, left=sheet.left)
 
 
 def shares_panel(
