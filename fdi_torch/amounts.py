@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 
 from fdi_torch.parameters import ParameterName
@@ -60,8 +61,10 @@ def with_error(value: float, std: float) -> str:
 
 
 def rounded(value: float, std: float) -> str:
-    """The value with as many digits as show two of its standard error; with six where it has none."""
-    if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
+    """The value with as many digits as show two of its standard error; with six where it has none, or one that is
+    within the rounding of the numbers it was computed with.
+    """
+    if not (math.isfinite(value) and math.isfinite(std) and std > sys.float_info.epsilon * abs(value)):
         return f"{value:.6g}"
     digits = decimals(std)
     if digits <= 6:

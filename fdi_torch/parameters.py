@@ -13,7 +13,6 @@ from functools import lru_cache
 from typing import Any, TypeVar
 
 import torch
-from torch import Tensor
 
 from fdi_torch.names import unknown
 
@@ -171,30 +170,30 @@ class ParameterSpace:
         self.index(name)
         return ParameterSpace(replace(p, **changes) if p.name == name else p for p in self.parameters)
 
-    def nominal(self, like: Tensor | None = None) -> Tensor:
+    def nominal(self, like: torch.Tensor | None = None) -> torch.Tensor:
         return self._column("nominal", like)
 
-    def low(self, like: Tensor | None = None) -> Tensor:
+    def low(self, like: torch.Tensor | None = None) -> torch.Tensor:
         return self._column("low", like)
 
-    def high(self, like: Tensor | None = None) -> Tensor:
+    def high(self, like: torch.Tensor | None = None) -> torch.Tensor:
         return self._column("high", like)
 
-    def std(self, like: Tensor | None = None) -> Tensor:
+    def std(self, like: torch.Tensor | None = None) -> torch.Tensor:
         return self._column("std", like)
 
-    def _column(self, field: str, like: Tensor | None) -> Tensor:
+    def _column(self, field: str, like: torch.Tensor | None) -> torch.Tensor:
         values = [getattr(p, field) for p in self.parameters]
         return torch.tensor(values, dtype=torch.float64) if like is None else like.new_tensor(values)
 
-    def vector(self, values: Mapping[str, float]) -> Tensor:
+    def vector(self, values: Mapping[str, float]) -> torch.Tensor:
         """Nominal values (P,) with some replaced by name."""
         theta = self.nominal()
         for name, value in values.items():
             theta[self.index(name)] = value
         return theta
 
-    def named(self, theta: Tensor) -> dict[str, Tensor]:
+    def named(self, theta: torch.Tensor) -> dict[str, torch.Tensor]:
         """Split (*batch, P) into one tensor (*batch) per name."""
         if theta.shape[-1] != len(self):
             raise ValueError(

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
 
 from fdi_torch.clock import stamp
 from fdi_torch.names import unknown
@@ -32,14 +31,14 @@ class Recording(Shown):
     of each channel in its file.
     """
 
-    time: Tensor
-    inputs: Tensor
-    outputs: Tensor
+    time: torch.Tensor
+    inputs: torch.Tensor
+    outputs: torch.Tensor
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
     input_units: tuple[str, ...]
     output_units: tuple[str, ...]
-    mask: Tensor = field(default=None)  # type: ignore[assignment]
+    mask: torch.Tensor = field(default=None)  # type: ignore[assignment]
     hold: Hold = "zero_order"
     source: str = "memory"
     sha256: str = ""
@@ -129,7 +128,7 @@ class Recording(Shown):
         coordinates = {"time": ("time", self.time.cpu().numpy(), {"units": "s"})}
         return needed("xarray").Dataset(variables, coordinates, {"source": self.source})
 
-    def compared(self, predicted: Tensor) -> Any:
+    def compared(self, predicted: torch.Tensor) -> Any:
         """An xarray.Dataset (extra `xarray`) of measured, predicted and residual outputs over time and sensor, SI.
 
         predicted (T, N): outputs of a model.
@@ -247,7 +246,7 @@ class Recording(Shown):
             self, time=self.time[::step], inputs=inputs, outputs=self.outputs[::step], mask=self.mask[::step]
         )
 
-    def _held_means(self, step: int) -> Tensor:
+    def _held_means(self, step: int) -> torch.Tensor:
         """Mean inputs (T/step, M) over blocks of `step` samples, weighted by the time for which each is held."""
         steps = torch.diff(self.time)
         held = torch.cat((steps, steps[-1:]))[:, None]
@@ -263,6 +262,6 @@ class Recording(Shown):
         return [self.stretch(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _range(values: Tensor) -> tuple[float, float]:
+def _range(values: torch.Tensor) -> tuple[float, float]:
     finite = values[torch.isfinite(values)]
     return (float(finite.min()), float(finite.max())) if len(finite) else (math.nan, math.nan)

@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import Any, Self, TypeVar, cast
 
 from fdi_torch.amounts import rounded
-from fdi_torch.quantities import display_unit, displayed_in, displayed_units
+from fdi_torch.quantities import display_unit, displayed_in, displayed_units, significant
 
 MOST_ROWS = 60
 """Number of displayed rows; a data frame has all of them."""
@@ -42,7 +42,7 @@ class Table:
         errors = next((self.columns[name] for name in ERRORS if name in self.columns), None)
         columns = [
             [
-                _cell(value, errors[k] if errors and name in WITH_ERROR else None)
+                _shown(name, value, errors[k] if errors and name in WITH_ERROR else None)
                 for k, value in enumerate(column[:most])
             ]
             for name, column in self.columns.items()
@@ -145,6 +145,11 @@ def needed(library: str, extra: str = "") -> Any:
             f"expected the library {library.partition('.')[0]}, got none; pip install 'fdi_torch[{extra or library}]'"
         )
         raise MissingExtraError(sentence) from error
+
+
+def _shown(column: str, value: Any, std: float | None) -> str:
+    """A cell; probabilities are known to three digits at most."""
+    return significant(value, 3) if column == "probability" and isinstance(value, float) else _cell(value, std)
 
 
 def _cell(value: Any, std: float | None = None) -> str:

@@ -7,6 +7,7 @@ import pytest
 from fdi_torch.amounts import estimate_words, parameter_words, rounded, sized_words, with_error
 from fdi_torch.monitor.events import Explanation, Size, headline
 from fdi_torch.quantities import displayed_in
+from fdi_torch.tables import Table
 
 
 def size(name: str, value: float, std: float, unit: str = "1") -> Size:
@@ -59,5 +60,11 @@ def test_an_error_has_two_digits_and_the_value_its_decimals(value: float, std: f
 
 def test_numbers_of_a_table_have_the_digits_of_their_error() -> None:
     assert [rounded(v, 0.004) for v in (0.0271818, 0.004, 0.0)] == ["0.0272", "0.0040", "0.0000"]
+    assert rounded(0.451569442664, 2.2e-20) == "0.451569"  # a fit that has not converged
     assert rounded(1234.56, 123.0) == "1235" and rounded(2.4417e-9, 2.4e-10) == "2.44e-09"
     assert rounded(2.4e-10, 2.4e-10) == "2.4e-10" and rounded(0.3, 0.0) == "0.3" and rounded(0.3, float("inf")) == "0.3"
+
+
+def test_probabilities_in_a_table_have_three_digits() -> None:
+    shown = Table({"explanation": ["leak at A"], "probability": [0.697017]}).rows()
+    assert shown == [["leak at A", "0.697"]]

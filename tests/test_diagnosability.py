@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 
+from fdi_torch.cli import main
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import placements_for
 from fdi_torch.estimate.fitting import set_up
@@ -141,3 +142,15 @@ def _as_toolbox_model(toolbox: Any, structure: Structure, names: list[str]) -> d
         "z": readings,
         "rels": written,
     }
+
+
+def test_the_tables_are_in_the_units_of_the_plant(capsys: pytest.CaptureFixture[str]) -> None:
+    """A pump's offset in cm^3/s has a millionth of the effect of one in m^3/s; what is not determined has no number."""
+    words = ["diagnosability", "--plant", "three_tank", "--input", "50 cm^3/s,50 cm^3/s", "--duration", "60 s"]
+    assert main([*words, "--faults", "Q1.pump_offset,h1.sensor_bias,T2.leak,OUT2.plugging"]) == 0
+    shown = capsys.readouterr().out
+    assert "inf" not in shown and " SI" not in shown
+    offset = [line.split() for line in shown.splitlines() if line.startswith("Q1.pump_offset")]
+    [bounds, effects] = offset
+    assert bounds[1] == effects[1] == "cm^3/s" and 0.1 < float(effects[2]) < 1e3
+    assert any(line.split()[2] == "-" for line in shown.splitlines() if line.startswith("OUT2.plugging"))

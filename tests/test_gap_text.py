@@ -96,6 +96,15 @@ def test_where_the_plant_as_it_is_remains_plausible_there_may_be_a_gap() -> None
     )
 
 
+def test_a_recording_that_is_only_rounded_may_have_no_gap() -> None:
+    rounded = (ROUNDS, "h1")
+    posterior = [ProbableExplanation((rounded,), 0.7), ProbableExplanation((rounded, ("leak", "T1")), 0.29)]
+    answer = replace(
+        BOTH, verdict="ambiguous", causes=[], ambiguity_set=[e.causes for e in posterior], posterior=posterior
+    )
+    assert verdict_sentence(answer.to_dict()).startswith("There may be a gap; ")
+
+
 def test_an_unknown_is_nothing_to_adopt() -> None:
     alone = replace(BOTH, causes=[Cause(*ODD)])
     assert adopted(nominal_plant(), alone).effects == ()

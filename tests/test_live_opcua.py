@@ -42,12 +42,12 @@ class Plc(ThreadedServer):
             self._server = server
             yield
 
-    def write(self, sample: dict[str, float], bad: tuple[str, ...] = ()) -> None:
-        asyncio.run_coroutine_threadsafe(self._write(sample, bad), self.loop).result(10.0)
+    def write(self, sample: dict[str, float], bad: tuple[str, ...] = (), only: tuple[str, ...] = NAMES) -> None:
+        asyncio.run_coroutine_threadsafe(self._write(sample, bad, only), self.loop).result(10.0)
 
-    async def _write(self, sample: dict[str, float], bad: tuple[str, ...]) -> None:
+    async def _write(self, sample: dict[str, float], bad: tuple[str, ...], only: tuple[str, ...]) -> None:
         ua = asyncua.ua
-        for name in NAMES:
+        for name in only:
             status = ua.StatusCode(ua.StatusCodes.BadSensorFailure if name in bad else ua.StatusCodes.Good)
             value = ua.DataValue(
                 ua.Variant(float(sample[name]), ua.VariantType.Double),
@@ -175,3 +175,19 @@ def test_ctrl_c_ends_the_command(tmp_path: Path, plc: Plc) -> None:
             assert waiting and process.wait(60.0) == 130
         finally:
             process.kill()
+
+
+def test_a_level_that_has_not_changed_for_hours_does_not_set_time_zero(tmp_path: Path, plc: Plc) -> None:
+    """The first value of a node has the time of its last change."""
+    from fdi_torch.config.live_source import LiveRows
+    from fdi_torch.config.monitor_file import load_monitor
+
+    run = load_monitor(config(tmp_path, recording=None, source=source(plc.port)))
+    assert run.config.source is not None
+    moving = tuple(name for name in NAMES if name != "h1")
+    plc.write(MESSAGES[0] | {"t": -10800.0})
+    plc.write(MESSAGES[0], only=moving)
+    rows = LiveRows(run.config.source, run.plant, idle=0.8)
+    plc.write(MESSAGES[1], only=moving)
+    got = [row for row in rows if not isinstance(row, str)]
+    assert [t for t, _, _ in got] == [0.0, 1.0] and rows.origin == START.timestamp()

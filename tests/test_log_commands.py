@@ -109,6 +109,15 @@ def test_compare_says_what_differs_and_whether_results_agree(
     assert {p.name for p in pictures.iterdir()} >= {"compare_cost_1.png", "compare_residual_1.svg"}
 
 
+def test_runs_of_different_kinds_are_compared_without_their_settings(
+    trained: Path, study: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["compare", str(trained), str(study)]) == cli.DONE
+    shown = capsys.readouterr().out
+    assert "the kind of run (Fault diagnosis; Study)" in shown and "settings\n" not in shown
+    assert "estimates\n" in shown and "agree" not in shown
+
+
 def test_a_page_of_several_runs_compares_them(tmp_path: Path) -> None:
     logs = [write_estimate(tmp_path / f"{k}.mcap", v) for k, v in enumerate((0.30, 0.31))]
     assert cli.main(["report", *map(str, logs), "--quiet", "--out", str(tmp_path / "both.html")]) == cli.DONE

@@ -16,6 +16,8 @@ from fdi_torch.config.file_templates import template
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.rehearsal_file import load_rehearsal
 from fdi_torch.config.run_file import load_run
 from fdi_torch.config.study_file import load_study
 from fdi_torch.config.yaml_files import read_yaml, shipped_plants
@@ -48,20 +50,59 @@ def test_from_nothing_to_a_diagnosis_with_new_files_alone(
 @pytest.mark.parametrize("name", shipped_plants())
 def test_every_template_is_a_file_of_its_kind_for_every_shipped_plant(name: str, tmp_path: Path) -> None:
     plant = load_plant(name)
-    paths = {kind: tmp_path / f"{kind}.yaml" for kind in ("plant", "run", "monitor", "study")}
+    paths = {kind: tmp_path / f"{kind}.yaml" for kind in ("plant", "run", "monitor", "rehearsal", "study")}
     for kind, path in paths.items():
         path.write_text(template(kind, plant, name, kind))
         assert "${" not in path.read_text()
     assert load_plant(paths["plant"]).name == "rig"
     assert load_run(paths["run"]).plant == plant and load_monitor(paths["monitor"]).plant == plant
     assert load_study(paths["study"]).plan.trials == 600
+    assert len(load_rehearsal(paths["rehearsal"]).plans) == 2
 
 
-def test_a_new_plant_file_does_not_wait_for_torch(tmp_path: Path) -> None:
+def test_a_plant_file_in_place_of_a_run_file_is_called_one(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(template("plant", load_plant("three_tank"), "", ""))
+    for load in (load_run, load_monitor, load_study, load_rehearsal):
+        with pytest.raises(ConfigError, match=r"got a plant file; .*: fdi new run --plant .*rig.yaml writes one"):
+            load(path)
+
+
+def test_an_effect_of_the_catalogue_is_shown_with_its_parameters() -> None:
+    shown = repr(effects()["pump_lag"])
+    assert shown.startswith("Entry: pump_lag, at a pump or a transfer: A pump ") and "time_constant" in shown
+
+
+def test_a_new_plant_file_does_not_wait_for_the_library_of_units(tmp_path: Path) -> None:
     words = ["-X", "importtime", "-m", "fdi_torch", "new", "plant", "--out", str(tmp_path / "rig.yaml")]
     imported = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True).stderr
-    assert "fdi_torch.cli.screen" in imported and "torch._C" not in imported and "fdi_torch.units" not in imported
+    assert "fdi_torch.cli.screen" in imported and "fdi_torch.units" not in imported
     assert load_plant(tmp_path / "rig.yaml").name == "rig"
+
+
+WITHOUT_TORCH = [
+    *("new plant --out rig.yaml", "new run --out run.yaml", "new monitor --out watch.yaml", "new study --out st.yaml"),
+    *("effects", "effects leak pump_lag", "effects --plant quadruple_tank --json", "completion bash"),
+]
+
+
+@pytest.mark.parametrize("words", WITHOUT_TORCH)
+def test_a_command_that_computes_nothing_does_not_load_torch(words: str, tmp_path: Path) -> None:
+    """A file of `effects` or `plant` writes `torch.Tensor`: `from torch import Tensor` would load torch."""
+    if words.startswith("completion"):
+        pytest.importorskip("shtab")
+    code = "import sys; from fdi_torch.cli import main; main(sys.argv[1:]); sys.exit('torch._C' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code, *words.split()], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout, done.stderr
+
+
+def test_a_quick_command_loads_torch_where_it_needs_it(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text("t_s,Q_l/min,h_cm\n" + "".join(f"{k},{1 + k % 2},{10 + k}\n" for k in range(30)))
+    code = "import sys; from fdi_torch.cli import main; main(sys.argv[1:]); sys.exit('torch._C' not in sys.modules)"
+    words = ["new", "plant", "--recording", "run.csv", "--out", "rig.yaml"]
+    done = subprocess.run([sys.executable, "-c", code, *words], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "h:" in (tmp_path / "rig.yaml").read_text()
 
 
 def test_what_is_commented_out_in_a_new_file_holds_too(tmp_path: Path) -> None:

@@ -159,6 +159,18 @@ def test_a_file_whose_components_share_a_value_is_written_anew_and_that_is_said(
     assert [tank.area for tank in found.tanks] == [pytest.approx(0.021), 0.02]
 
 
+def test_values_of_a_file_with_anchors_have_the_digits_of_their_standard_errors() -> None:
+    shared = TEXT.replace("  A: {area: 0.02 m^2", "  A: &wide {area: 0.02 m^2").replace(
+        "  B:\n    area: 300 cm^2\n    height: 24 in   # rim\n", "  B: *wide\n"
+    )
+    before = read(shared)
+    after = with_constants(before, {"A.area": 0.021123456789, "link.discharge_coefficient": 0.612345678})
+    text, kept = patched_plant(shared, before, after, {"A.area": 0.00012, "link.discharge_coefficient": 0.0034})
+    assert not kept and "123456789" not in text
+    assert "area: 0.02112 m^2" in text and "discharge_coefficient: 0.6123" in text
+    assert [tank.area for tank in read(text).tanks] == [0.02112, 0.02]
+
+
 def test_the_diff_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("rig.yaml").write_text(TEXT)

@@ -76,10 +76,13 @@ def test_a_run_ends_where_a_command_is_unknown_and_begins_anew(
     assert isinstance(listed, list) and [r["rmse"] for r in listed] == [r["rmse"] for r in runs]
 
 
-def test_the_picture_has_both_plants(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_and_picture_have_both_plants(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (folder / "before.yaml").write_text(PLANT.replace("100 cm^2", "80 cm^2"))
-    said(capsys, "novalve.csv", "--picture", "run.svg", "--beside", "before.yaml")
+    words = ["predict", "--plant", "rig.yaml", "novalve.csv", "--picture", "run.svg", "--beside", "before.yaml"]
+    assert main(words) == DONE
     assert (folder / "run.svg").stat().st_size > 5000
+    rows = [line.split() for line in capsys.readouterr().out.splitlines() if " novalve.csv " in line]
+    assert [row[0] for row in rows] == ["rig", "before"] and float(rows[0][4]) < 0.1 * float(rows[1][4])
 
 
 def test_a_plant_that_does_not_explain_the_recording_is_said_first(

@@ -109,6 +109,16 @@ def test_missing_readings() -> None:
     )
 
 
+def test_inputs_that_never_change() -> None:
+    still = healthy()
+    held = replace(still, inputs=still.inputs[:1].expand_as(still.inputs).clone())
+    channels, text = found(check_recording(held, PLANT), "constant input")
+    assert channels == "Q1, Q2" and "never changes" in text
+    one = held.inputs.clone()
+    one[200:, 0] *= 2.0
+    assert not any(f.kind == "constant input" for f in check_recording(replace(held, inputs=one), PLANT).findings)
+
+
 def test_constant_channel() -> None:
     constant = check_recording(with_h1(torch.full((400,), 0.4, dtype=torch.float64)), PLANT)
     assert found(constant, "constant")[1] == "constant at 40 cm: its correlation with anything is undefined"

@@ -8,16 +8,18 @@ from pathlib import Path
 import pytest
 import torch
 
+from fdi_torch.cli.study import _row
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.study_file import Study, load_study
 from fdi_torch.estimate.evolution import EvolutionResult, distant_members
 from fdi_torch.estimate.refinement import starting_points
-from fdi_torch.jobs.study import TRIAL, progress, run_study
+from fdi_torch.jobs.study import TRIAL, StudyResult, progress, run_study
 from fdi_torch.logbook import read_run
+from fdi_torch.quantities import displayed_in
 from fdi_torch.study.mode_isolation import count_modes
 from fdi_torch.study.monte_carlo import Trial, run_block, run_blocks
 from fdi_torch.study.study_plan import Block, Plan, Setting, fault_modes, fixed_faults, mode_faults, uniform_faults
-from fdi_torch.study.summary import column, covered, rms_ratio, rms_with_error, share, summarise
+from fdi_torch.study.summary import Ratio, Score, Summary, column, covered, rms_ratio, rms_with_error, share, summarise
 from fdi_torch.study.trial_readings import limits, make_trials
 
 NOISE = "configs/studies/table3_noise.yaml"
@@ -276,3 +278,15 @@ def test_time_left_is_that_of_the_trials_to_come() -> None:
 def test_what_is_wrong_with_a_study_file_is_said(file: str, change: list[str], sentence: str) -> None:
     with pytest.raises(ConfigError, match=sentence.replace("(", r"\(")):
         load_study(file, change)
+
+
+def test_errors_are_in_the_unit_of_the_plant() -> None:
+    none = Ratio(1.0, 1.0, 1.0)
+    score = Score("free", "Q.pump_offset.size", "m^3/s", -2e-6, 1e-6, 3e-6, None, None, None)
+    summary = Summary("SNR 40 dB", 4, (score,), {"free": 0}, {"free": 0.0}, 4, 0, none)
+    with displayed_in({"m^3/s": "l/min"}):
+        table = StudyResult((summary,), None, {}, 4, 1.0, Path("study.mcap")).table()
+        printed = _row(score)
+    assert table.columns["unit"] == ["l/min"]
+    assert table.columns["bias"] == pytest.approx([-0.12]) and table.columns["RMSE"] == pytest.approx([0.18])
+    assert printed[:5] == ["free", "Q.pump_offset", "l/min", "-0.12 ± 0.12", "0.18"]

@@ -36,7 +36,7 @@ print(done)
 
 size = float(done.result.estimate.value[done.fitting.space.names.index("A.leak.size")])
 leaking = replace(rig, effects=(PlacedEffect("leak", "A", {"size": size}),))
-drawn, axes = figure(1, 2, f"{done.headline}: {size:.3f} (simulated: 0.2)")
+drawn, axes = figure(1, 2, f"{done.headline}, simulated: 0.2")
 for k, axis in enumerate(axes[0]):
     axis.plot(recording.time, 100 * recording.outputs[:, k], ".", color=GREY, markersize=2, label="recording")
     for plant, color, label in ((rig, ORANGE, "without leak"), (leaking, BLUE, "with the leak")):

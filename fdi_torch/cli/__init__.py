@@ -3,9 +3,9 @@
 Exit codes: 0 done, 2 wrong use (explained on standard error), 3 ran but did not converge, 4 converged, but the
 model does not explain the recording, 130 interrupted, 143 terminated.
 A command is a module `options/NAME.py` with its description, its STEP and SUMMARY in the overview, EXAMPLES,
-`add_arguments(parser)` and, if it takes more than a moment to start, LONG = True, and a module `NAME.py` with
-`run(arguments, screen) -> exit code`. The latter is imported after the arguments are parsed, so that help does not wait
-for torch.
+`add_arguments(parser)` and, if it takes more than a moment to start, LONG = True, or, if it usually computes nothing,
+QUICK = True; and a module `NAME.py` with `run(arguments, screen) -> exit code`. The latter is imported after the
+arguments are parsed, so that help does not wait for torch, and a QUICK command loads torch when it first uses it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from contextvars import copy_context
 from pathlib import Path
 from pkgutil import iter_modules
 from types import ModuleType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from fdi_torch.disk import sentence
 from fdi_torch.interruption import Terminated, catch_signals
@@ -107,6 +107,8 @@ def ending(error: KeyboardInterrupt | Terminated) -> str:
 
 def _carried_out(name: str, words: list[str]) -> int:
     arguments = command_parser(name).parse_args(words)
+    if getattr(options_of(name), "QUICK", False):
+        sys.modules.setdefault("torch", _Deferred("torch"))
     _say_that_it_began(name, arguments.quiet)
     command = importlib.import_module(f"fdi_torch.cli.{name}")
     from fdi_torch.cli.screen import Screen
@@ -140,6 +142,20 @@ def _resource_problem(error: Exception) -> str:
             "or without noise; fdi check shows which"
         )
     return ""
+
+
+class _Deferred(ModuleType):
+    """Stands for a library in `sys.modules` until an attribute of it is used, and loads it then.
+
+    `importlib.util.LazyLoader` does not serve: a second `import` of the library loads it.
+    """
+
+    def __getattr__(self, attribute: str) -> Any:
+        if sys.modules.get(self.__name__) is self:
+            del sys.modules[self.__name__]
+        library = importlib.import_module(self.__name__)
+        vars(self).update(vars(library))
+        return getattr(library, attribute)
 
 
 def _say_that_it_began(name: str, quiet: bool) -> None:

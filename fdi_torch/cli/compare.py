@@ -15,7 +15,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import replacing
 from fdi_torch.jobs.report import plant_of
 from fdi_torch.logbook import Comparison, compare, read_run
-from fdi_torch.report.comparison import comparison_section, in_words, result_rows
+from fdi_torch.report.comparison import comparison_section, in_words, result_table
 from fdi_torch.report.comparison_headline import comparison_headline, setting_differences
 from fdi_torch.report.material import Material, gather
 from fdi_torch.report.style import save
@@ -47,17 +47,15 @@ def show(comparison: Comparison, logs: Sequence[str | Path], screen: Screen) -> 
         headline = comparison_headline(comparison, runs)
         for sentence in (*headline, *in_words(comparison)):
             screen.say(sentence)
-        _show_tables(comparison, screen)
+        _show_tables(comparison, runs, screen)
     return runs, headline
 
 
-def _show_tables(comparison: Comparison, screen: Screen) -> None:
+def _show_tables(comparison: Comparison, runs: Sequence[Material], screen: Screen) -> None:
     rows = [[key, *(text[:MOST_TEXT] for text in texts)] for key, texts in setting_differences(comparison).items()]
-    if rows:
+    if rows and len({run.kind for run in runs}) == 1:  # runs of different kinds have different keys
         screen.say()
         screen.table("settings", ("key", *comparison.labels), rows, left=1 + len(comparison.labels))
     if comparison.results:
         screen.say()
-        screen.table(
-            "estimates", ("parameter", "unit", *comparison.labels, "p", "agree"), result_rows(comparison), left=2
-        )
+        screen.table("estimates", *result_table(comparison), left=2)

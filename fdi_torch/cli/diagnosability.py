@@ -6,6 +6,7 @@ Path: cli.diagnosability.run → monitor.monitor_setup.usual_faults → monitor.
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 
 import torch
@@ -20,7 +21,7 @@ from fdi_torch.monitor.monitor_setup import usual_faults
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
-from fdi_torch.quantities import display_unit, parse_quantity
+from fdi_torch.quantities import display_unit, parse_quantity, significant
 from fdi_torch.recording import Recording
 
 
@@ -67,20 +68,33 @@ def _inputs(arguments: argparse.Namespace, plant: PlantDescription) -> tuple[Rec
 
 def _show(report: Diagnosability, screen: Screen) -> None:
     screen.say(f"{report.rank} of {len(report.faults)} faults (or combinations) are determined together")
-    header = ("fault", "unit", "std, all together", "by correlation", "smallest detectable", "smallest isolable")
+    header = ("fault", "unit", "std error", "by correlation", "smallest detectable", "smallest isolable")
     columns = (report.std, report.std_by_correlation, report.smallest_detectable, report.smallest_isolable)
     rows = []
     for name, si_unit, *values in zip(report.faults, report.units, *columns, strict=True):
         unit, scale = display_unit(si_unit, name)
-        rows.append([name, unit or "1", *(f"{scale * value:.3g}" for value in values)])
+        rows.append([name, unit or "1", *(_number(scale * value) for value in values)])
     screen.table("", header, rows, left=2)
     screen.say()
-    shows = [[name, *(f"{v:.3g}" for v in row)] for name, row in zip(report.faults, report.shows, strict=True)]
-    screen.table("effect of one SI unit of each fault, in noise standard deviations", ("fault", *report.sensors), shows)
+    screen.say("std error: of all faults estimated together; by correlation: with the correlation as objective")
     screen.say()
-    apart = [[str(i + 1), name, *(f"{v:.2g}" for v in row)] for i, (name, row) in
+    shows = []
+    for name, si_unit, row in zip(report.faults, report.units, report.shows, strict=True):
+        unit, scale = display_unit(si_unit, name)
+        shows.append([name, unit or "1", *(_number(value / scale) for value in row)])
+    title = (
+        "effect of one unit of each fault on each sensor, in standard deviations of its noise (all samples together)"
+    )
+    screen.table(title, ("fault", "unit", *report.sensors), shows, left=2)
+    screen.say()
+    apart = [[str(i + 1), name, *(f"{v:.2f}" for v in row)] for i, (name, row) in
              enumerate(zip(report.faults, report.apart, strict=True))]  # fmt: skip
     numbers = tuple(str(i + 1) for i in range(len(report.faults)))
     screen.table("sine of the angle between signatures (0: not distinguishable)", ("", "fault", *numbers), apart, 2)
     for sentence in (*report.groups, *report.remarks):
         screen.say(f"- {sentence}")
+
+
+def _number(value: float) -> str:
+    """Three digits; a dash for what the experiment cannot determine or show."""
+    return significant(value, 3) if math.isfinite(value) else "-"

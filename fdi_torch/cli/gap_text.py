@@ -173,8 +173,9 @@ def _constants(constants: Mapping[str, Any], screen: Screen) -> None:
     for name, c in constants.items():
         if max(_tolerances_off(c, stage) for stage in ("recalibrated", "augmented")) > MOVED:
             unit, scale = display_unit(c["unit"], name)
-            numbers = [c["nominal"], c["tolerance"], c["recalibrated"], c["augmented"], c["std"]]
-            rows.append([name, *(f"{scale * v:.4g}" for v in numbers[:4]), f"{scale * numbers[4]:.2g}", unit])
+            numbers = [f"{scale * c[stage]:.4g}" for stage in ("nominal", "tolerance", "recalibrated")]
+            fitted = [rounded(scale * c[stage], scale * c["std"]) for stage in ("augmented", "std")]
+            rows.append([name, *numbers, *fitted, unit])
     if rows:
         header = ("constant", "nominal", "tolerance", "recalibrated", "with the causes", "std error", "unit")
         screen.table(f"constants more than {MOVED:g} tolerances off", header, rows)
@@ -192,6 +193,7 @@ def _confusability(impostors: Mapping[str, Any] | None) -> list[str]:
         return []
     confused, passed, draws = simulated["confused"], simulated["passed"], simulated["draws"]
     return [
-        f"check by simulation: a gap of this size from any of {simulated['rivals']} other causes would be given this "
-        f"name in {confused} of {draws} recordings, or in {passed} if the library lacked that cause"
+        f"reliability of the name: of {draws} simulated recordings with a gap of this size from one of "
+        f"{simulated['rivals']} other causes, {confused} were given this name, and {passed} if the library lacked the "
+        "true cause"
     ]

@@ -17,6 +17,7 @@ NEXT = {
     "plant": "{correct}fdi check --plant {}{recording}",
     "run": "fdi train --config {}",
     "monitor": "fdi monitor --config {}",
+    "rehearsal": "fdi rehearse --config {}",
     "study": "fdi study --config {}",
 }
 
@@ -25,8 +26,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     path = Path(arguments.out or f"{arguments.kind}.yaml")
     if path.suffix not in (".yaml", ".yml"):
         raise ValueError(f"--out: expected a file that ends in .yaml, got {path}; rename it")
-    if arguments.recording and arguments.kind == "study":
-        raise ValueError("--recording: expected it for a plant, run or monitor; a study simulates its own")
+    if arguments.recording and arguments.kind in ("rehearsal", "study"):
+        raise ValueError(f"--recording: expected it for a plant, run or monitor; a {arguments.kind} simulates its own")
     text = _text(arguments, path.stem)
     if path.exists():
         raise ValueError(f"{path}: expected a new file, but it exists; choose another name with --out")

@@ -45,26 +45,26 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     say_first(worst, screen)
     first = f"{arguments.start_samples} samples" if arguments.settle is None else f"{arguments.settle:g} s"
     screen.say(f"free run of {plant.name}, initial levels from the first {first}")
+    other = load_plant(arguments.beside) if arguments.beside else None
+    before = [_predict(other, recording, arguments, vary="") for recording in recordings] if other else []
+    own_name, other_name = _names(plant, other, arguments)
+    rows = [[own_name, *_row(plant, recording, prediction)] for recording, prediction in predictions]
+    rows += [[other_name, *_row(plant, *each)] for each in zip(recordings, before, strict=bool(other))]
+    units = (f"{s.name}, {display_unit(s.unit, s.column)[0] or 'share'}" for s in plant.sensors)
+    header = ("plant", "recording", "from, s", "to, s", *units, "start at")
+    alone = 0 if other else 1  # without the column of plants
     screen.table(
         "root mean square error" + ("" if arguments.settle is None else f" after the first {arguments.settle:g} s"),
-        (
-            "recording",
-            "from, s",
-            "to, s",
-            *(f"{s.name}, {display_unit(s.unit, s.column)[0] or 'share'}" for s in plant.sensors),
-            "start at",
-        ),
-        [_row(plant, recording, prediction) for recording, prediction in predictions],
+        header[alone:],
+        [row[alone:] for row in rows],
+        left=2 - alone,
     )
     for recording, prediction in predictions:
         _own_constants(plant, recording, prediction, screen)
     if arguments.picture:
         recording, prediction = predictions[-1]
-        runs = {plant.name: prediction.readings}
-        if arguments.beside:
-            other = load_plant(arguments.beside)
-            before = _predict(other, recording, arguments, vary="")
-            runs = {_other_name(other, plant, arguments): before.readings} | runs
+        runs = {other_name: before[-1].readings} if before else {}
+        runs[own_name] = prediction.readings
         columns = [sensor.column for sensor in plant.sensors]
         title = misfits[-1].headline(f"free run along {Path(recording.source).name}")
         screen.note(f"picture: {save(fit_figure(recording, runs, title, columns), Path(arguments.picture))}")
@@ -98,8 +98,11 @@ def _recordings(name: str, plant: PlantDescription, arguments: argparse.Namespac
     return [part.recording for part in loaded]
 
 
-def _other_name(other: PlantDescription, plant: PlantDescription, arguments: argparse.Namespace) -> str:
-    return other.name if other.name != plant.name else Path(arguments.beside).stem
+def _names(plant: PlantDescription, other: PlantDescription | None, arguments: argparse.Namespace) -> tuple[str, str]:
+    """Names of the plant and of the one beside it; those of their files if both plants have one name."""
+    if other is None or other.name != plant.name:
+        return plant.name, other.name if other else ""
+    return Path(arguments.plant).stem, Path(arguments.beside).stem
 
 
 def _constants(arguments: argparse.Namespace, plant: PlantDescription) -> dict[str, dict[str, Any]]:
@@ -137,7 +140,10 @@ def _own_constants(plant: PlantDescription, recording: Recording, prediction: Pr
 
 
 def _row(plant: PlantDescription, recording: Recording, prediction: Prediction) -> list[str]:
-    errors = [f"{display_unit(s.unit, s.column)[1] * prediction.rmse[s.name]:.4g}" for s in plant.sensors]
+    errors = [
+        f"{display_unit(s.unit, s.column)[1] * prediction.rmse[s.name]:.4g}" if s.name in prediction.rmse else ""
+        for s in plant.sensors
+    ]
     levels = ", ".join(f"{tank} {quantity_text(level, 'm')}" for tank, level in prediction.start_levels.items())
     times = (f"{float(recording.time[i]):g}" for i in (0, -1))
     return [Path(recording.source).name, *times, *errors, levels]

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import argparse
 
+from fdi_torch.amounts import with_error
 from fdi_torch.cli.options import live, overrides
 from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.config.study_file import load_study
 from fdi_torch.jobs.study import StudyResult, run_study
+from fdi_torch.quantities import significant
 from fdi_torch.study.mode_isolation import Isolation
 from fdi_torch.study.summary import Ratio, Score, Summary
+from fdi_torch.tables import in_display_unit
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -30,7 +33,7 @@ def show(result: StudyResult, screen: Screen) -> None:
     """Print a table per setting, the isolation of modes, and the path of the log."""
     single = len(result.summaries) <= 10
     for summary in result.summaries if single else ():
-        screen.table(heading(summary), HEADER, [_row(score) for score in summary.scores], left=2)
+        screen.table(heading(summary), HEADER, [_row(score) for score in summary.scores], left=3)
         screen.say(ending(summary))
         screen.say()
     if single:
@@ -46,19 +49,21 @@ def show(result: StudyResult, screen: Screen) -> None:
 
 
 HEADER = (
-    *("estimator", "parameter", "bias, SI", "RMSE, SI", "RMSE / bound", "95 %", "RMSE / linearised", "95 %"),
+    *("estimator", "parameter", "unit", "bias", "RMSE", "RMSE / bound", "95 %", "RMSE / linearised", "95 %"),
     *("coverage", "95 %"),
 )
 LEGEND = (
-    "bound: Cramér-Rao bound; linearised: the efficient estimator, which knows the truth; coverage: share of trials "
-    "whose stated 95 % interval contains the truth; 95 %: confidence interval of the number before it"
+    "bias: ± 1.96 of its standard errors; bound: Cramér-Rao bound; linearised: the efficient estimator, which knows "
+    "the truth; coverage: share of trials whose stated 95 % interval contains the truth; 95 %: confidence interval of "
+    "the number before it"
 )
 
 
 def _row(score: Score) -> list[str]:
     ratios = [text for ratio in (score.over_bound, score.over_linearised, score.coverage) for text in _shown(ratio)]
-    bias = f"{score.bias:.2g} ± {1.96 * score.bias_error:.1g}"
-    return [score.estimator, score.parameter.removesuffix(".size"), bias, f"{score.rmse:.3g}", *ratios]
+    unit, bias, error, rmse = in_display_unit(score.parameter, score.unit, score.bias, score.bias_error, score.rmse)
+    size = [with_error(bias, 1.96 * error), significant(rmse, 3)]
+    return [score.estimator, score.parameter.removesuffix(".size"), unit, *size, *ratios]
 
 
 def _shown(ratio: Ratio | None) -> tuple[str, str]:

@@ -1,7 +1,8 @@
-"""Commented minimal runs, monitors and studies of any plant."""
+"""Commented minimal runs, monitors, rehearsals and studies of any plant."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib.resources import files
 from string import Template
 
@@ -11,7 +12,7 @@ from fdi_torch.recordings.csv_writing import header_of
 
 
 def template(kind: str, plant: PlantDescription, plant_file: str, name: str, recording: str | None = None) -> str:
-    """The text of a new run, monitor or study.
+    """The text of a new run, monitor, rehearsal or study.
 
     plant: the plant of the file; plant_file: its entry under the key `plant`; name: of the run. recording: the file
     that it reads; None for one of the name of the run, whose header is then told.
@@ -32,19 +33,24 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str, rec
         plugging=plugging,
         constant=constant,
         inputs=_inputs(plant),
+        channels=", ".join(plant.channels()),
+        commands=", ".join(_shares(plant, channel, (0.4,))[0] for channel in plant.channels()),
     )
 
 
 def _inputs(plant: PlantDescription) -> str:
     """For each pump and transfer a step up and a step down about half of its range; valves are open."""
-    full_commands = {c.channel: (c.full_command, c.command_unit) for c in plant.metered_flows()}
     lines = []
     for channel in plant.channels():
-        if channel not in full_commands:
-            lines.append(f"    {channel}: 1")
-            continue
-        high, unit = full_commands[channel]
-        levels = [quantity_text(share * high, unit, 3) for share in (0.4, 0.5, 0.3)]
-        steps = ", ".join(f"[{t} s, {level}]" for t, level in zip((0, 200, 400), levels, strict=True))
-        lines.append(f"    {channel}: {{steps: [{steps}]}}")
+        steps = zip((0, 200, 400), _shares(plant, channel, (0.4, 0.5, 0.3)), strict=False)
+        listed = [f"[{t} s, {level}]" for t, level in steps]
+        lines.append(f"    {channel}: " + ("1" if len(listed) == 1 else f"{{steps: [{', '.join(listed)}]}}"))
     return "\n".join(lines)
+
+
+def _shares(plant: PlantDescription, channel: str, shares: Sequence[float]) -> list[str]:
+    """Commands that are these shares of a pump's or transfer's range; of a valve, fully open."""
+    full = {c.channel: (c.full_command, c.command_unit) for c in plant.metered_flows()}
+    return (
+        [quantity_text(share * full[channel][0], full[channel][1], 3) for share in shares] if channel in full else ["1"]
+    )

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
 
 from fdi_torch.config.strict import quantity
 from fdi_torch.config.written_units import written_units
@@ -27,8 +26,10 @@ from fdi_torch.plant.description import (
 )
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.plant.scales import emptying_time
-from fdi_torch.simulate.ode import Inputs, PlantOde
 from fdi_torch.tables import Table
+
+if TYPE_CHECKING:
+    from fdi_torch.simulate.ode import Inputs, PlantOde
 
 Read = Callable[[Any, str], float]
 """A function from a value as written and its SI unit to its SI value."""
@@ -105,7 +106,7 @@ class Plant(PlantDescription):
     def ode(
         self,
         inputs: Inputs,
-        theta: Mapping[str, float | Tensor] | None = None,
+        theta: Mapping[str, float | torch.Tensor] | None = None,
         *,
         resolution: float | None = None,
     ) -> PlantOde:
@@ -117,6 +118,8 @@ class Plant(PlantDescription):
         Raises ValueError for an unknown parameter, and for actuators with memory or dead time.
         """
         named = theta or {}
+        from fdi_torch.simulate.ode import PlantOde
+
         network = build_network(self, placements_for(named))
         space = ParameterSpace(network.constants[name] for name in named)
         columns = torch.broadcast_tensors(*(torch.as_tensor(v, dtype=torch.float64) for v in named.values()))

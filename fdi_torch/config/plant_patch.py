@@ -35,14 +35,21 @@ def patched_plant(
 
     text: the file from which `before` was read. errors: standard errors by full name, SI. Numbers are written in the
     unit of the text with as many digits as show two digits of the error, those without an error with `DIGITS`. If the
-    changes cannot be located in the text (anchors shared by several components), the file is written anew.
+    changes cannot be located in the text (anchors shared by several components), they are made in the plant written
+    anew.
     """
-    changed = _edited(text, before, after, {})
+    for source in (text, dump_plant(before)):
+        if _describes(_edited(source, before, after, {}), after):
+            return _edited(source, before, after, errors or {}), source == text
+    return dump_plant(after), False
+
+
+def _describes(text: str, plant: PlantDescription) -> bool:
+    """Whether the text is a plant file of this plant, up to rounding."""
     try:
-        kept = _equal(build_plant({"name": after.name, **parse_yaml(changed.encode(), "patched")}, "patched"), after)
+        return _equal(build_plant({"name": plant.name, **parse_yaml(text.encode(), "patched")}, "patched"), plant)
     except ConfigError:
-        kept = False
-    return (_edited(text, before, after, errors or {}), True) if kept else (dump_plant(after), False)
+        return False
 
 
 def _edited(text: str, before: PlantDescription, after: PlantDescription, errors: Mapping[str, float]) -> str:

@@ -51,7 +51,9 @@ def _sentence(finding: Any, known: Sequence[str]) -> str:
     if "error" in finding.get("ctx", {}):
         return f"{finding['ctx']['error']}{_elsewhere(finding['ctx']['error'], known)}"
     if finding["type"] in ("list_type", "tuple_type"):
-        return f"expected a list, as in [{finding['input']}], got {_shown(finding['input'])}"
+        given = finding["input"]
+        values = ", ".join(map(str, given.values())) if isinstance(given, dict) else given
+        return f"expected a list, as in [{values}], got {_shown(given)}"
     if finding["type"] in ("dict_type", "model_type"):
         return f"expected keys with values, got {_shown(finding['input'])}"
     expected = finding["msg"].replace("Input should be", "expected").replace("Input should have", "expected")

@@ -79,7 +79,9 @@ class RivalConfig(Strict):
 
 class RehearsalConfig(Strict):
     plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
-    inputs: list[str] = Field(description="constant commands, one per channel")
+    inputs: list[str | float] = Field(
+        description="list of constant commands, one per channel of the plant, in its order"
+    )
     reading_noise: str = Field("1 mm", description="standard deviation: 1 mm (of the level), or h1 = 1 mm, p2 = 2 mV")
     sampling: ScaledSeconds = Field(1.0, gt=0, description="sampling interval, s")
     false_alarms_every: ScaledSeconds = Field(20000.0, description="design mean time between false alarms, s")
@@ -145,7 +147,7 @@ def _inputs(c: RehearsalConfig, plant: PlantDescription) -> torch.Tensor:
     units = plant.channel_units()
     if len(c.inputs) != len(units):
         raise ValueError(f"inputs: expected {len(units)} ({', '.join(units)}), got {len(c.inputs)}")
-    amounts = [parse_quantity(text, unit) for text, unit in zip(c.inputs, units.values(), strict=True)]
+    amounts = [parse_quantity(str(text), unit) for text, unit in zip(c.inputs, units.values(), strict=True)]
     return torch.tensor(amounts, dtype=torch.float64)
 
 

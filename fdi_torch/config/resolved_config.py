@@ -71,9 +71,15 @@ class ResolvedFile(Generic[AnyConfig]):
 
 
 def values_in(path: str | Path, overrides: Iterable[str] = ()) -> tuple[dict[str, Any], Path]:
-    """The mapping of a file with overrides, and the file's path. Raises ConfigError."""
+    """The mapping of a file with overrides, and the file's path. Raises ConfigError, also for a plant file."""
     file = find_file(str(path), Path.cwd())
-    return with_overrides(read_extended(file), overrides), file
+    data = read_extended(file)
+    if "tanks" in data:
+        text = (
+            "expected a run, monitor, study or rehearsal file, got a plant file; name it under the key plant of such a"
+        )
+        raise ConfigError([f"{file}: {text} file: fdi new run --plant {path} writes one (fdi new --help)"])
+    return with_overrides(data, overrides), file
 
 
 def resolve(

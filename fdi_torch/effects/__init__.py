@@ -6,11 +6,14 @@ from collections.abc import Collection, Iterable
 from dataclasses import replace
 from difflib import get_close_matches
 from importlib import import_module
+from typing import TYPE_CHECKING
 
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription, with_tolerances
 from fdi_torch.plant.effect import Effect, Placement, fits, place_kind, place_kinds_of
-from fdi_torch.plant.network import TankNetwork
+
+if TYPE_CHECKING:
+    from fdi_torch.plant.network import TankNetwork
 
 
 def _loaded(name: str) -> Effect:
@@ -64,6 +67,8 @@ def build_network(plant: PlantDescription, placements: Iterable[Placement] = ())
 
     A further placement is ignored if the plant already has that effect at that place.
     """
+    from fdi_torch.plant.network import TankNetwork  # a module of torch, which the catalogue does without
+
     known = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     prefixes = {p.prefix for p in known}
     return TankNetwork(plant, [*known, *(p for p in placements if p.prefix not in prefixes)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.effect import Clock, Effect, Memory, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.metered_flow import MeteredFlow
@@ -32,10 +31,10 @@ class ActuatorSlew(Effect):
         slowest = 120.0 * time_scale(plant) / actuator.full_command
         return (Parameter("slowness", SLOWNESS_UNITS[unit], 0.0, 0.0, slowest, meaning="time to move by one unit"),)
 
-    def steady_memory(self, value: Tensor, p: Values) -> Memory:
+    def steady_memory(self, value: torch.Tensor, p: Values) -> Memory:
         return (value,)
 
-    def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def command(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         gap = memory[0] - value
         needed = torch.abs(gap) * p["slowness"] / clock.step
         moving = torch.clamp(needed, max=1.0)  # share of the step in which it moves

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.effects.stuck import Stuck
 from fdi_torch.plant.effect import Clock, Memory, Stage, Values
@@ -21,5 +21,5 @@ class ActuatorStuck(Stuck):
     places = ("pump", "valve")
     mistaken_for = ("pump_gain", "pump_saturation", "valve_dead_zone", "valve_leak", "actuator_slew")
 
-    def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def command(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         return self.hold(value, memory, clock.share_after(p["onset"]), p)

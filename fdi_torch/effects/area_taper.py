@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
 
@@ -32,5 +31,5 @@ class AreaTaper(Effect):
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         return [{"taper": s, "reference": r} for r in (0.5, 0.0) for s in (0.16, -0.16)]
 
-    def area(self, area: Tensor, local: Local, p: Values) -> Tensor:
+    def area(self, area: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return area * torch.clamp(1.0 + p["taper"] * (local.level / local.height - p["reference"]), min=0.05)

@@ -28,8 +28,8 @@ _ANY = PlantDescription(
 _ONSETS = ("onset", "begin")
 
 
-@dataclass(frozen=True)
-class Entry:
+@dataclass(frozen=True, repr=False)
+class Entry(Shown):
     """One effect of the catalogue.
 
     meaning: one sentence. law: equation and source. kinds: kinds of component. at: the places of the plant. parameters:
@@ -44,6 +44,10 @@ class Entry:
     at: tuple[str, ...]
     parameters: tuple[Parameter, ...]
     mistaken_for: tuple[str, ...]
+
+    @property
+    def headline(self) -> str:
+        return f"{self.name}, at a {' or a '.join(self.kinds)}: {self.meaning}"
 
     @property
     def begins(self) -> str:

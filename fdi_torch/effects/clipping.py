@@ -6,7 +6,6 @@ import math
 from typing import ClassVar
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.constants import reading_at
 from fdi_torch.plant.effect import Effect, OperatingRange, Parameter, PlantDescription, Stage, Values
@@ -49,7 +48,7 @@ class ReadingLimit(Effect):
         return [{"limit": limit} for limit in interior_points(half, 5)]
 
 
-def clipping_bias(beyond: Tensor, p: Values) -> Tensor:
+def clipping_bias(beyond: torch.Tensor, p: Values) -> torch.Tensor:
     """Distance of the mean of a clipped noisy reading from the clipped level, towards the inside, in the reading's
     unit.
 

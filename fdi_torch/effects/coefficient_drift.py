@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import time_scale
@@ -31,11 +30,11 @@ class CoefficientDrift(Effect):
             Parameter("settling", "1/s", 0.0, slowing, settled, meaning="rate at which the change settles"),
         )
 
-    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+    def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * torch.clamp(1.0 + p["rate"] * _elapsed(local.clock.middle, p["settling"]), min=0.0)
 
 
-def _elapsed(time: Tensor, settling: Tensor) -> Tensor:
+def _elapsed(time: torch.Tensor, settling: torch.Tensor) -> torch.Tensor:
     """(1 - exp(-b t))/b, s; the series t (1 - b t/2 + (b t)^2/6) for small b t, where the difference would cancel."""
     x = settling * time
     small = x.abs() < SMALL

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.effects.laminar_flow import torricelli_share
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
@@ -49,7 +48,7 @@ class CrossFlow(Effect):
         narrow = {"size": 0.1, "transition_head": 0.05 * NARROWEST * _lowest_rim(place, plant)}
         return [narrow, *({"size": 0.1, "height": height} for height in heights)]
 
-    def inflow(self, local: Local, p: Values) -> Tensor:
+    def inflow(self, local: Local, p: Values) -> torch.Tensor:
         near = torch.clamp(local.level - p["height"], min=0.0)
         far = torch.clamp(local.far_level - p["height"], min=0.0)
         head = near - far

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import length_scale, time_scale
@@ -32,5 +32,5 @@ class Evaporation(Effect):
         fastest = 2e-5 * length_scale(plant) / time_scale(plant)
         return (Parameter("rate", "m/s", 0.0, 0.0, fastest, meaning="fall of the level in a still tank"),)
 
-    def inflow(self, local: Local, p: Values) -> Tensor:
+    def inflow(self, local: Local, p: Values) -> torch.Tensor:
         return -p["rate"] * local.constants["area"]

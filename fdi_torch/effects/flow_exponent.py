@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.constants import source_height
 from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
@@ -32,6 +31,6 @@ class FlowExponent(Effect):
             Parameter("reference", "m", typical, low, high, meaning="head at which the flow is the nominal one"),
         )
 
-    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+    def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         # exp(n log x): a power with a tensor exponent differs in its last bit alone and in a batch.
         return flow * torch.exp(p["excess"] * torch.log(local.magnitude(local.head) / p["reference"]))

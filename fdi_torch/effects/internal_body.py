@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
 
@@ -43,7 +42,7 @@ class InternalBody(Effect):
             for at, tall in sections
         ]
 
-    def area(self, area: Tensor, local: Local, p: Values) -> Tensor:
+    def area(self, area: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         edge = EDGE_SHARE * local.height
         above_bottom = torch.clamp((local.level - p["bottom"]) / edge + 0.5, 0.0, 1.0)
         above_top = torch.clamp((local.level - p["bottom"] - p["height"]) / edge + 0.5, 0.0, 1.0)

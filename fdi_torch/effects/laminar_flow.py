@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.constants import source_height
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
@@ -43,11 +42,11 @@ class LaminarFlow(Effect):
         kink = {"transition_head": lowest + (highest - lowest) / 3, "softness": 0.03}
         return [*({"transition_head": low, "softness": s} for s in (0.67, 0.33, 0.125)), kink]
 
-    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+    def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * torricelli_share(p["transition_head"] / local.magnitude(local.head), p["softness"])
 
 
-def torricelli_share(ratio: Tensor, softness: Tensor | float) -> Tensor:
+def torricelli_share(ratio: torch.Tensor, softness: torch.Tensor | float) -> torch.Tensor:
     """The flow relative to Torricelli's law, (1 + ratio^(1/2s))^(-s), for ratio = transition head / head and softness
     s.
     """

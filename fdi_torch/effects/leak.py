@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.operating_range import interior_points, onset_grid
@@ -38,6 +37,6 @@ class Leak(Effect):
         opened = [{"size": 0.1, "onset": instant} for instant in onset_grid(operating_range)]
         return [{"size": 0.1}, *at_height, *opened, growing]
 
-    def inflow(self, local: Local, p: Values) -> Tensor:
+    def inflow(self, local: Local, p: Values) -> torch.Tensor:
         head = torch.clamp(local.level - p["height"], min=0.0)
         return -p["size"] * local.clock.risen(p["onset"], p["ramp"]) * local.capacity * local.root(head)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
 
@@ -23,5 +23,5 @@ class NetOutlet(Effect):
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("size", "1", 1.0, -1.0, 2.0, meaning="net outflow relative to the outlet's law"),)
 
-    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+    def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * p["size"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.constants import source_height
 from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
@@ -24,5 +24,5 @@ class OutletDrop(Effect):
         far = 0.3 * source_height(plant, place)
         return (Parameter("drop", "m", 0.0, -far, far, meaning="distance below the zero of the level"),)
 
-    def head(self, head: Tensor, local: Local, p: Values) -> Tensor:
+    def head(self, head: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return head + p["drop"]

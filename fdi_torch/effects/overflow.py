@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.operating_range import interior_points
@@ -53,14 +53,14 @@ class Overflow(Effect):
         shares = [{}, *({f"to_{name}": 0.7} for name in others)]
         return [{"below_rim": max(d, 0.0), "crest": 0.03} | share for d in depths for share in shares]
 
-    def inflow(self, local: Local, p: Values) -> Tensor:
+    def inflow(self, local: Local, p: Values) -> torch.Tensor:
         over_rim = local.level - local.height
         return self._weir(over_rim, local, p["crest"]) - self._weir(over_rim + p["below_rim"], local, p["crest"])
 
-    def recipients(self, p: Values) -> Mapping[str, Tensor]:
+    def recipients(self, p: Values) -> Mapping[str, torch.Tensor]:
         return {name.removeprefix("to_"): share for name, share in p.items() if name.startswith("to_")}
 
-    def _weir(self, above: Tensor, local: Local, crest: Tensor) -> Tensor:
+    def _weir(self, above: torch.Tensor, local: Local, crest: torch.Tensor) -> torch.Tensor:
         area = local.constants["area"]
         strength = rim_strength(area, local.gravity) * crest
         return weir_flow(above, local.net, area, strength, local.clock.resolution)

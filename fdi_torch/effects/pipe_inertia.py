@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.constants import source_height
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
@@ -42,16 +41,16 @@ class PipeInertia(Effect):
         unit = time_scale(plant) * _length_per_second(plant, place)
         return [{"length": factor * unit} for factor in STARTS]
 
-    def steady_states(self, flow: Tensor, local: Local, p: Values) -> tuple[Tensor, ...]:
+    def steady_states(self, flow: torch.Tensor, local: Local, p: Values) -> tuple[torch.Tensor, ...]:
         return (flow / _flow_of_unit_state(local),)
 
-    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+    def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         column = _Column.of(flow, local, p)
         time_constant = column.time_constant
         share = time_constant / torch.maximum(time_constant, local.clock.resolution)
         return flow + share * (column.delayed - flow)
 
-    def state_rates(self, flow: Tensor, local: Local, p: Values) -> tuple[Tensor, ...]:
+    def state_rates(self, flow: torch.Tensor, local: Local, p: Values) -> tuple[torch.Tensor, ...]:
         column, resolution = _Column.of(flow, local, p), local.clock.resolution
         rate = (flow - column.delayed) / torch.maximum(column.time_constant, resolution)
         return ((rate + column.unsmoothed(flow, local)) / _flow_of_unit_state(local),)
@@ -65,14 +64,14 @@ class _Column:
     where both have one sign. least: friction of the smoothed root at zero head, K sqrt(w), m^3/s.
     """
 
-    delayed: Tensor
-    inertia: Tensor
-    friction: Tensor
-    least: Tensor
-    squared_capacity: Tensor
+    delayed: torch.Tensor
+    inertia: torch.Tensor
+    friction: torch.Tensor
+    least: torch.Tensor
+    squared_capacity: torch.Tensor
 
     @classmethod
-    def of(cls, flow: Tensor, local: Local, p: Values) -> _Column:
+    def of(cls, flow: torch.Tensor, local: Local, p: Values) -> _Column:
         delayed = local.states[0] * _flow_of_unit_state(local)
         nominal, least = local.capacity * local.command, local.capacity * torch.sqrt(local.width)
         at_rest = NO_FLOW * least
@@ -85,10 +84,10 @@ class _Column:
         return cls(delayed, inertia, friction, least, squared_capacity)
 
     @property
-    def time_constant(self) -> Tensor:
+    def time_constant(self) -> torch.Tensor:
         return self.inertia / (self.friction + self.least)
 
-    def unsmoothed(self, flow: Tensor, local: Local) -> Tensor:
+    def unsmoothed(self, flow: torch.Tensor, local: Local) -> torch.Tensor:
         """Further rate of change of the flow without the smoothing of the root, m^3/s^2.
 
         A column that the integrator resolves needs no smoothing: its head acts on the rate, and the rate is finite.
@@ -100,7 +99,7 @@ class _Column:
         return torch.where(driven, resolved * missing, 0.0) / torch.maximum(self.inertia, smallest)
 
 
-def _flow_of_unit_state(local: Local) -> Tensor:
+def _flow_of_unit_state(local: Local) -> torch.Tensor:
     """Flow per unit of the state, m^2/s: the state is the tank's height where the flow is that of the full tank."""
     return local.capacity / torch.sqrt(local.height)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.operating_range import onset_grid
@@ -31,5 +31,5 @@ class Plugging(Effect):
         times = [{}, *({"onset": instant} for instant in onset_grid(operating_range))]
         return [{"size": size} | onset for onset in times for size in (0.1, -0.1)]
 
-    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+    def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * (1.0 - p["size"] * local.clock.risen(p["onset"], p["ramp"]))

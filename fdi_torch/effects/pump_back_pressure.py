@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
 
@@ -28,6 +27,6 @@ class PumpBackPressure(Effect):
             Parameter("droop", "1", 1.0, 1.0, 3.0, meaning="exponent of the level"),
         )
 
-    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+    def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         share = torch.clamp(local.level / local.height, min=DRY)
         return flow * torch.clamp(1.0 - p["loss"] * torch.exp(p["droop"] * torch.log(share)), min=0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
 
@@ -22,5 +22,5 @@ class PumpCurve(Effect):
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("bend", "1", 0.0, -0.95, 0.95, meaning="relative extra flow at small commands"),)
 
-    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+    def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * (1.0 + p["bend"] * (1.0 - flow / local.constants["max_flow"]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.operating_range import interior_points
@@ -34,5 +33,5 @@ class PumpCutOut(Effect):
         least = 0.05 * tank.height
         return [{"level": max(level, least)} for level in interior_points((0.5 * (low + high), high), 4)]
 
-    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+    def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * torch.clamp((p["level"] - local.level) / (EDGE_SHARE * local.height), 0.0, 1.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
 
@@ -29,6 +28,6 @@ class PumpDeadZone(Effect):
         full = plant.metered_flow(place).full_command
         return [{"dead_zone": share * full} for share in (0.03, 0.1, 0.25, 0.5, 0.9)]
 
-    def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def command(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         # At command 0 and dead zone 0 the clamp alone would have a slope, although a pump at rest cannot deliver less.
         return torch.where(value > 0.0, torch.clamp(value - p["dead_zone"], min=0.0), torch.zeros_like(value)), memory

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.effect import Effect, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import time_scale
@@ -24,5 +24,5 @@ class PumpDelay(Effect):
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("delay", "s", 0.0, 0.0, 60.0 * time_scale(plant), meaning="dead time of the pump"),)
 
-    def delay(self, p: Values) -> Tensor:
+    def delay(self, p: Values) -> torch.Tensor:
         return p["delay"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
 
@@ -36,5 +36,5 @@ class PumpGain(Effect):
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         return [{"factor": 0.9}, {"factor": 1.1}]
 
-    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+    def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * (1.0 + (p["factor"] - 1.0) * local.clock.risen(p["onset"], p["ramp"]))

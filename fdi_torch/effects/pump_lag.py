@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.effect import Clock, Effect, Memory, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import time_scale
@@ -27,10 +27,10 @@ class PumpLag(Effect):
         slowest = 60.0 * time_scale(plant)
         return (Parameter("time_constant", "s", 0.0, 0.0, slowest, meaning="time to 63 % of a step"),)
 
-    def steady_memory(self, value: Tensor, p: Values) -> Memory:
+    def steady_memory(self, value: torch.Tensor, p: Values) -> Memory:
         return (value,)
 
-    def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def command(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         gap = memory[0] - value
         decay = clock.decay(p["time_constant"])
         mean = value + gap * (p["time_constant"] / clock.step) * (1.0 - decay)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
 
@@ -25,5 +24,5 @@ class PumpOffset(Effect):
         far = 0.5 * pump.max_flow
         return (Parameter("offset", "m^3/s", 0.0, -far, far, meaning="additional flow"),)
 
-    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+    def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return torch.clamp(flow + p["offset"], min=0.0)

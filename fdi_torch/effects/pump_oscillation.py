@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import time_scale
@@ -33,5 +33,5 @@ class PumpOscillation(Effect):
         periods = [time_scale(plant) * seconds for seconds in (10.0, 30.0, 60.0, 120.0, 300.0)]
         return [{"amplitude": 0.1, "period": period, "phase": phase} for period in periods for phase in (-1.5, 1.5)]
 
-    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+    def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * (1.0 + p["amplitude"] * local.clock.sine(p["period"], p["phase"]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import time_scale
@@ -61,12 +60,12 @@ class PumpPriming(Effect):
         pump = plant.metered_flow(place)
         return [{"volume": seconds * time_scale(plant) * pump.max_flow / pump.gain} for seconds in STARTS]
 
-    def steady_memory(self, value: Tensor, p: Values) -> Memory:
+    def steady_memory(self, value: torch.Tensor, p: Values) -> Memory:
         pumped = value * p["ran_for"]
         # At command 0 and volume 0 both arguments of the minimum are 0 and would share the slope.
         return (torch.where(value > 0.0, torch.minimum(p["volume"] + 0.0 * pumped, pumped), torch.zeros_like(pumped)),)
 
-    def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def command(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         missing = torch.clamp(p["volume"] - memory[0], min=0.0)
         filling = (1.0 - p["passed"]) * value * clock.step
         taken = torch.where(value > 0.0, torch.minimum(missing, filling), torch.zeros_like(missing * filling))

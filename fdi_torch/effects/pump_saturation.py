@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.operating_range import interior_points
@@ -38,7 +37,7 @@ class PumpSaturation(Effect):
         commanded = tuple(min(max(pump.gain * u, 0.0), pump.max_flow) for u in operating_range.commands[pump.channel])
         return [{"limit": limit, "knee": 0.1} for limit in interior_points((commanded[0], commanded[1]), 7)]
 
-    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+    def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         least = torch.minimum(flow, p["limit"])
         share = least / torch.clamp(torch.maximum(flow, p["limit"]), min=DRY)
         round_off = p["knee"] * (1.0 - p["limit"] / local.constants["max_flow"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
@@ -35,5 +35,5 @@ class SensorBias(Effect):
         bias = 0.02 * reading_span(plant, sensor)
         return [{"bias": bias}, {"bias": -bias}]
 
-    def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         return value + p["bias"] * clock.risen_by_end(p["onset"], p["ramp"]), memory

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.constants import reading_at, reading_span
 from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
@@ -36,5 +36,5 @@ class SensorCurvature(Effect):
         sensor = plant.sensor(place)
         return [{"bend": share / reading_span(plant, sensor)} for share in (0.1, -0.1)]
 
-    def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         return value + p["bend"] * (value - p["middle"]) * (value - p["middle"]), memory

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.effect import Clock, Effect, Memory, Parameter, PlantDescription, Stage, Values
@@ -27,5 +27,5 @@ class SensorDrift(Effect):
             Parameter("rate", f"{sensor.unit}/s", 0.0, -rate, rate, meaning="rate of change of the reading's error"),
         )
 
-    def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         return value + p["rate"] * clock.end, memory

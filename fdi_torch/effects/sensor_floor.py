@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.effects.clipping import ReadingLimit, clipping_bias
 from fdi_torch.plant.effect import Clock, Memory, Values
@@ -21,5 +20,5 @@ class SensorFloor(ReadingLimit):
     upper = False
     mistaken_for = ("sensor_bias", "outlet_drop", "sensor_curvature")
 
-    def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         return torch.maximum(value, p["limit"]) + clipping_bias(p["limit"] - value, p), memory

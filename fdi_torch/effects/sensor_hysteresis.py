@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.effect import Clock, Effect, Memory, Parameter, PlantDescription, Stage, Values
@@ -27,10 +26,10 @@ class SensorHysteresis(Effect):
         high = 0.1 * reading_span(plant, sensor)
         return (Parameter("play", sensor.unit, 0.0, 0.0, high, meaning="half the width of the band"),)
 
-    def steady_memory(self, value: Tensor, p: Values) -> Memory:
+    def steady_memory(self, value: torch.Tensor, p: Values) -> Memory:
         return (value,)
 
-    def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         distance = memory[0] - value
         # A clamp to -play..play would lose its slope at a play of 0, where both limits coincide.
         lag = torch.sign(distance) * torch.minimum(torch.abs(distance), p["play"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.effect import Clock, Effect, Memory, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.scales import time_scale
@@ -25,10 +25,10 @@ class SensorLag(Effect):
         slowest = 60.0 * time_scale(plant)
         return (Parameter("time_constant", "s", 0.0, 0.0, slowest, meaning="time to 63 % of a step"),)
 
-    def steady_memory(self, value: Tensor, p: Values) -> Memory:
+    def steady_memory(self, value: torch.Tensor, p: Values) -> Memory:
         return value, value
 
-    def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         last_output, last_input = memory
         decay = clock.decay(p["time_constant"])
         slope_lag = (value - last_input) * (p["time_constant"] / clock.step) * (1.0 - decay)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
@@ -40,5 +39,5 @@ class SensorOscillation(Effect):
         periods = [time_scale(plant) * seconds for seconds in (5.0, 10.0, 30.0, 60.0, 120.0, 300.0)]
         return [{"amplitude": amplitude, "period": t, "phase": phase} for t in periods for phase in (-1.5, 1.5)]
 
-    def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         return value + p["amplitude"] * torch.sin(2.0 * math.pi * clock.end / p["period"] + p["phase"]), memory

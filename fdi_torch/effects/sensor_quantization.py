@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.effect import Effect, OperatingRange, Parameter, PlantDescription, Stage, Values
@@ -32,5 +32,5 @@ class SensorQuantization(Effect):
         sensor = plant.sensor(place)
         return [{"step": share * reading_span(plant, sensor)} for share in (0.001, 0.003, 0.01, 0.03)]
 
-    def resolution(self, p: Values) -> Tensor:
+    def resolution(self, p: Values) -> torch.Tensor:
         return p["step"]

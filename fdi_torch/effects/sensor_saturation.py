@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.effects.clipping import ReadingLimit, clipping_bias
 from fdi_torch.plant.effect import Clock, Memory, Values
@@ -22,5 +21,5 @@ class SensorSaturation(ReadingLimit):
     upper = True
     mistaken_for = ("overflow", "pump_cut_out", "sensor_curvature")
 
-    def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         return torch.minimum(value, p["limit"]) - clipping_bias(value - p["limit"], p), memory

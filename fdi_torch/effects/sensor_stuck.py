@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.effects.stuck import Stuck
 from fdi_torch.plant.effect import Clock, Memory, Stage, Values
@@ -20,5 +20,5 @@ class SensorStuck(Stuck):
     places = ("sensor",)
     mistaken_for = ("sensor_gain", "sensor_curvature", "sensor_saturation", "sensor_hysteresis")
 
-    def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         return self.hold(value, memory, clock.risen_by_end(p["onset"], clock.step * 0.0), p)

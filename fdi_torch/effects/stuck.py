@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.effect import Effect, Memory, OperatingRange, Parameter, PlantDescription, Values
 from fdi_torch.plant.operating_range import interior_points
@@ -25,10 +25,10 @@ class Stuck(Effect):
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         return [{"size": 0.9, "onset": onset} for onset in (0.0, *interior_points((0.0, operating_range.duration), 5))]
 
-    def steady_memory(self, value: Tensor, p: Values) -> Memory:
+    def steady_memory(self, value: torch.Tensor, p: Values) -> Memory:
         return (value,)
 
-    def hold(self, value: Tensor, memory: Memory, share: Tensor, p: Values) -> tuple[Tensor, Memory]:
+    def hold(self, value: torch.Tensor, memory: Memory, share: torch.Tensor, p: Values) -> tuple[torch.Tensor, Memory]:
         """The partly held value and the new memory; share: of the step, after the onset."""
         held = value + share * (memory[0] - value)
         return value + p["size"] * share * (held - value), (held,)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.constants import flow_scale
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
@@ -42,7 +42,7 @@ class UnmeteredFlow(Effect):
             for sign in (-1.0, 1.0)
         ]
 
-    def inflow(self, local: Local, p: Values) -> Tensor:
+    def inflow(self, local: Local, p: Values) -> torch.Tensor:
         begun = local.clock.share_after(p["begin"])
         ended = local.clock.share_after(p["begin"] + p["duration"])
         return p["flow"] * (begun - ended)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.effect import Clock, Effect, Memory, Parameter, PlantDescription, Stage, Values
 
@@ -25,6 +24,6 @@ class ValveCharacteristic(Effect):
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("bend", "1", 0.0, -0.8, 4.0, meaning="exponent of the opening less 1"),)
 
-    def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def command(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         opening = torch.clamp(value, 0.0, 1.0)
         return opening * torch.exp(p["bend"] * torch.log(torch.clamp(opening, min=LEAST_OPENING))), memory

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
 
@@ -26,5 +25,5 @@ class ValveDeadZone(Effect):
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         return [{"dead_zone": opening} for opening in (0.05, 0.15, 0.3, 0.5)]
 
-    def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def command(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         return torch.clamp(value - p["dead_zone"], min=0.0) / (1.0 - p["dead_zone"]), memory

@@ -58,9 +58,9 @@ def log_law_error(error: float) -> float:
 def log_odds_of_law(error: float | None, choices: int, places: int) -> float:
     """Log odds that a deviation is an effect whose law has this relative error, against a law that no library has.
 
-    error: None if it is not noticeable. choices: number of possible pairs of effect and place. places: number of
-    places. The error of the law is normal. The difference of another law of the same size is at most twice that size,
-    and uniform up to it.
+    error: None if the readings cannot show an error of the law. choices: number of possible pairs of effect and place.
+    places: number of places. The error of the law is normal. The difference of another law of the same size is at most
+    twice that size, and uniform up to it.
     """
     density = math.log(2.0 * 2.0 / (ODDS.law_error * math.sqrt(2.0 * math.pi)))
     law = density + (math.log1p(-ODDS.inexact) if error is None else log_law_error(error))

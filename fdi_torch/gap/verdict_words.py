@@ -91,7 +91,7 @@ def _verdict(answer: Named, best: str) -> str:
         return f"The gap comes from {best}{chance}."
     if verdict == "ambiguous":
         explanations = answer.get("ambiguity_set") or []
-        count, whether = len(explanations), "is" if all(explanations) else "may be"
+        count, whether = len(explanations), "is" if all(map(apart_from_rounding, explanations)) else "may be"
         plausible = f"{count} explanations are plausible at 95 %, " if count > 1 else ""
         rest = "" if count > 1 else _unfitted(answer)
         certain = apart_from_rounding(answer.get("certain") or [])

@@ -16,8 +16,8 @@ from fdi_torch.study.cluster import run_on_cluster
 from fdi_torch.study.mode_isolation import Isolation, count_modes
 from fdi_torch.study.monte_carlo import Trial, run_blocks
 from fdi_torch.study.study_plan import Plan
-from fdi_torch.study.summary import Ratio, Summary, summarise
-from fdi_torch.tables import Shown, Table
+from fdi_torch.study.summary import Score, Summary, summarise
+from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
 
 Tell = Callable[[float, str], None]
 
@@ -43,19 +43,20 @@ class StudyResult(Shown):
         settings = f"{len(self.summaries)} setting{'s' if len(self.summaries) != 1 else ''}"
         return f"{len(self.trials)} trials in {settings}"
 
+    @in_its_units
     def table(self) -> Table:
-        """One row per setting, estimator and parameter; bias and RMSE in the parameter's SI unit."""
-        names = ("setting", "estimator", "parameter", "bias", "RMSE", "RMSE / bound", "coverage")
+        """One row per setting, estimator and parameter; bias and RMSE in the parameter's unit for display."""
+        names = ("setting", "estimator", "parameter", "unit", "bias", "RMSE", "RMSE / bound", "coverage")
         rows = [
-            (s.setting, e.estimator, e.parameter, e.bias, e.rmse, _value(e.over_bound), _value(e.coverage))
+            (s.setting, e.estimator, e.parameter, *in_display_unit(e.parameter, e.unit, e.bias, e.rmse), *_ratios(e))
             for s in self.summaries
             for e in s.scores
         ]
         return Table.of_rows(names, rows)
 
 
-def _value(ratio: Ratio | None) -> float | None:
-    return None if ratio is None else ratio.value
+def _ratios(score: Score) -> list[float | None]:
+    return [None if ratio is None else ratio.value for ratio in (score.over_bound, score.coverage)]
 
 
 def run_study(

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -42,6 +43,7 @@ class OpcUaSource:
         self._url = f"opc.tcp://{address.place}/{address.path}".rstrip("/")
         self._place, self._tags, self._period, self._publish = address.place, tags, period, publish
         self._lost_at: float | None = None
+        self._waiting: list[Value] | None = []  # values before each node has sent its first; None from then on
         self._inbox, self._stop, self._connected = Inbox(), threading.Event(), threading.Event()
         self._refusal: Exception | None = None
         self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True, name="opcua")
@@ -67,7 +69,21 @@ class OpcUaSource:
         stamp = value.SourceTimestamp or value.ServerTimestamp
         at = time.time() if stamp is None else _utc(stamp).timestamp()
         is_number = value.StatusCode.is_good() and isinstance(number, bool | int | float)
-        self._inbox.put([Value(self._names[node.nodeid], at, float(number) if is_number else math.nan)])
+        self._deliver(Value(self._names[node.nodeid], at, float(number) if is_number else math.nan))
+
+    def _deliver(self, value: Value) -> None:
+        """Put a value into the inbox. The server first sends the present value of each node, which has the time of its
+        last change, perhaps hours ago; all of these hold from the latest of their times on.
+        """
+        if self._waiting is None:
+            self._inbox.put([value])
+            return
+        self._waiting.append(value)
+        present = {each.tag: each.stamp for each in reversed(self._waiting)}
+        if len(present) == len(set(self._tags)):
+            latest = max(present.values())
+            self._inbox.put([replace(each, stamp=max(each.stamp, latest)) for each in self._waiting])
+            self._waiting = None
 
     def status_change_notification(self, status: Any) -> None:
         """Called by asyncua when the server ends the subscription; the connection check handles it."""

@@ -2,7 +2,7 @@
 mcap.
 """
 
-from fdi_torch.logbook.compare import Comparison, align, compare
+from fdi_torch.logbook.compare import Comparison, align, compare, labels_of
 from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.exclusive_file import being_written
 from fdi_torch.logbook.export import export, export_attachment
@@ -42,6 +42,7 @@ __all__ = [
     "follow",
     "foxglove_layout",
     "inspect_log",
+    "labels_of",
     "last_state",
     "mapped_signals",
     "number_at",

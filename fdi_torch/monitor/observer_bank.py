@@ -151,7 +151,7 @@ class ObserverBank:
     def simulate(
         self, samples: Samples, start: Tensor, believed: Tensor, changes: ChangeHypotheses, shocks: Tensor
     ) -> Tensor:
-        """States (L, S, order + M) without corrections at all samples but the first, from `start` (L, order + M).
+        """States (L, S, order + M) of a free run from `start` (L, order + M): readings correct only the first sample.
 
         shocks (L, S, order) are added to the network's states, in m, at these samples. The engines inject them as the
         corrections of a reading so large that the prediction does not matter.

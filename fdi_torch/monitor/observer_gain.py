@@ -41,7 +41,9 @@ class Gain:
         return torch.cat([opening, self.steady.expand(count - len(opening), *self.steady.shape)])
 
     def spread(self, first: int, count: int) -> Tensor:
-        """The inflation at `count` samples from the `first` of a run on, (*batch, count, sensors)."""
+        """The `inflation` of the samples `first` to `first` + `count` of a run, 1 after its opening samples, (*batch,
+        count, sensors).
+        """
         opening = self.inflation[first : first + count]
         steady = torch.ones_like(self.steady[..., 0, :]).expand(count - len(opening), *self.steady[..., 0, :].shape)
         return torch.cat([opening, steady]).movedim(0, -2)

@@ -132,8 +132,8 @@ def _run(
 ) -> MonitorState:
     """Run the observer along a window at the end of the samples, and replace the stored results there.
 
-    The parameters change from `before` to `state.believed` at `onset` s. The window's state, its memory and the
-    errors of the known faults are those at its beginning.
+    The observer uses the parameters `before` until `onset` s and `state.believed` from then on. The window's state,
+    its memory and the errors of the known faults are those at its beginning.
     """
     first, errors, order = len(state.samples) - len(window), state.errors, observer.whitening.order
     theta = state.believed.repeat(1 + len(errors.columns), 1)

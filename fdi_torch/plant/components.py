@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from fdi_torch.quantities import parse_quantity
 from fdi_torch.recording import LARGEST as LARGEST_QUANTITY
@@ -135,6 +134,6 @@ class Sensor(Component):
     def column(self) -> str:
         return self.channel or self.name
 
-    def clipped(self, reading: Tensor) -> Tensor:
+    def clipped(self, reading: torch.Tensor) -> torch.Tensor:
         """The reading limited to low..high."""
         return reading if self.low is None and self.high is None else torch.clamp(reading, self.low, self.high)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import ClassVar
 
-from torch import Tensor
+import torch
 
 from fdi_torch.parameters import Parameter, ParameterName
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
@@ -25,7 +25,7 @@ __all__ = [
     *("Clock", "Local", "OperatingRange", "Parameter", "PlantDescription", "Values"),  # for the files of effects
 ]
 
-Memory = tuple[Tensor, ...]
+Memory = tuple["torch.Tensor", ...]
 
 
 class Stage(Enum):
@@ -80,53 +80,53 @@ class Effect:
         bounds = [bound for bound in (size.low, size.high) if bound != size.nominal]
         return [{size.name: size.nominal + 0.1 * (bound - size.nominal)} | typical for bound in bounds]
 
-    def delay(self, p: Values) -> Tensor:
+    def delay(self, p: Values) -> torch.Tensor:
         """COMMAND, READING: dead time that the effect adds to its signal, s (only where `delays`)."""
         raise NotImplementedError
 
-    def steady_memory(self, value: Tensor, p: Values) -> Memory:
+    def steady_memory(self, value: torch.Tensor, p: Values) -> Memory:
         """COMMAND, READING: the memory in steady state, after the signal has been `value` for a long time."""
         return ()
 
-    def command(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def command(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         """COMMAND: mean command (or valve opening) over the step -> mean actuator output over the step, new memory."""
         return value, memory
 
-    def head(self, head: Tensor, local: Local, p: Values) -> Tensor:
+    def head(self, head: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         """FLOW: the driving head of a pipe, m."""
         return head
 
-    def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
+    def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         """FLOW: the flow of a pump, pipe or outlet, m^3/s, positive from source to target."""
         return flow
 
-    def steady_states(self, flow: Tensor, local: Local, p: Values) -> tuple[Tensor, ...]:
+    def steady_states(self, flow: torch.Tensor, local: Local, p: Values) -> tuple[torch.Tensor, ...]:
         """FLOW: its states in steady state, m, where the flow before the effect has been `flow` (m^3/s) for a long
         time.
         """
         return ()
 
-    def state_rates(self, flow: Tensor, local: Local, p: Values) -> tuple[Tensor, ...]:
+    def state_rates(self, flow: torch.Tensor, local: Local, p: Values) -> tuple[torch.Tensor, ...]:
         """FLOW: rate of change of each of its states `local.states`, m/s; flow (m^3/s) is the one before the effect."""
         return ()
 
-    def inflow(self, local: Local, p: Values) -> Tensor:
+    def inflow(self, local: Local, p: Values) -> torch.Tensor:
         """BALANCE: additional net inflow of a tank, m^3/s; at a tank pair 'A-B', the flow from A to B."""
         raise NotImplementedError
 
-    def recipients(self, p: Values) -> Mapping[str, Tensor]:
+    def recipients(self, p: Values) -> Mapping[str, torch.Tensor]:
         """BALANCE at a tank: share of the lost flow that each other tank receives; the rest leaves the plant."""
         return {}
 
-    def area(self, area: Tensor, local: Local, p: Values) -> Tensor:
+    def area(self, area: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         """STORAGE: cross-section at the present level, m^2."""
         return area
 
-    def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
+    def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         """READING: sensor signal at the end of the sampling interval -> indicated value, new memory."""
         return value, memory
 
-    def resolution(self, p: Values) -> Tensor:
+    def resolution(self, p: Values) -> torch.Tensor:
         """READING: quantization step in the reading's unit (only where `quantizes`)."""
         raise NotImplementedError
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import ClassVar, Self
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.components import OUTSIDE, Component
 from fdi_torch.plant.local_conditions import Local, Values
@@ -123,15 +123,15 @@ class FlowComponent(Component):
         """Impossible values, each as 'field: expected ..., got ...', beyond numbers that must be positive."""
         return iter(())
 
-    def actuated(self, value: Tensor) -> Tensor:
+    def actuated(self, value: torch.Tensor) -> torch.Tensor:
         """The command or opening within its range."""
         return value
 
-    def capacity(self, constants: Values, gravity: Tensor) -> Tensor:
+    def capacity(self, constants: Values, gravity: torch.Tensor) -> torch.Tensor:
         """Flow at 1 m of head, or for a command of 1, by the present constants."""
         raise NotImplementedError
 
-    def smoothing_width(self, gravity: float, inverse_areas: float, resolution: Tensor) -> Tensor | None:
+    def smoothing_width(self, gravity: float, inverse_areas: float, resolution: torch.Tensor) -> torch.Tensor | None:
         """Head below which square roots and divisors are smoothed, m, at the time scale `resolution` (s).
 
         inverse_areas: sum of 1/A over the tanks at both ends, 1/m^2: d(head)/dt per unit of flow. None: the width of
@@ -139,15 +139,15 @@ class FlowComponent(Component):
         """
         return None
 
-    def head(self, local: Local) -> Tensor:
+    def head(self, local: Local) -> torch.Tensor:
         """Driving head, m, from the levels and constants of `local`."""
         return local.level
 
-    def law(self, local: Local) -> Tensor:
+    def law(self, local: Local) -> torch.Tensor:
         """Nominal flow from source to target, m^3/s, before effects."""
         raise NotImplementedError
 
-    def limited(self, flow: Tensor, local: Local) -> Tensor:
+    def limited(self, flow: torch.Tensor, local: Local) -> torch.Tensor:
         """The flow after effects, limited so that the levels stay stable at a step of `local.clock.resolution`.
 
         Only kinds of order SUPPLY and SPILL have the net inflow of their source in `local.net`.

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.orifice import signed_root
 from fdi_torch.plant.signals import Clock
 
-Values = Mapping[str, Tensor]
+Values = Mapping[str, "torch.Tensor"]
 
 
 @dataclass(frozen=True)
@@ -27,23 +26,23 @@ class Local:
     """
 
     clock: Clock
-    level: Tensor
-    far_level: Tensor
-    head: Tensor
-    capacity: Tensor
-    command: Tensor
-    net: Tensor
-    width: Tensor
-    height: Tensor
-    area: Tensor
-    gravity: Tensor
+    level: torch.Tensor
+    far_level: torch.Tensor
+    head: torch.Tensor
+    capacity: torch.Tensor
+    command: torch.Tensor
+    net: torch.Tensor
+    width: torch.Tensor
+    height: torch.Tensor
+    area: torch.Tensor
+    gravity: torch.Tensor
     constants: Values
-    states: tuple[Tensor, ...] = ()
+    states: tuple[torch.Tensor, ...] = ()
 
-    def root(self, head: Tensor) -> Tensor:
+    def root(self, head: torch.Tensor) -> torch.Tensor:
         """Regularised signed square root of a head, sgn(x) sqrt(|x|), m^0.5 (see `signed_root`)."""
         return signed_root(head, self.width)
 
-    def magnitude(self, head: Tensor) -> Tensor:
+    def magnitude(self, head: torch.Tensor) -> torch.Tensor:
         """|head| smoothed at zero to sqrt(x^2 + w^2), so that it can be a divisor, m."""
         return torch.sqrt(head * head + self.width * self.width)

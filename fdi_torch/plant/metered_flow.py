@@ -6,7 +6,6 @@ from dataclasses import field
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.components import COMMAND_UNITS
 from fdi_torch.plant.flow_component import FlowComponent
@@ -56,9 +55,9 @@ class MeteredFlow(FlowComponent):
     def full_command(self) -> float:
         return self.max_flow / self.gain
 
-    def capacity(self, constants: Values, gravity: Tensor) -> Tensor:
+    def capacity(self, constants: Values, gravity: torch.Tensor) -> torch.Tensor:
         return constants["gain"]
 
-    def law(self, local: Local) -> Tensor:
+    def law(self, local: Local) -> torch.Tensor:
         demanded = torch.clamp(local.capacity * local.command, min=0.0)
         return torch.minimum(demanded, local.constants["max_flow"])

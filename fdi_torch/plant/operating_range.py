@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.constants import reading_at
@@ -50,7 +50,7 @@ def operating_range_of(recording: Recording, plant: PlantDescription) -> Operati
 
 
 def with_simulated_levels(
-    operating_range: OperatingRange, plant: PlantDescription, levels: Float[Tensor, "K tanks"]
+    operating_range: OperatingRange, plant: PlantDescription, levels: Float[torch.Tensor, "K tanks"]
 ) -> OperatingRange:
     """The same range, with the levels of tanks without a sensor taken from a simulation: levels (K, tanks), m."""
     unmeasured = {t.name: _range(levels[:, i]) for i, t in enumerate(plant.tanks)}
@@ -105,5 +105,5 @@ def interior_points(ends: Range, count: int) -> list[float]:
     return [low + (high - low) * (k + 1) / (count + 1) for k in range(count)]
 
 
-def _range(values: Tensor) -> Range:
+def _range(values: torch.Tensor) -> Range:
     return float(values.min()), float(values.max())

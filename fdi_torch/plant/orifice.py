@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import torch
-from torch import Tensor
 
 # Stability of explicit RK4 on the real axis requires |rate x step| < 2.785. These values had the least error over
 # random faults; they leave a margin for several orifices on one tank.
@@ -16,7 +15,7 @@ WEIR_COEFFICIENT = 0.6
 _DRY = 1e-9  # m; keeps the weir's slope finite at zero excess
 
 
-def signed_root(head: Tensor, width: Tensor) -> Tensor:
+def signed_root(head: torch.Tensor, width: torch.Tensor) -> torch.Tensor:
     """sgn(x) sqrt(|x|), smooth within `width` (m) of zero: x / (x^2 + w^2)^(1/4).
 
     The slope at zero is 1/sqrt(w); for |x| >> w the relative error is (w/x)^2 / 4.
@@ -24,7 +23,7 @@ def signed_root(head: Tensor, width: Tensor) -> Tensor:
     return head / torch.sqrt(torch.sqrt(head * head + width * width))
 
 
-def regular_width(rate: float, resolution: Tensor) -> Tensor:
+def regular_width(rate: float, resolution: torch.Tensor) -> torch.Tensor:
     """Smoothing width w (m) at which the levels' fastest rate, `rate` / sqrt(w), is stable at a step `resolution` (s).
 
     rate = C_d a sqrt(2 g) (1/A_1 + 1/A_2), in m^0.5/s.
@@ -33,12 +32,12 @@ def regular_width(rate: float, resolution: Tensor) -> Tensor:
     return bound * bound
 
 
-def orifice_capacity(discharge_coefficient: Tensor, area: Tensor, gravity: Tensor) -> Tensor:
+def orifice_capacity(discharge_coefficient: torch.Tensor, area: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:
     """C_d a sqrt(2 g): flow at 1 m of head, m^2.5/s (Torricelli)."""
     return discharge_coefficient * area * torch.sqrt(2.0 * gravity)
 
 
-def weir_strength(coefficient: Tensor | float, crest: Tensor, gravity: Tensor) -> Tensor:
+def weir_strength(coefficient: torch.Tensor | float, crest: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:
     """Weir coefficient (2/3) C sqrt(2 g) b of a sharp crest of length b, m^1.5/s; flow over it at 1 m above the crest.
 
     Rectangular weir (Poleni, 1717; Bos, 1989, "Discharge Measurement Structures", ch. 5); C is about 0.6.
@@ -46,12 +45,12 @@ def weir_strength(coefficient: Tensor | float, crest: Tensor, gravity: Tensor) -
     return (2.0 / 3.0) * coefficient * torch.sqrt(2.0 * gravity) * crest
 
 
-def rim_strength(tank_area: Tensor, gravity: Tensor) -> Tensor:
+def rim_strength(tank_area: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:
     """Weir coefficient of a round tank's rim, a crest of length 2 sqrt(pi A), m^1.5/s."""
     return weir_strength(WEIR_COEFFICIENT, 2.0 * torch.sqrt(math.pi * tank_area), gravity)
 
 
-def limit_emptying(rate: Tensor, level: Tensor, resolution: Tensor) -> Tensor:
+def limit_emptying(rate: torch.Tensor, level: torch.Tensor, resolution: torch.Tensor) -> torch.Tensor:
     """Limit dh/dt (m/s) from below so that a tank never falls below its floor: max(rate, -2 h / r).
 
     A drain that ends below the floor, or evaporation, would make the rate jump at level 0 within a step. With
@@ -62,21 +61,27 @@ def limit_emptying(rate: Tensor, level: Tensor, resolution: Tensor) -> Tensor:
     return torch.maximum(rate, slowest)
 
 
-def weir_law(excess: Tensor, strength: Tensor) -> tuple[Tensor, Tensor]:
+def weir_law(excess: torch.Tensor, strength: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Flow over a crest w(x) = strength x^(3/2), m^3/s, and its slope w'(x), m^2/s, at the excess x (m) above it."""
     above = torch.clamp(excess, min=0.0)
     root = torch.sqrt(above + _DRY)
     return strength * above * root, 1.5 * strength * root
 
 
-def weir_slope(flow: Tensor, excess: Tensor) -> Tensor:
+def weir_slope(flow: torch.Tensor, excess: torch.Tensor) -> torch.Tensor:
     """The slope 1.5 w / x of a flow over a crest (m^3/s) that effects have changed, at the excess x (m), m^2/s."""
     return 1.5 * flow / (torch.clamp(excess, min=0.0) + _DRY)
 
 
 def limit_spill(
-    flow: Tensor, slope: Tensor, *, excess: Tensor, inflow: Tensor | float, tank_area: Tensor, resolution: Tensor
-) -> Tensor:
+    flow: torch.Tensor,
+    slope: torch.Tensor,
+    *,
+    excess: torch.Tensor,
+    inflow: torch.Tensor | float,
+    tank_area: torch.Tensor,
+    resolution: torch.Tensor,
+) -> torch.Tensor:
     """Flow over a crest (m^3/s), limited so that the tank is stable at a step of `resolution` (s).
 
     The law w = `flow` with the slope w' = `slope` (m^2/s) at the excess (m) above the crest is much faster than the
@@ -90,14 +95,20 @@ def limit_spill(
 
 
 def weir_flow(
-    excess: Tensor, inflow: Tensor | float, tank_area: Tensor, strength: Tensor, resolution: Tensor
-) -> Tensor:
+    excess: torch.Tensor,
+    inflow: torch.Tensor | float,
+    tank_area: torch.Tensor,
+    strength: torch.Tensor,
+    resolution: torch.Tensor,
+) -> torch.Tensor:
     """Flow over a rim, or over a share of it, m^3/s: `weir_law` limited by `limit_spill`."""
     flow, slope = weir_law(excess, strength)
     return limit_spill(flow, slope, excess=excess, inflow=inflow, tank_area=tank_area, resolution=resolution)
 
 
-def limit_draw(flow: Tensor, level: Tensor, inflow: Tensor, tank_area: Tensor, resolution: Tensor) -> Tensor:
+def limit_draw(
+    flow: torch.Tensor, level: torch.Tensor, inflow: torch.Tensor, tank_area: torch.Tensor, resolution: torch.Tensor
+) -> torch.Tensor:
     """A flow drawn from a tank (m^3/s), limited to what the tank holds and receives: min(flow, max(q + 2 A h / r, 0)).
 
     q = `inflow` (m^3/s): net inflow of the tank without this flow; r = `resolution` (s). The level then never falls

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class ChannelFinding:
-    """kind: read, clock, gap, constant, clipped, frozen, quantised, range, rim, unit, missing, on change, undersampled,
-    unknown, stuck or slip. values: the numbers stated in `text`, by name, SI.
+    """kind: read, clock, gap, constant, constant input, clipped, frozen, quantised, range, rim, unit, missing, on
+    change, undersampled, unknown, stuck or slip. values: the numbers stated in `text`, by name, SI.
     """
 
     kind: str

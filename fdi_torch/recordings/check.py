@@ -71,6 +71,7 @@ def check_recording(recording: Recording, plant: PlantDescription) -> RecordingC
             *(ChannelFinding("read", "t", note) for note in recording.notes),
             *_clock_findings(time, steps, interval),
             *_missing_inputs(recording),
+            *_constant_inputs(recording),
             *undersampled_inputs(recording, plant),
             *_missing_readings(recording),
             *reading_findings(recording),
@@ -123,6 +124,15 @@ def _clock_findings(time: Tensor, steps: Tensor, interval: float) -> Iterator[Ch
     if jitter > JITTER_SHARE * interval:
         text = f"the sampling interval of {interval:g} s varies by up to {jitter:.3g} s"
         yield ChannelFinding("clock", "t", text, {"interval": interval, "jitter": jitter})
+
+
+def _constant_inputs(recording: Recording) -> Iterator[ChannelFinding]:
+    """Inputs none of which ever changes."""
+    known = recording.inputs[torch.isfinite(recording.inputs).all(dim=1)]
+    if known.numel() and bool((known == known[0]).all()):
+        names = ", ".join(recording.input_names)
+        text = "never changes: is that column right? Constant inputs leave most faults indistinguishable (fdi plan)"
+        yield ChannelFinding("constant input", names, text)
 
 
 def _missing_inputs(recording: Recording) -> Iterator[ChannelFinding]:

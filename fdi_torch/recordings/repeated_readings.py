@@ -59,10 +59,11 @@ def scatter(values: Tensor) -> Scatter:
 
 
 def stuck_runs(values: Tensor, usual: Scatter | None = None) -> list[tuple[int, int]]:
-    """Runs of equal readings that are too long among values (n,): the first sample of each, and the first after it.
+    """Runs of equal readings among values (n,) that are too long for the sensor's noise: the first sample of each run,
+    and the first sample after it.
 
-    usual: the scatter of readings of this kind, for sensors that never change; by default estimated from the other
-    readings.
+    usual: noise and quantization step of such readings, needed for a sensor that never changes; by default estimated
+    from the other readings.
     """
     count = len(values)
     if count < 3:

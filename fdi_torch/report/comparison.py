@@ -35,10 +35,7 @@ def _section(compared: Comparison, runs: Sequence[Material]) -> Section:
     first, *others = comparison_headline(compared, runs)
     blocks: list[Any] = [tag("h3", first), *(tag("p", sentence) for sentence in (*others, *in_words(compared)))]
     if compared.results:
-        header, rows = ["parameter", "unit", *compared.labels, "p", "agree"], result_rows(compared)
-        if all(result.agree is None for result in compared.results):
-            header, rows = header[:-2], [row[:-2] for row in rows]
-        blocks.append(table(header, rows, left=2))
+        blocks.append(table(*result_table(compared), left=2))
     pictures = [*_convergence(compared, runs), *_residuals(compared, runs)]
     blocks += [pictures] if pictures else []
     for name, entries in compared.differences.items():
@@ -62,15 +59,18 @@ def in_words(compared: Comparison) -> list[str]:
     return words
 
 
-def result_rows(compared: Comparison) -> list[list[str]]:
-    """Rows with parameter, unit, value and error of each run, p-value, and agreement."""
+def result_table(compared: Comparison) -> tuple[list[str], list[list[str]]]:
+    """Header and rows: parameter, unit, value and error of each run and, if runs share one, p-value and agreement."""
     verdicts = {True: "yes", False: "no", None: ""}
     rows = []
     for result in compared.results:
         unit, scale = shown_unit(result.unit, result.name)
         values = [with_error(scale * v, scale * s) for v, s in zip(result.values, result.std, strict=True)]
         rows.append([result.name, unit or "1", *values, _p_text(result.p_value), verdicts[result.agree]])
-    return rows
+    header = ["parameter", "unit", *compared.labels, "p", "agree"]
+    if all(result.agree is None for result in compared.results):
+        return header[:-2], [row[:-2] for row in rows]
+    return header, rows
 
 
 def _p_text(p: float) -> str:

@@ -71,7 +71,12 @@ def _better(compared: Comparison, runs: Sequence[Material]) -> str:
 
 def _same_readings(runs: Sequence[Material]) -> bool:
     """Whether all runs have the same readings at the same times."""
-    first, *others = ([array for r in run.recordings for array in (r.time, r.outputs)] for run in runs)
+    return _same(runs, "time") and _same(runs, "outputs")
+
+
+def _same(runs: Sequence[Material], columns: str) -> bool:
+    """Whether these columns of the recordings, `time`, `inputs` or `outputs`, are the same in all runs."""
+    first, *others = ([getattr(recording, columns) for recording in run.recordings] for run in runs)
     return all(
         len(first) == len(other)
         and all(np.array_equal(a, b, equal_nan=True) for a, b in zip(first, other, strict=True))
@@ -89,6 +94,8 @@ def _differences(compared: Comparison, runs: Sequence[Material]) -> str:
     parts = []
     if not _same_readings(runs):
         parts.append(f"the recording ({_recordings_in_words(runs)})")
+    elif not _same(runs, "inputs"):
+        parts.append("the inputs of the recording")
     kinds = [kind_words(run) for run in runs]
     several = len(set(kinds)) > 1  # their settings have different keys
     parts += [f"the kind of run ({'; '.join(kinds)})"] if several else []

@@ -56,6 +56,11 @@ def with_error(value: float, std: float) -> str:
     return _minus(amounts.with_error(value, std)) if math.isfinite(value) else number(value)
 
 
+def rounded_number(value: float, std: float) -> str:
+    """'0.2985': a number with as many decimals as show two digits of its standard error."""
+    return _minus(amounts.rounded(value, std)) if math.isfinite(value) else number(value)
+
+
 def percent(share: float) -> str:
     return f"{100.0 * share:.3g} %" if math.isfinite(share) else "–"
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from fdi_torch.logbook import labels_of
 from fdi_torch.report.html import Markup, join, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.page_assets import POLICY, SCRIPT, STYLESHEET
@@ -47,7 +48,7 @@ def page(reports: Sequence[RunReport], first: Sequence[Section] = (), above: Seq
     title = " · ".join(report.material.run.path.stem for report in reports[:4])
     articles = [_article(report, f"r{k}-") for k, report in enumerate(reports)]
     if len(reports) > 1:
-        runs = [(f"r{k}-run", report.material.run.path.stem) for k, report in enumerate(reports)]
+        runs = [(f"r{k}-run", name) for k, name in enumerate(labels_of([r.material.run.path for r in reports]))]
         listed = [*((f"all-{k}", section.title) for k, section in enumerate(first)), *runs]
         shared = (section_html(section, "all-", f"all-{k}") for k, section in enumerate(first))
         articles = [_index(listed), *shared, *articles]

@@ -186,10 +186,19 @@ def how_it_ended(material: Material) -> list[str]:
     ended = status.get("status", "no end in the log").replace("_", " ")
     reason = f" ({status['reason']})" if status.get("reason") else ""
     parts = [f"{ended}{reason}"]
+    seconds = status.get("wall_seconds")  # of a blind benchmark: of writing its log, after all diagnoses
     parts += [f"started {run['started'][:19].replace('T', ' ')} UTC"] if run.get("started") else []
-    parts += [f"took {status['wall_seconds']} s"] if status.get("wall_seconds") else []
+    parts += [f"took {_rounded(seconds)} s"] if seconds and material.kind != "challenge" else []
     sentences = [" · ".join(parts)]
     return sentences
+
+
+def _rounded(seconds: str) -> str:
+    """The duration with three digits; unchanged if it is not a number."""
+    try:
+        return number(float(seconds), 3)
+    except ValueError:
+        return seconds
 
 
 def _listed(items: list[str]) -> str:

@@ -33,7 +33,7 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Score:
-    """Performance of one estimator for one parameter. bias, bias_error, rmse in the parameter's unit.
+    """Performance of one estimator for one parameter. bias, bias_error, rmse in the parameter's SI unit.
 
     over_bound: RMSE over the Cramer-Rao bound; over_linearised: over the RMSE of the linearised efficient estimator on
     the same draws; coverage: of the stated 95 % intervals. None if not available.
@@ -41,6 +41,7 @@ class Score:
 
     estimator: str
     parameter: str
+    unit: str
     bias: float
     bias_error: float
     rmse: float
@@ -110,12 +111,13 @@ def _scores(
     bound = column(trials, "bound")
     std = column(trials, f"{name}_std") if f"{name}_std" in trials[0].numbers else None
     compared = noisy and "linearised" in errors and name != "linearised"
-    for i, parameter in enumerate(space.names):
+    for i, parameter in enumerate(space):
         errors_i = error[:, i]
         scores.append(
             Score(
                 estimator=name,
-                parameter=parameter,
+                parameter=parameter.name,
+                unit=parameter.unit,
                 bias=float(errors_i.mean()),
                 bias_error=float(errors_i.std() / math.sqrt(len(errors_i))) if len(errors_i) > 1 else math.nan,
                 rmse=float(errors_i.square().mean().sqrt()),

@@ -81,7 +81,7 @@ def _choice(entries: Sequence[Entry], query: Query) -> Markup:
         "form",
         tag("button", "Compare the ticked logs"),
         tag("div", table(header, rows, left=1 + len(COLUMNS), most=max(len(rows), 1))),
-        tag("p", "error: root mean square of read − estimate over all sensors", class_="note"),
+        tag("p", "error: root mean square of measured − model over all sensors", class_="note"),
         action="/report",
     )
 

@@ -17,14 +17,20 @@ SAMPLES = 100
 
 
 def write_fit(
-    path: Path, error: float, *, level: float = 0.3, config: dict[str, str] | None = None, explained: bool = True
+    path: Path,
+    error: float,
+    *,
+    level: float = 0.3,
+    config: dict[str, str] | None = None,
+    explained: bool = True,
+    flow: float = 4e-5,
 ) -> Path:
     """A fit of two sensors whose residuals alternate between + and - `error`, m, of readings that vary with `level`."""
     time = np.arange(float(SAMPLES))
     read = level + 0.01 * np.sin(time)[:, None] * np.ones(2)
     model = read - error * np.where(np.arange(SAMPLES) % 2, 1.0, -1.0)[:, None]
     with RunLog(path, "train", config_text="plant: three_tank\n", config=config or {}, env={}, git={}) as log:
-        log.recording(time, np.full((SAMPLES, 1), 4e-5), read, ("Q1",), ("h1", "h2"), ("m^3/s",), ("m", "m"))
+        log.recording(time, np.full((SAMPLES, 1), flow), read, ("Q1",), ("h1", "h2"), ("m^3/s",), ("m", "m"))
         log.result_arrays(predicted=model)
         log.result({"explained": explained})
     return path
@@ -45,6 +51,12 @@ def test_the_run_with_the_smaller_residuals_is_better_by_their_ratio(tmp_path: P
     assert same == "Recording, settings and versions are the same."
     third = write_fit(tmp_path / "c.mcap", 0.002)
     assert "50 % smaller than those of c" in sentences(a, b, third)[0]
+
+
+def test_a_recording_with_other_inputs_is_not_called_the_same(tmp_path: Path) -> None:
+    a, b = write_fit(tmp_path / "a.mcap", 0.004), write_fit(tmp_path / "b.mcap", 0.001, flow=0.0)
+    better, differ = sentences(a, b)
+    assert "75 % smaller" in better and differ == "They differ in the inputs of the recording."
 
 
 @pytest.mark.parametrize(("share", "equal"), [(0.1, True), (0.18, False)])

@@ -6,6 +6,7 @@ import argparse
 
 SHELLS = ("bash", "zsh", "fish")
 STEP, SUMMARY = "use", "print a script with which a shell completes commands and options"
+QUICK = True
 EXAMPLES = """
 examples:
   fdi completion bash > ~/.local/share/bash-completion/completions/fdi    in each new shell from then on

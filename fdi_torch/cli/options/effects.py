@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 STEP, SUMMARY = "describe", "show the catalogue of faults and unmodelled effects"
+QUICK = True
 EXAMPLES = """
 examples:
   fdi effects                                      list all effects

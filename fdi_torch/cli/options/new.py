@@ -1,22 +1,24 @@
-"""Write a commented minimal file: a plant, or a run, monitor or study of a plant."""
+"""Write a commented minimal file: a plant, or a run, monitor, rehearsal or study of a plant."""
 
 from __future__ import annotations
 
 import argparse
 
-STEP, SUMMARY = "describe", "write a commented minimal file: a plant, run, monitor or study"
+STEP, SUMMARY = "describe", "write a commented minimal file: a plant, run, monitor, rehearsal or study"
+QUICK = True
 EXAMPLES = """
 examples:
   fdi new plant --out rig.yaml                     then fdi check --plant rig.yaml
   fdi new plant --recording trend.xlsx --out rig.yaml      pumps and sensors from the columns of a recording
   fdi new run --plant rig.yaml --recording trend.xlsx      writes run.yaml; then fdi train --config run.yaml
   fdi new monitor --plant rig.yaml --recording trend.xlsx --out watch.yaml
+  fdi new rehearsal --plant rig.yaml       validates a monitor by simulation: fdi rehearse --config rehearsal.yaml
   fdi new study --plant three_tank
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("kind", choices=("plant", "run", "monitor", "study"), help="kind of file")
+    parser.add_argument("kind", choices=("plant", "run", "monitor", "rehearsal", "study"), help="kind of file")
     parser.add_argument("--plant", metavar="NAME|FILE", default="three_tank", help="its plant (three_tank)")
     parser.add_argument(
         "--recording", metavar="FILE", help="a recording: its columns make the plant; a run or monitor reads it"

@@ -43,7 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--from", metavar="TIME", dest="start", type=seconds, help="first time used of each file")
     parser.add_argument("--to", metavar="TIME", dest="stop", type=seconds, help="last time used: 300, or '2 h'")
     parser.add_argument("--picture", metavar="FILE", help="draw the run (PNG or SVG); of several, the last")
-    parser.add_argument("--beside", metavar="PLANT", help="another plant in the same picture, such as the previous one")
+    parser.add_argument(
+        "--beside", metavar="PLANT", help="another plant in the same table and picture, such as the previous one"
+    )
     parser.add_argument(
         "--constant",
         metavar="INPUT=VALUE",

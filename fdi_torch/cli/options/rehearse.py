@@ -12,7 +12,7 @@ from fdi_torch.cli.options import add_config, add_live
 STEP, SUMMARY = "monitor", "validate a monitor on simulated runs: false alarms, delays, isolation"
 EXAMPLES = """
 examples:
-  fdi rehearse --config rehearsal.yaml
+  fdi rehearse --config rehearsal.yaml             fdi new rehearsal --plant rig.yaml writes such a file
   fdi rehearse --config rehearsal.yaml --resume    continue a stopped run
 """
 

@@ -13,6 +13,7 @@ from fdi_torch.monitor.monte_carlo.simulated_runs import SimulatedRig, fault_fre
 from fdi_torch.monitor.monte_carlo.tasks import Numbers, ResultTable, Task, seeded_generator
 from fdi_torch.monitor.noise_model import learn_noise
 from fdi_torch.monitor.samples import Samples
+from fdi_torch.quantities import significant
 
 NORMAL = 1.96  # of a 95 % interval
 RUNS_AT_ONCE = 250  # runs side by side
@@ -79,7 +80,9 @@ class FalseAlarmPlan:
         what = ("noise", "detector", "calibrations", "alarms (asked)")
         header = (*what, "s between", "95 %", "single calibrations", "within own 95 %")
         summary = f"{agreeing} of {total} calibrations alarm falsely as often as they predict" if total else ""
-        return ResultTable(f"false alarms, {self.every:g} s between them asked for", header, tuple(rows), summary)
+        return ResultTable(
+            f"false alarms, one in {significant(self.every, 3)} s asked for", header, tuple(rows), summary
+        )
 
 
 def mean_time(counts: Sequence[int], every: float, expected: float) -> tuple[float, float, float]:

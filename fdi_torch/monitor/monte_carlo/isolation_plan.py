@@ -127,8 +127,7 @@ class IsolationPlan:
         delay_values = [float("inf") if d < 0 else d for n in results for d in n["delay"]]
         q, missed = quantiles(delay_values, (0.5, 0.95)), sum(d == float("inf") for d in delay_values)
         first = (self.loop, str(len(named_faults)), f"{right} ({100 * low:.0f} .. {100 * high:.0f} %)", str(missed))
-        ways = f"{results[0]['ways']:.0f} ways" if results else ""
-        rows = [(*first, str(sum(int(n["early"]) for n in results)), f"{q[0]:.0f}, {q[1]:.0f}", ways)]
+        rows = [(*first, str(sum(int(n["early"]) for n in results)), f"{q[0]:.0f}, {q[1]:.0f}", "")]
         wrong = [(t, tuple(s.split(" + ")) if s else ()) for t, s in zip(truth, named_faults, strict=True)]
         wrong = [(t, s) for t, s in wrong if s != (t.partition(" ")[0],)]
         mistakes = confusions([t for t, _ in wrong], [s for _, s in wrong], 12)
@@ -136,6 +135,7 @@ class IsolationPlan:
         summary = f"{right} of {len(named_faults)} faults named right in {self.loop} loop" if results else ""
         header = ("loop", "runs", "named right", "missed", "false alarms", "delay, s (50, 95 %)", "wrong")
         title = f"faults of {self.times:g} times the smallest isolable size"
+        title += f", drawn from {results[0]['ways']:.0f}" if results else ""
         return ResultTable(title, header, tuple(rows) if results else (), summary)
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.components import OUTSIDE, quantity_field, word_field
 from fdi_torch.plant.flow_component import (
@@ -91,20 +90,20 @@ class Pipe(FlowComponent):
                 "tanks' levels below the pipe"
             )
 
-    def actuated(self, value: Tensor) -> Tensor:
+    def actuated(self, value: torch.Tensor) -> torch.Tensor:
         return torch.clamp(value, 0.0, 1.0)
 
     def nominal_capacity(self, gravity: float) -> float:
         """Nominal C_d a sqrt(2 g): flow at 1 m of head, m^2.5/s."""
         return self.discharge_coefficient * self.area * math.sqrt(2.0 * gravity)
 
-    def capacity(self, constants: Values, gravity: Tensor) -> Tensor:
+    def capacity(self, constants: Values, gravity: torch.Tensor) -> torch.Tensor:
         return orifice_capacity(constants["discharge_coefficient"], constants["area"], gravity)
 
-    def smoothing_width(self, gravity: float, inverse_areas: float, resolution: Tensor) -> Tensor:
+    def smoothing_width(self, gravity: float, inverse_areas: float, resolution: torch.Tensor) -> torch.Tensor:
         return regular_width(self.nominal_capacity(gravity) * inverse_areas, resolution)
 
-    def head(self, local: Local) -> Tensor:
+    def head(self, local: Local) -> torch.Tensor:
         elevation = local.constants["elevation"]
         if self.is_outlet:
             return local.level - elevation
@@ -112,7 +111,7 @@ class Pipe(FlowComponent):
             return local.level - local.far_level
         return torch.clamp(local.level - elevation, min=0.0) - torch.clamp(local.far_level - elevation, min=0.0)
 
-    def law(self, local: Local) -> Tensor:
+    def law(self, local: Local) -> torch.Tensor:
         head = torch.clamp(local.head, min=0.0) if self.is_outlet else local.head
         return local.capacity * local.command * local.root(head)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Self
 
-from torch import Tensor
+import torch
 
 from fdi_torch.plant.components import OUTSIDE, quantity_field, word_field
 from fdi_torch.plant.flow_component import FlowOrder, Sketch
@@ -46,7 +46,7 @@ class Transfer(MeteredFlow):
     def example(cls, name: str, source: str, target: str) -> Self:
         return cls(name, source, target, 3e-5)
 
-    def limited(self, flow: Tensor, local: Local) -> Tensor:
+    def limited(self, flow: torch.Tensor, local: Local) -> torch.Tensor:
         return limit_draw(flow, local.level, local.net, local.area, local.clock.resolution)
 
     def sketch(self) -> Sketch:

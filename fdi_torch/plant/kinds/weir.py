@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import torch
-from torch import Tensor
 
 from fdi_torch.plant.components import OUTSIDE, quantity_field, word_field
 from fdi_torch.plant.flow_component import (
@@ -65,19 +64,19 @@ class Weir(FlowComponent):
     def problems(self) -> Iterator[str]:
         return coefficient_problems(self.discharge_coefficient)
 
-    def capacity(self, constants: Values, gravity: Tensor) -> Tensor:
+    def capacity(self, constants: Values, gravity: torch.Tensor) -> torch.Tensor:
         return weir_strength(constants["discharge_coefficient"], constants["width"], gravity)
 
-    def smoothing_width(self, gravity: float, inverse_areas: float, resolution: Tensor) -> Tensor:
+    def smoothing_width(self, gravity: float, inverse_areas: float, resolution: torch.Tensor) -> torch.Tensor:
         return torch.full_like(resolution, SMALLEST_HEAD)
 
-    def head(self, local: Local) -> Tensor:
+    def head(self, local: Local) -> torch.Tensor:
         return local.level - local.constants["crest"]
 
-    def law(self, local: Local) -> Tensor:
+    def law(self, local: Local) -> torch.Tensor:
         return weir_law(local.head, local.capacity)[0]
 
-    def limited(self, flow: Tensor, local: Local) -> Tensor:
+    def limited(self, flow: torch.Tensor, local: Local) -> torch.Tensor:
         if not local.clock.explicit:
             return flow
         slope = weir_slope(flow, local.head)

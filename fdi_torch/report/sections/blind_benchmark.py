@@ -45,7 +45,8 @@ def scores_section(material: Material) -> Section | None:
     words = (
         "The rigs use other equations than the library, and their causes stayed sealed until every answer was "
         "in. Lines and brackets are 95 % intervals. Calibration: orange is the mean stated probability of the best "
-        "explanation, blue the share in which it was true. Times: a point is a case, blue the median."
+        "explanation, blue the share in which it was true. Times: a point is a case, blue the median. "
+        "`fdi challenge --help` describes the kinds of cases."
     )
     blocks: list[Markup | str | list[Picture]] = [words]
     for k, (group, by) in enumerate(tables(rows).items()):
@@ -142,7 +143,7 @@ def _titled(sheet: Sheet) -> Markup:
 
 
 def _shown(sheet: Sheet) -> Markup:
-    return table(sheet.header, sheet.rows, left=sheet.left)
+    return table([name.replace("`", "") for name in sheet.header], sheet.rows, left=sheet.left)
 
 
 def shares_panel(

@@ -12,7 +12,7 @@ from fdi_torch.estimate.combinations import Combination
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import amount, number, shown_unit, with_error
+from fdi_torch.report.numbers import amount, number, rounded_number, shown_unit, with_error
 from fdi_torch.report.panels import ellipse_panel
 from fdi_torch.report.section import Picture, Section
 
@@ -114,13 +114,8 @@ def _numbers(value: float, std: float, si_unit: str, name: str) -> list[str]:
     reach = 1.96 * std
     if not np.isfinite(reach):
         return [unit or "1", with_error(value, std), "–"]
-    digits = max(3, min(9, 2 + _decades(value, reach)))
-    interval = f"{number(value - reach, digits)} … {number(value + reach, digits)}"
+    interval = " … ".join(rounded_number(end, std) for end in (value - reach, value + reach))
     return [unit or "1", with_error(value, std), interval]
-
-
-def _decades(value: float, reach: float) -> int:
-    return int(np.ceil(np.log10(max(abs(value) / reach, 1.0)))) if reach > 0 else 4
 
 
 def _finding(material: Material, name: str) -> Any:

@@ -121,7 +121,9 @@ def posterior_bars(answer: Mapping[str, Any]) -> list[list[Picture]]:
     figure = bar_panel("", "probability, %", names, percents, texts, within)
     _up_to_all(figure)
     caption = f"All contain {explanation_words(shared)}. " if shared else ""
-    return [[Picture("gap_posterior", figure, f"{caption}Orange: together they have 95 % of the probability.")]]
+    return [
+        [Picture("gap_posterior", figure, f"{caption}Orange: together they have at least 95 % of the probability.")]
+    ]
 
 
 def _beside(shared: Sequence[Mapping[str, Any]], causes: Sequence[Mapping[str, Any]]) -> str:

@@ -75,8 +75,8 @@ def _confusability_words(impostors: Mapping[str, Any]) -> list[str]:
         mostly = f", mostly for {', '.join(passed_for[:3])}" if passed_for else ""
         rivals, draws = simulated.get("rivals"), simulated.get("draws")
         sentences.append(
-            f"Check by simulation with linearized effects: a gap of this size from any of {rivals} other causes would "
-            f"be given this name in {simulated.get('confused')} of {draws} recordings, or in "
-            f"{simulated.get('passed')} if the library lacked that cause{mostly}."
+            f"Reliability of the name: of {draws} recordings simulated with linearized effects, with a gap of this "
+            f"size from one of {rivals} other causes, {simulated.get('confused')} were given this name, and "
+            f"{simulated.get('passed')} if the library lacked the true cause{mostly}."
         )
     return sentences

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from typing import Any
 
 import numpy as np
@@ -11,12 +13,13 @@ from fdi_torch.clock import clock_text
 from fdi_torch.parameters import is_effect_parameter
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import table, tag
-from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import axis, number, raised, shown_unit
+from fdi_torch.report.material import Material, Payload
+from fdi_torch.report.numbers import as_float, axis, number, raised, rounded_number, shown_unit
 from fdi_torch.report.section import Section, signals
 from fdi_torch.report.style import MARK, MODEL
 
 RESIDUAL, ALARM = "/observer/residual", "/observer/alarm"
+_NEGATIVE = re.compile(r"(?<![\w.])-(?=\d)")
 _SUFFIXES = ("_statistic", "_threshold")
 
 
@@ -66,14 +69,22 @@ def event_section(material: Material) -> Section | None:
             number(float(m["t"]), 6),
             *([_moment(float(m["t"]))] if dated else []),
             str(m.get("event", "")),
-            " and ".join(map(_words, str(m.get("channel", "")).split(" + "))),
-            raised(str(m.get("message", ""))),
-            *_onset(m.get("onset"), dated),
+            tag("span", " and ".join(map(_words, str(m.get("channel", "")).split(" + "))), class_="moment"),
+            _sentence(str(m.get("message", ""))),
+            *_onset(m, dated),
         ]
         for m in events
     ]
     clock = ["clock time"] if dated else []
-    header = ("time, s", *clock, "event", "at", "description", "onset, s", *(["onset, clock time"] if dated else []))
+    header = (
+        "time, s",
+        *clock,
+        "event",
+        "fault or sensor",
+        "description",
+        "onset, s",
+        *(["onset, clock time"] if dated else []),
+    )
     listed = table(header, rows, left=len(header) - 1 - len(clock))
     return Section("Events", [listed])
 
@@ -83,10 +94,17 @@ def _words(name: str) -> str:
     return parameter_words(name) if is_effect_parameter(name) else name
 
 
-def _onset(onset: Any, dated: bool) -> list[Any]:
+def _sentence(message: str) -> str:
+    """A message with units and minus signs as elsewhere on the page; '2026-11-24', 'hA-hB' and '1e-05' stay."""
+    return _NEGATIVE.sub("−", raised(message))
+
+
+def _onset(event: Payload, dated: bool) -> list[Any]:
     """The onset of an event's fault in s, and by the clock of a dated recording; empty cells without an onset."""
-    known = isinstance(onset, int | float)
-    return [number(float(onset), 6) if known else "", *([_moment(float(onset)) if known else ""] if dated else [])]
+    onset, std = as_float(event.get("onset")), as_float(event.get("onset_std"))
+    if math.isnan(onset):
+        return ["", ""] if dated else [""]
+    return [rounded_number(onset, std), *([_moment(onset)] if dated else [])]
 
 
 def _moment(seconds: float) -> Any:

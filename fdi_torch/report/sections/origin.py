@@ -42,10 +42,8 @@ def health_section(material: Material) -> Section | None:
     problems = [*inspection.health.problems, *material.trouble]
     state = tag("span", "damaged", class_="bad") if problems else tag("span", "intact", class_="good")
     chunks = "chunk" if inspection.health.chunks == 1 else "chunks"
-    counted = (
-        f"{inspection.messages} messages on {len(inspection.topics)} topics in {inspection.health.chunks} {chunks}, "
-        f"{inspection.size} bytes"
-    )
+    on = "1 topic" if len(inspection.topics) == 1 else f"{len(inspection.topics)} topics"
+    counted = f"{inspection.messages} messages on {on} in {inspection.health.chunks} {chunks}, {inspection.size} bytes"
     topics = inspection.topics.values()
     rows = [[info.topic, str(info.messages), number(info.first), number(info.last)] for info in topics]
     messages = [_log_message(message) for message in material.of("/log")]

@@ -49,9 +49,8 @@ def refinement_section(material: Material) -> Section | None:
         lines.append(Line(f"start {lane + 1}", np.arange(len(start)), column(start, "cost"), colour))
     chart = Chart("Cost", "iteration", "cost", lines, log=True)
     lowest = float(np.nanmin(column(events, "cost")))
-    words = (
-        f"{len(events)} iterations from {len(lanes)} start{'s' if len(lanes) > 1 else ''}; lowest cost {lowest:.8g}."
-    )
+    starts = f"{len(lanes)} start{'s' if len(lanes) > 1 else ''}"
+    words = f"{len(events)} iterations from {starts}; lowest cost {number(lowest, 6)}."
     return Section("Refinement", [words, [signals("refinement_cost", chart)]])
 
 
@@ -73,6 +72,6 @@ def _best_members(material: Material, events: Sequence[Payload], steps: np.ndarr
             lines.append(
                 Line("simulated", steps, np.full(len(steps), scale * material.truth[name]), OTHER, dashed=True)
             )
-        chart = Chart(name, "generation", axis("best member", unit or "1"), lines, clock="search")
+        chart = Chart(name, "generation", axis("best member", unit), lines, clock="search")
         pictures.append(signals(f"search_parameter_{k + 1}", chart))
     return pictures

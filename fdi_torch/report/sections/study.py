@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import orjson
 from matplotlib.figure import Figure
 
 from fdi_torch.amounts import parameter_words
-from fdi_torch.effects import build_network, effect
+from fdi_torch.effects import build_network, effect, full_name
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.effect import Placement
 from fdi_torch.report.html import folded, short, table
@@ -33,7 +34,9 @@ def summary_section(material: Material) -> Section | None:
     names = list(dict.fromkeys(k for m in settings for k, v in m.items() if k not in _OWN and _shown(v) is not None))
     header = ["", *(str(m.get("group", "")) for m in settings)]
     rows = [["trials", *(str(m.get("trials", "")) for m in settings)]]
-    rows += [[name, *(_shown(m.get(name)) or "" for m in settings)] for name in names]
+    for name in names:
+        label, scale = _label_and_scale(material, name)
+        rows.append([label, *(_shown(m.get(name), scale) or "" for m in settings)])
     shown = table(header, rows)
     if len(rows) <= MOST_ROWS:
         return Section("Settings", [shown])
@@ -43,6 +46,15 @@ def summary_section(material: Material) -> Section | None:
     ]
     blocks = [table(header, [rows[0], *main]), folded(f"All {len(rows)} numbers of each setting", shown, printed=False)]
     return Section("Settings", [f"Estimator: {estimator}.", *blocks] if main else blocks[1:])
+
+
+def _label_and_scale(material: Material, name: str) -> tuple[str, float]:
+    """The name of a number, with its unit for display if it is an error of a parameter, and that unit's scale."""
+    parameter, _, quantity = name.partition(".")[2].rpartition(".")
+    if quantity not in ("bias", "bias_error", "rmse"):
+        return name, 1.0
+    unit, scale = _unit_of(material, parameter)
+    return axis(name, unit), scale
 
 
 def _main_words(name: str) -> str:
@@ -89,10 +101,22 @@ def _unit_of(material: Material, name: str) -> tuple[str, float]:
 
 
 def _parameters(material: Material, estimator: str, count: int) -> list[str]:
-    """Names of the parameters, from the summary's ESTIMATOR.PARAMETER.rmse; numbers if the summary has none."""
+    """Names of the parameters, from the summary's ESTIMATOR.PARAMETER.rmse or, in an unfinished study, from its
+    configuration; numbers if neither has them.
+    """
     keys = [k for m in material.of(SUMMARY)[:1] for k in m if k.startswith(f"{estimator}.") and k.endswith(".rmse")]
-    names = [key.removeprefix(f"{estimator}.").removesuffix(".rmse") for key in keys]
+    names = [key.removeprefix(f"{estimator}.").removesuffix(".rmse") for key in keys] or _configured(material)
     return names if len(names) == count else [f"parameter {i + 1}" for i in range(count)]
+
+
+def _configured(material: Material) -> list[str]:
+    """The parameters that the configuration in the log asks for; none if it cannot be read."""
+    try:
+        asked = orjson.loads(material.about("config").get("estimate.parameters", "[]"))
+        names = [str(each["name"]) for each in asked]
+        return [full_name(name, material.plant) for name in names] if material.plant else names
+    except (ValueError, TypeError, KeyError):
+        return []
 
 
 def trials_section(material: Material) -> Section | None:
@@ -144,12 +168,12 @@ def _column(trials: Sequence[Payload], group: str, name: str) -> np.ndarray:
     return np.array([float(v) for v in own if isinstance(v, int | float)])
 
 
-def _shown(value: Any) -> str | None:
+def _shown(value: Any, scale: float = 1.0) -> str | None:
     """Numbers, texts and short lists of them as text; None for values that do not fit a table."""
     if isinstance(value, bool | str):
         return str(value)
     if isinstance(value, int | float):
-        return number(float(value))
+        return number(scale * float(value))
     if isinstance(value, list) and len(value) <= 8:
         return ", ".join(number(float(v), 3) if isinstance(v, int | float) else str(v) for v in value)
     return None

@@ -1,0 +1,53 @@
+"""What pages say of numbers and names: digits, alignment, runs of one name, parameters of an unfinished study."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sample_runs import material_of, write_study
+
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.logbook import RunLog
+from fdi_torch.report.page import page, report_of
+from fdi_torch.report.sections.rehearsal import _texts
+
+
+def test_numbers_of_a_monitor_have_the_digits_that_their_standard_errors_justify(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "run.mcap", "monitor", env={}, git={}) as log:
+        told = "pump offset at Q (-1.072 ± 0.087 l/min), by hA-hB of 2026-11-24"
+        log.alarm(764.0, "explained", "Q.pump_offset", told, onset=700.4754, onset_std=0.31)
+    text = page([report_of(material_of(tmp_path / "run.mcap"))])
+    assert ">700.48<" in text and "700.475" not in text
+    assert "(−1.072 ± 0.087 l/min), by hA-hB of 2026-11-24" in text
+
+
+def test_an_interval_has_the_digits_of_its_estimate(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "run.mcap", "train", env={}, git={}) as log:
+        log.estimate(["T1.area"], [0.015441], [0.0002], [[0.0002**2]], "converged", units=["m^2"])
+    text = page([report_of(material_of(tmp_path / "run.mcap"))])
+    assert "154.4 ± 2.0" in text and ">150.5 … 158.3<" in text
+
+
+def test_runs_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    both = []
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        both.append(report_of(material_of(write_study(tmp_path / name / "leak.mcap"))))
+    index = page(both).split("</nav>")[0]
+    assert ">first/leak<" in index and ">second/leak<" in index
+
+
+def test_words_of_a_table_are_left_aligned() -> None:
+    assert _texts([["5 %", "fixed", "20"], ["20 %", "glr", "7"]]) == 2
+    assert _texts([["white", "24 (18 .. 40)"]]) == 1 and _texts([]) == 1
+
+
+def test_an_unfinished_study_names_its_parameters(tmp_path: Path) -> None:
+    asked = {"estimate": {"parameters": [{"name": "Q1.pump_offset"}]}}
+    with RunLog(tmp_path / "run.mcap", "study", config=asked, env={}, git={}) as log:
+        for k in range(4):
+            numbers = {"truth": [2e-6], "free": [2e-6 + 1e-7 * (k + 1)], "bound": [1e-7]}
+            log.trial(k, numbers, group="SNR 40 dB", seed=k, status="converged")
+    made = report_of(material_of(tmp_path / "run.mcap", load_plant("three_tank")))
+    axes = next(p for p in made.pictures if p.name == "errors_1").figure.axes[0]
+    assert axes.get_title(loc="left") == "pump offset at Q1" and axes.get_ylabel() == "size of the error, cm³/s"
