@@ -7,9 +7,10 @@ import torch
 from torch import Tensor
 
 from fdi_torch.effects import EFFECTS, build_network, place
+from fdi_torch.gap.free_form import FreeInflow
 from fdi_torch.parameters import ParameterSpace, by_prefix
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Effect, Stage, fits
+from fdi_torch.plant.effect import Effect, Placement, Stage, fits
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.array_program import BLOCK
@@ -122,3 +123,5 @@ def test_plants_share_a_trace_only_if_their_equations_are_the_same() -> None:
     assert first is same
     assert len({id(first), id(elsewhere), id(lower)}) == 3
     assert traced_rates(networks[0], names[:1]) is not first
+    free = (build_network(three_tank(), [Placement(FreeInflow({"level": [0.0, 0.6]}, s), "T1")]) for s in (1.0, 2.0))
+    assert len({id(traced_rates(network, names[:1])) for network in free}) == 2

@@ -151,7 +151,7 @@ inline bool inverse_factor(const double* s, double* inverse, double* log_det) {
     return true;
 }
 
-constexpr int64_t BLOCK = 32;
+constexpr int64_t BLOCK = 8;  // samples whose numbers of one column share a cache line
 
 // W columns of x (C, columns, S) from `first` on, at the samples from `start` on, side by side: block (length, C, W); and
 // back. Columns beyond the last are padding.

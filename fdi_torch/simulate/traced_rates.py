@@ -122,7 +122,7 @@ def traced_rates(network: TankNetwork, names: Sequence[str]) -> TracedRates:
     """The traced rates of a plant; plants of the same components and effects share one."""
     plant = network.description
     structure = type(network), network.may_overflow, plant.gravity, plant.tanks, *plant.flow_components()
-    effects = tuple((p.effect, p.location) for p in network.placements)
+    effects = tuple(p.effect for p in network.placements)  # the names of their constants hold their places
     return _shared(_Structure((structure, effects, network.constants.names, tuple(names)), network))
 
 
