@@ -26,6 +26,20 @@ def parse_quantity(text: str, unit: str) -> float:
         raise ValueError(f"expected a quantity in {unit} such as '1 {unit}', got '{shortened(text)}'") from error
 
 
+def parse_level_deviation(text: str, name: str) -> float:
+    """A standard deviation of levels, m: '3 mm', or a bare number in m.
+
+    Raises ValueError, naming the option `name`, for text that is not a positive length.
+    """
+    try:
+        value = parse_quantity(text if text.strip()[-1:].isalpha() else f"{text} m", "m")
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+    if not value > 0.0:
+        raise ValueError(f"{name}: expected a positive standard deviation such as '1 mm', got '{text}'")
+    return value
+
+
 @lru_cache(maxsize=256)
 def unit_factor(unit: str, si_unit: str) -> float:
     """The value of one `unit` in `si_unit`: unit_factor('cm', 'm') = 0.01."""

@@ -245,6 +245,17 @@ def test_planned_inputs_show_which_effects_are_hidden() -> None:
     assert ("sensor_saturation", "h1") in at_rest.hidden
 
 
+def test_planned_noise_is_that_of_the_level_whatever_unit_a_sensor_has() -> None:
+    plant, library = nominal_plant(), ("pump_gain", "plugging")
+    in_milliamperes = replace(
+        plant, sensors=tuple(replace(s, unit="A", gain=0.016 / 0.6, offset=0.004) for s in plant.sensors)
+    )
+    inputs = recorded({"P13.discharge_coefficient": 0.6}, 61, samples=300)
+    one, other = (planned_identifiability(p, inputs, 1e-3, library) for p in (plant, in_milliamperes))
+    assert other.hidden == one.hidden
+    assert other.shown == pytest.approx(one.shown)
+
+
 def test_named_causes_can_be_adopted() -> None:
     recording = recorded({"Q2.pump_gain.factor": 1.12}, 71, samples=600)
     answer = diagnose(nominal_plant(), recording, settings=Settings(("pump_gain", "sensor_bias@h1")))

@@ -16,17 +16,17 @@ from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.gap.identifiability import Identifiability, planned_identifiability
 from fdi_torch.jobs.gap import one_thread
+from fdi_torch.quantities import parse_level_deviation
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
-    if not arguments.noise > 0.0:
-        raise ValueError(f"--noise: expected a positive standard deviation, got {arguments.noise:g}")
+    noise = parse_level_deviation(arguments.noise, "--noise")
     plant = chosen_plant(arguments.plant)
     planned = named_recordings(arguments.recording, plant, Path.cwd())[0]
     for note in planned.notes:
         screen.note(note)
     with one_thread():
-        limits = planned_identifiability(plant, planned, arguments.noise, names(arguments.library) or None)
+        limits = planned_identifiability(plant, planned, noise, names(arguments.library) or None)
     _show(limits, screen)
     shown = {f"{place}.{name}": residual for (name, place), residual in limits.shown.items()}
     screen.result(

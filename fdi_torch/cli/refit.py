@@ -29,7 +29,7 @@ from fdi_torch.gap.free_runs.refit import Refit, refit
 from fdi_torch.jobs.gap import one_thread
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.quantities import display_unit
+from fdi_torch.quantities import display_unit, parse_level_deviation
 from fdi_torch.recording import Recording
 
 DISTURBED = (
@@ -44,10 +44,11 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     holdouts = [r for name in arguments.holdout for r in named_recordings(name, plant, Path.cwd())]
     for note in dict.fromkeys(note for r in (*recordings, *holdouts) for note in r.notes):
         screen.note(note)
+    white = parse_level_deviation(arguments.white, "--white") if arguments.white else None
     hold, vary, leave_out = (names(text) for text in (arguments.hold, arguments.vary, arguments.leave_out))
 
     def fitted_to(others: Sequence[Recording]) -> Refit:
-        return refit(plant, others, leave_out, arguments.step, hold, arguments.white, vary)
+        return refit(plant, others, leave_out, arguments.step, hold, white, vary)
 
     trials: list[LeftOutRun] = []
     with one_thread():

@@ -88,7 +88,7 @@ def _inseparable_pairs(
 def planned_identifiability(
     plant: PlantDescription, recording: Recording, noise: float, library: Sequence[str] | None = None
 ) -> Identifiability:
-    """Identifiability under planned inputs; readings are ignored. noise: standard deviation of a reading."""
+    """Identifiability under planned inputs; readings are ignored. noise: standard deviation of a sensor's level, m."""
     nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     step = float(torch.median(torch.diff(recording.time)))
     fitter = _noise_free(plant, nominal_effects, recording, step, noise)
@@ -111,7 +111,8 @@ def _noise_free(
         recording, outputs=blank, output_names=names, output_units=units, mask=torch.ones_like(blank, dtype=torch.bool)
     )
     data = data_set_of(plant, nominal_effects, planned, step)
-    white = Noise(torch.full((sensors,), noise, dtype=torch.float64), torch.zeros(sensors, dtype=torch.float64))
+    std = noise * torch.tensor([abs(s.gain) for s in plant.sensors], dtype=torch.float64)
+    white = Noise(std, torch.zeros_like(std))
     engine = Fitter(data, white).engine(Candidate(), ())
     theta = engine.space.nominal().unsqueeze(0)
     readings = engine.converge(theta, engine.constant_guess(theta)).readings[0]

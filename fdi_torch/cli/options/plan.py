@@ -10,13 +10,13 @@ import argparse
 
 from fdi_torch.cli.options import add_library, add_plant_and_recording
 
-NOISE = 1e-3
+NOISE = "1 mm"
 
 STEP, SUMMARY = "plan", "tell what planned inputs cannot show before an experiment"
 EXAMPLES = """
 examples:
   fdi plan --plant rig.yaml --recording planned.csv
-  fdi plan --plant rig.yaml --recording planned.csv --noise 5e-4 --library leak,plugging
+  fdi plan --plant rig.yaml --recording planned.csv --noise '0.5 mm' --library leak,plugging
 """
 
 
@@ -26,7 +26,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--noise",
         metavar="STD",
-        type=float,
         default=NOISE,
-        help=f"standard deviation of the readings' noise, SI ({NOISE:g}, which is {1e3 * NOISE:g} mm)",
+        help=f"standard deviation of the sensors' noise, as a level ({NOISE})",
     )

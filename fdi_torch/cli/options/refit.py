@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="values that may differ by recording; their variation is reported (* matches any name)",
     )
     parser.add_argument(
-        "--white", metavar="STD", type=float, help="treat errors as white, with this standard deviation, SI"
+        "--white", metavar="STD", help="treat errors as white, with this standard deviation of a level, such as '3 mm'"
     )
     parser.add_argument(
         "--leave-one-file-out",

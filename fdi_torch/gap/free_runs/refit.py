@@ -80,9 +80,10 @@ def refit(
     """Fit all effects and constants of a plant to recordings.
 
     step: of the simulation, s; None for half the sampling interval. leave_out: effects to remove from the plant. hold:
-    patterns of constants that are not fitted. white: standard deviation (SI) of white noise that replaces the estimated
-    noise. Use it for free runs with equations that are not quite the rig's: the estimated noise weights fast errors
-    more than slow ones. vary: patterns of further constants with a tolerance that each recording has for itself.
+    patterns of constants that are not fitted. white: standard deviation of white noise of the levels, m, that replaces
+    the estimated noise. Use it for free runs with equations that are not quite the rig's: the estimated noise weights
+    fast errors more than slow ones. vary: patterns of further constants with a tolerance that each recording has for
+    itself.
 
     Raises ValueError for a pattern that matches no name.
     """
@@ -107,7 +108,7 @@ def refit(
     start = {n: v for n, v in start.items() if n not in held_names}
     free = [p for p in placements if p.prefix in by_prefix(start)]
     std = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
-    size = 1e-2 * std if white is None else torch.full_like(std, white)
+    size = 1e-2 * std if white is None else white * std.new_tensor([abs(s.gain) for s in plant.sensors])
     fitter = Fitter(data, Noise(size, torch.zeros_like(std)))
     null = _with_a_trajectory(fit_by_continuation(fitter, Candidate()), recordings)
     fit, base = null, null if white is None else None
