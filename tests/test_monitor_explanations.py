@@ -19,16 +19,17 @@ def explanation(column: int, misfit: float, probability: float) -> HypothesisFit
     return HypothesisFit(Hypothesis((column,)), zeros, zeros, 0.0, 1.0, 0.0, misfit, 1.0, 2.0, probability=probability)
 
 
-def test_explanations_that_no_reading_distinguishes_are_ranked_by_their_sum() -> None:
+def test_explanations_are_ranked_by_probability_and_none_is_told_without_those_that_no_reading_distinguishes() -> None:
     fits = [
         explanation(0, 10.5, 0.44),
         explanation(1, 10.0, 0.30),
         explanation(2, 10.0, 0.22),
         explanation(3, 14.0, 0.04),
     ]
-    assert [f.hypothesis.columns[0] for f in merged(fits)] == [1, 2, 0, 3]
-    assert [f.hypothesis.columns[0] for f in credible_set(merged(fits), 0.95)] == [1, 2, 0]
-    assert [f.hypothesis.columns[0] for f in credible_set(merged(fits), 0.25)] == [1, 2]
+    assert [f.hypothesis.columns[0] for f in merged(fits)] == [0, 1, 2, 3]
+    assert [f.hypothesis.columns[0] for f in credible_set(merged(fits), 0.95)] == [0, 1, 2]
+    assert [f.hypothesis.columns[0] for f in credible_set(merged(fits), 0.7)] == [0, 1, 2]
+    assert [f.hypothesis.columns[0] for f in credible_set(merged(fits), 0.4)] == [0]
 
 
 def test_every_fault_is_fitted_when_a_wrong_explanation_no_longer_holds() -> None:

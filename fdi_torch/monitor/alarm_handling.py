@@ -259,9 +259,13 @@ class AlarmHandler:
             return state, events
         alarm = state.alarm(change.number)
         answer = self._answer_of(reported)
-        state = state.with_alarm(replace(alarm.with_state(answer), faults=tuple(self.space.names[c] for c in present)))
+        state = state.with_alarm(alarm.with_state(answer))
         kind = kind if kind == "revised" and alarm.state is answer else str(answer)  # type: ignore[assignment]
-        return state, [*events, self.writer.answered(state, change, reported, kind, announce or kind != "revised")]
+        event = self.writer.answered(state, change, reported, kind, announce or kind != "revised")
+        likeliest, *rivals = event.explanations
+        named = likeliest.restricted_to([self.space.names[c] for c in present])
+        state = state.with_alarm(replace(state.alarm(change.number), explanations=(named, *rivals)))
+        return state, [*events, event]
 
     @staticmethod
     def _answer_of(reported: Sequence[HypothesisFit]) -> State:

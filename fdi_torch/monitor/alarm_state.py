@@ -9,6 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fdi_torch.monitor.events import Explanation
 
 
 class State(StrEnum):
@@ -40,7 +44,8 @@ FOLLOWS: dict[State, frozenset[State]] = {
 class Alarm:
     """One alarm. number: from 1. first, last: time of the first and last threshold crossing, s; count: of crossings.
 
-    shares: of each sensor in the detector's statistic. faults: parameters that the likeliest explanation changes.
+    shares: of each sensor in the detector's statistic. explanations: those of its last answer, likeliest first; of the
+    first, the faults that did not recover.
     """
 
     number: int
@@ -49,7 +54,7 @@ class Alarm:
     shares: tuple[tuple[str, float], ...] = ()
     state: State = State.CONFIRMING
     count: int = 1
-    faults: tuple[str, ...] = ()
+    explanations: tuple[Explanation, ...] = ()
 
     @property
     def is_open(self) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from fdi_torch.amounts import estimate_words, parameter_words, sized_words
+from fdi_torch.amounts import estimate_words, parameter_words
 from fdi_torch.monitor.alarm_state import Alarm
 from fdi_torch.monitor.events import (
     Event,
@@ -55,7 +55,7 @@ class EventWriter:
         """The explanation of an alarm. fits: the reported explanations, likeliest first."""
         alarm, best = state.alarm(change.number), fits[0]
         explanations = tuple(self.explanation(f, state, change) for f in fits)
-        text = f"{headline(explanations)}, {_onset_text(best)}"
+        text = f"{headline(explanations)}, {_onset_text(best, best.hypothesis.incipient)}"
         interval = float(torch.diff(state.samples.time).median())
         if best.onset - state.reachable <= max(2.0 * best.onset_std, interval):
             text += ", where the observer starts: it may have been there before"
@@ -93,7 +93,7 @@ class EventWriter:
         """Recovery of the faults of one alarm. observable: whether the readings would show them if still present."""
         explanations = tuple(self.explanation(f, state, change) for f in fits)
         faults = ", ".join(map(parameter_words, names))
-        text = f"{faults}: back to nominal, {_onset_text(fits[0])}"
+        text = f"{faults}: back to nominal, {_onset_text(fits[0], fits[0].hypothesis.incipient)}"
         if " or " in headline(explanations):
             text += f"; {headline(explanations)}"
         if not observable:
@@ -105,11 +105,11 @@ class EventWriter:
     def end_shown(self, state: MonitorState, number: int, faults: Sequence[HiddenFault]) -> Event:
         """The end of hidden faults of one alarm, once the readings have shown it."""
         names = [parameter_words(self.space.names[f.track.column]) for f in faults]
-        ended = max(f.ended for f in faults)
+        last = max(faults, key=lambda f: f.ended)
         text = f"{', '.join(names)}: back to nominal, as the readings since {max(f.seen for f in faults):.1f} s show"
         nominal = [self.space.parameters[f.track.column] for f in faults]
         sizes = tuple(Size(p.name, p.nominal, 0.0, p.unit, estimate_words(p.name, p.unit, p.nominal)) for p in nominal)
-        explanations = (Explanation(1.0, sizes, ended, gone=True),)
+        explanations = (Explanation(1.0, sizes, last.ended, last.ended_std, gone=True),)
         return self._event(state, "recovered", text, state.alarm(number), explanations=explanations)
 
     def followed(
@@ -120,25 +120,30 @@ class EventWriter:
             self._event(
                 state,
                 "followed",
-                f"{self._track_text(t)}, since {t.onset:.1f} s",
+                self._tracks_text((explanation := self._tracks_explanation([t]),), [t]),
                 state.alarm(t.number),
-                explanations=(self._track_explanation(t),),
+                explanations=(explanation,),
                 announced=t in announced,
             )
             for t in tracks
         ]
 
     def summary(self, state: MonitorState, alarm: Alarm) -> Event:
-        """Summary of one alarm at the end of the recording."""
+        """Summary of one alarm at the end of the recording: the explanations of its last answer, with the present
+        sizes of the likeliest; only their names if its faults have gone.
+        """
         tracks = [t for t in state.tracks if t.number == alarm.number]
-        sizes = "; ".join(f"{self._track_text(t)}, since {t.onset:.1f} s" for t in tracks)
-        faults = sizes or ", ".join(map(parameter_words, alarm.faults))
+        faults = headline(alarm.explanations, sizes=False) if alarm.explanations else ""
+        explanations: tuple[Explanation, ...] = ()
+        if tracks:
+            likeliest, *rivals = alarm.explanations
+            explanations = (self._tracks_explanation(tracks, likeliest.mass), *rivals)
+            faults = self._tracks_text(explanations, tracks)
         if alarm.count > 1:
             times = f"raised {alarm.count} times, {alarm.first:g} s to {alarm.last:g} s"
         else:
             times = f"raised at {alarm.first:g} s"
         text = f"alarm {alarm.number}, {alarm.state}{': ' if faults else ''}{faults}; {times}"
-        explanations = tuple(self._track_explanation(t) for t in tracks)
         return self._event(state, "summary", text, alarm, explanations=explanations)
 
     def explanation(self, fit: HypothesisFit, state: MonitorState, change: DetectedChange | None = None) -> Explanation:
@@ -176,18 +181,17 @@ class EventWriter:
             urgencies += [matter.urgency] if matter and large and matter.urgency else []
         return ", ".join(dict.fromkeys(urgencies)), any(announced)
 
-    def _track_explanation(self, track: FaultTrack) -> Explanation:
-        size = self._track_size(track)
-        return Explanation(1.0, (size,), track.onset, None, size.rate is not None)
+    def _tracks_explanation(self, tracks: Sequence[FaultTrack], mass: float = 1.0) -> Explanation:
+        """The present sizes of known faults as one explanation, with the onset of the first."""
+        sizes = tuple(size_of(self.space.parameters[t.column], *t.last[1:], t.rate) for t in tracks)
+        first = min(tracks, key=lambda t: t.onset)
+        return Explanation(mass, sizes, first.onset, first.onset_std, any(s.rate is not None for s in sizes))
 
-    def _track_size(self, track: FaultTrack) -> Size:
-        _, size, std = track.last
-        return size_of(self.space.parameters[track.column], size, std, track.rate)
-
-    def _track_text(self, track: FaultTrack) -> str:
-        size = self._track_size(track)
-        rate = [f"changes by {rate_text(self.space[size.name], size.rate)}"] if size.rate is not None else []
-        return sized_words(size.name, [size.shown, *rate])
+    def _tracks_text(self, explanations: Sequence[Explanation], tracks: Sequence[FaultTrack]) -> str:
+        """The explanations, the likeliest of which consists of known faults, with the onset and growth of these."""
+        since = ", ".join(dict.fromkeys(_onset_text(t) for t in tracks))
+        rates = [rate_text(self.space[s.name], s.rate) for s in explanations[0].sizes if s.rate is not None]
+        return f"{headline(explanations)}, {since}" + (f"; changes by {', '.join(rates)}" if rates else "")
 
     def _event(self, state: MonitorState, kind: Kind, text: str, alarm: Alarm | None = None, **more: object) -> Event:
         off = (state.believed != state.healthy).nonzero().flatten().tolist()
@@ -200,6 +204,5 @@ class EventWriter:
         )  # fmt: skip
 
 
-def _onset_text(fit: HypothesisFit) -> str:
-    manner = "growing since" if fit.hypothesis.incipient else "since"
-    return f"{manner} {fit.onset:.1f} ± {fit.onset_std:.2g} s"
+def _onset_text(change: HypothesisFit | FaultTrack, growing: bool = False) -> str:
+    return f"{'growing since' if growing else 'since'} {change.onset:.1f} ± {change.onset_std:.2g} s"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 from fdi_torch.amounts import amount_words, estimate_words, parameter_words, sized_words
@@ -73,6 +73,15 @@ class Explanation:
         if not self.sizes:
             return "chance"
         return " and ".join(_words(sizes, self.gone) for sizes in _by_effect(self.sizes))
+
+    @property
+    def causes(self) -> str:
+        """The text without sizes."""
+        return " and ".join(parameter_words(sizes[0].name) for sizes in _by_effect(self.sizes)) or self.text
+
+    def restricted_to(self, names: Sequence[str]) -> Explanation:
+        """The explanation with the sizes of some parameters only."""
+        return replace(self, sizes=tuple(s for s in self.sizes if s.name in names))
 
 
 @dataclass(frozen=True)
@@ -187,11 +196,13 @@ class Event:
         return {**fields, **_plain({**likeliest, "onset_std": self.onset_std}), "headline": self.headline}
 
 
-def headline(explanations: Sequence[Explanation]) -> str:
+def headline(explanations: Sequence[Explanation], sizes: bool = True) -> str:
+    """The explanations above 5 %, likeliest first, with their probabilities if there are several. sizes: name them."""
     named = [e for k, e in enumerate(explanations) if k == 0 or e.mass >= SMALLEST_SHARE]
+    texts = [e.text if sizes else e.causes for e in named]
     if len(named) == 1:
-        return named[0].text
-    return ", or ".join(f"{e.text}, {percent_text(e.mass)}" for e in named)
+        return texts[0]
+    return ", or ".join(f"{text}, {percent_text(e.mass)}" for text, e in zip(texts, named, strict=True))
 
 
 def _by_effect(sizes: Sequence[Size]) -> list[list[Size]]:

@@ -132,23 +132,15 @@ def with_posterior(fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
 
 
 def merged(fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
-    """One fit for each set of changed parameters, with the summed probability.
+    """One fit for each set of changed parameters, likeliest first.
 
-    Sudden and incipient changes of the same parameters count as one explanation. Explanations that no reading
-    distinguishes share their probability: they follow one another, and the likeliest such group comes first.
+    Sudden and incipient changes of the same parameters count as one explanation, with the sum of their probabilities.
     """
     each: dict[tuple[tuple[int, ...], tuple[int, ...]], HypothesisFit] = {}
     for f in sorted(fits, key=lambda fit: -fit.probability):
         key = f.hypothesis.columns, f.hypothesis.recovered
         each[key] = replace(each[key], probability=each[key].probability + f.probability) if key in each else f
-    groups: list[list[HypothesisFit]] = []
-    for f in sorted(each.values(), key=lambda fit: -fit.probability):
-        same = next((group for group in groups if _indistinguishable(f, group[0])), None)
-        if same is None:
-            groups.append([f])
-        else:
-            same.append(f)
-    return [f for group in sorted(groups, key=_total, reverse=True) for f in group]
+    return sorted(each.values(), key=lambda fit: -fit.probability)
 
 
 def credible_set(fits: Sequence[HypothesisFit], level: float = 0.95) -> list[HypothesisFit]:
@@ -158,14 +150,10 @@ def credible_set(fits: Sequence[HypothesisFit], level: float = 0.95) -> list[Hyp
     """
     chosen: list[HypothesisFit] = []
     for f in fits:
-        if _total(chosen) >= level and not any(_indistinguishable(f, c) for c in chosen):
+        if sum(c.probability for c in chosen) >= level and not any(_indistinguishable(f, c) for c in chosen):
             continue
         chosen.append(f)
     return chosen
-
-
-def _total(fits: Sequence[HypothesisFit]) -> float:
-    return sum(f.probability for f in fits)
 
 
 def _indistinguishable(a: HypothesisFit, b: HypothesisFit) -> bool:

@@ -103,10 +103,12 @@ def updated_tracks(
         now = state.now, float(state.believed[column]), float(fit.std[column])
         if earlier is not None and earlier.number == change.number:
             start = (fit.onset, float(change.before[column]), 0.0) if fit.hypothesis.incipient else earlier.first
-            tracks.append(replace(earlier, onset=fit.onset, first=start, last=now, effect_rms=effect_rms(column)))
+            moved = replace(earlier, onset=fit.onset, onset_std=fit.onset_std)
+            tracks.append(replace(moved, first=start, last=now, effect_rms=effect_rms(column)))
             continue
         start = (fit.onset, float(change.before[column]), 0.0) if fit.hypothesis.incipient else now
-        tracks.append(FaultTrack(column, change.number, fit.onset, start, now, effect_rms(column), state.now))
+        onset, effect = (fit.onset, fit.onset_std), effect_rms(column)
+        tracks.append(FaultTrack(column, change.number, *onset, start, now, effect, state.now))
     return replace(state, tracks=tuple(tracks))
 
 
@@ -185,10 +187,10 @@ def _is_recovered(space: ParameterSpace, change: DetectedChange, column: int) ->
 
 def with_hidden(observer: ObserverBank, state: MonitorState, change: DetectedChange) -> MonitorState:
     """The state with the faults that recovered at a change but that the readings since would not show."""
-    onset, now = change.best.onset, state.now
+    best, now = change.best, state.now
     hidden = [t for t in change.ended if not _recovery_is_observable(observer, state, change, t)]
-    new = [HiddenFault(t, float(change.before[t.column]), onset, now) for t in hidden]
-    judged = {*change.best.hypothesis.columns, *state.off_nominal.nonzero().flatten().tolist()}
+    new = [HiddenFault(t, float(change.before[t.column]), best.onset, best.onset_std, now) for t in hidden]
+    judged = {*best.hypothesis.columns, *state.off_nominal.nonzero().flatten().tolist()}
     return replace(state, hidden=(*(h for h in state.hidden if h.track.column not in judged), *new))
 
 

@@ -19,14 +19,15 @@ from fdi_torch.monitor.samples import ClockState, Samples
 class FaultTrack:
     """The size of a known fault over time.
 
-    column: of the parameter space. number: of its alarm. onset: s. first, last: (time in s, size, standard deviation)
-    of the first and the latest estimate. effect_rms: root mean square of what the fault adds to the white residuals.
-    announced: when its size was last announced, s. adjusted: onset of the latest change of size, s.
+    column: of the parameter space. number: of its alarm. onset, onset_std: s. first, last: (time in s, size, standard
+    deviation) of the first and the latest estimate. effect_rms: root mean square of what the fault adds to the white
+    residuals. announced: when its size was last announced, s. adjusted: onset of the latest change of size, s.
     """
 
     column: int
     number: int
     onset: float
+    onset_std: float
     first: tuple[float, float, float]
     last: tuple[float, float, float]
     effect_rms: float
@@ -45,12 +46,13 @@ class FaultTrack:
 class HiddenFault:
     """A fault that seems to have ended, but that the readings since would not show, for example in a dry tank.
 
-    track: before it ended. size: before it ended. ended: s. seen: until when the readings were examined, s.
+    track: before it ended. size: before it ended. ended, ended_std: s. seen: until when the readings were examined, s.
     """
 
     track: FaultTrack
     size: float
     ended: float
+    ended_std: float
     seen: float
 
 

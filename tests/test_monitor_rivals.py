@@ -1,0 +1,66 @@
+"""Rival explanations of an alarm: their order, and what the last line says of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdi_torch.monitor.events import SMALLEST_SHARE, percent_text
+from tests.sessions import BLOCK, run_command
+from tests.test_monitor import SPACE, followed, monitor, recorded, step_to
+
+TUTORIAL = Path(__file__).parents[1] / "docs" / "tutorial.md"
+
+
+@pytest.fixture(scope="module")
+def rivals(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
+    """Events of the tutorial's rig and leak if the monitor has the nominal plant: three causes remain."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("rig"))
+        for _, title, body in BLOCK.findall(TUTORIAL.read_text(encoding="utf-8")):
+            if title:
+                Path(title).write_text(body, encoding="utf-8")
+        faults = "simulate.faults={Q.pump_lag: 8 s, A.leak: 0.2, A.leak.onset: 700 s}"
+        changes = f"--set output.name=live --set simulate.duration='1000 s' --set '{faults}'"
+        run_command(f"fdi simulate --config record.yaml --out . --seed 4 {changes}")
+        lines = run_command("fdi monitor --config watch.yaml --set plant=rig.yaml --json --quiet")
+    return [json.loads(line) for line in lines]
+
+
+def test_explanations_are_named_likeliest_first(rivals: list[dict[str, Any]]) -> None:
+    told = [event for event in rivals if len(event["explanations"]) > 1]
+    assert [event["kind"] for event in told] == ["explained", "revised", "revised", "summary"]
+    for event in told:
+        masses = [e["mass"] for e in event["explanations"]]
+        assert masses == sorted(masses, reverse=True) and 0.95 <= sum(masses) <= 1.0 + 1e-9
+        places = [event["headline"].index(percent_text(mass)) for mass in masses if mass >= SMALLEST_SHARE]
+        assert len(places) == 3 and places == sorted(places)
+        assert event["faults"] == ["A.leak.size"]
+
+
+def test_the_summary_names_every_rival_and_the_error_of_its_onset(rivals: list[dict[str, Any]]) -> None:
+    *_, last, summary = rivals
+    assert (last["kind"], summary["kind"]) == ("revised", "summary")
+    assert summary["headline"] == last["headline"] and summary["explanations"] == last["explanations"]
+    assert f"alarm 1, explained: {last['headline']}, since 700.5 ± 0.99 s; raised at 715 s" == summary["text"]
+    assert summary["onset_std"] == last["onset_std"] > 0.0
+
+
+def test_the_summary_of_a_growing_fault_has_its_size_at_the_last_report_and_its_growth() -> None:
+    watch = monitor(lookback=60.0, confirm=20.0, incipient=True)
+    state, events = followed(watch, recorded(lambda t: SPACE.vector({"T3.leak.size": 2e-4 * max(t - 150.0, 0.0)}), 420))
+    [summary] = watch.close(state)
+    last = [event for event in events if event.faults][-1]
+    assert summary.growing and summary.sizes == last.sizes and summary.onset_std == last.onset_std
+    assert "leak at T3 (size 0.0" in summary.text and "; changes by 0.7" in summary.text
+
+
+def test_the_summary_of_a_fault_that_has_gone_names_it_without_a_size() -> None:
+    watch = monitor()
+    state, events = followed(watch, recorded(step_to("T3.leak.size", 0.05, 200.0, 400.0), 700))
+    assert any(event.kind == "recovered" for event in events)
+    summary = watch.close(state)[0]
+    assert summary.text.startswith("alarm 1, recovered: leak at T3; raised ") and not summary.explanations
