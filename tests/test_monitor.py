@@ -18,6 +18,7 @@ from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, place
+from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.monitor.alarm_state import State
@@ -338,6 +339,15 @@ def test_misuse_is_refused() -> None:
     late = build_network(PLANT, [place("pump_delay", "Q1")])
     with pytest.raises(ValueError, match="without pure delays, got Q1"):
         ObserverBank(late, SPACE, noise().gain, noise().whitening)
+
+
+def test_no_range_goes_beyond_a_fully_open_valve() -> None:
+    plant, time = load_plant("dts200"), torch.arange(9, dtype=torch.float64)
+    name = "LM.valve_leak.size"
+    assert end_reached(build_network(plant, [place("valve_leak", "LM")]).constants[name], 1.0) is None
+    part = blank_recording(plant, torch.zeros(9, len(plant.channels()), dtype=torch.float64), time)
+    with pytest.raises(ValueError, match=f"{name}: expected a range that ends at 1, a physical limit, got 0 to 2"):
+        prepare_monitor(plant, part, [name], ranges={name: (0.0, 2.0)})
 
 
 def test_a_fault_may_be_named_by_its_effect_alone(tmp_path: Path) -> None:

@@ -19,7 +19,9 @@ class ValveLeak(Effect):
     mistaken_for = ("valve_dead_zone", "actuator_stuck", "valve_characteristic", "leak", "cross_flow", "plugging")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("size", "1", 0.0, 0.0, 1.0, meaning="flow when closed relative to fully open"),)
+        return (
+            Parameter("size", "1", 0.0, 0.0, 1.0, meaning="flow when closed relative to fully open", extremes=(1.0,)),
+        )
 
     def command(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         return value + p["size"] * (1.0 - value), memory

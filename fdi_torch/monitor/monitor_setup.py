@@ -97,6 +97,12 @@ def prepare_monitor(
         if ParameterName.parse(name).field == "phase":  # a full turn either way, so that no fit stops at +-pi
             space = space.with_changes(name, low=-2.0 * math.pi, high=2.0 * math.pi)
     for name, (low, high) in (ranges or {}).items():
+        for limit in space[name].extremes:
+            if low < limit < high:  # nothing changes beyond it, and a fit would stop at the kink there
+                raise ValueError(
+                    f"ranges: {name}: expected a range that ends at {limit:g}, a physical limit, "
+                    f"got {low:g} to {high:g}; leave out what lies beyond it"
+                )
         space = space.with_changes(name, low=low, high=high)
     believed = space.vector(values)
     samples = samples_of_recording(fault_free, plant)
