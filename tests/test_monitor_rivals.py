@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from fdi_torch.monitor.events import SMALLEST_SHARE, percent_text
+from fdi_torch.monitor.events import SMALLEST_SHARE, Explanation, Size, headline, percent_text
 from tests.sessions import BLOCK, run_command
 from tests.test_monitor import SPACE, followed, monitor, recorded, step_to
 
@@ -64,3 +65,21 @@ def test_the_summary_of_a_fault_that_has_gone_names_it_without_a_size() -> None:
     assert any(event.kind == "recovered" for event in events)
     summary = watch.close(state)[0]
     assert summary.text.startswith("alarm 1, recovered: leak at T3; raised ") and not summary.explanations
+
+
+def test_a_headline_has_the_likeliest_and_every_rival_above_5_percent() -> None:
+    names = ("A.leak.size", "Q.pump_gain.factor", "hA.sensor_bias.bias")
+    shares = zip(names, (0.9, 0.06, 0.04), strict=True)
+    told = [Explanation(mass, (Size(name, 0.1, 0.01, "1", "size 0.1"),)) for name, mass in shares]
+    assert headline(told) == "leak at A (size 0.1), 90 %, or pump gain at Q (size 0.1), 6 %"
+    assert headline(told, sizes=False) == "leak at A, 90 %, or pump gain at Q, 6 %"
+    assert headline(told[2:]) == "sensor bias at hA (size 0.1)"
+
+
+def test_a_gap_in_the_fault_free_part_does_not_end_the_learning() -> None:
+    watch, samples = monitor(), recorded(step_to("T3.leak.size", 0.1, 60.0), 200)
+    time = samples.time.clone()
+    time[100:] += 60.0
+    start = watch.start(samples, learning_until=1000.0)
+    state, events = watch.advance(start, replace(samples, time=time).segment(1, 200))
+    assert [event.kind for event in events] == ["notice"] and state.learning_until == 1000.0

@@ -14,7 +14,7 @@ from fdi_torch.config.plant_file import load_plant
 from fdi_torch.monitor.alarm_state import FOLLOWS, Alarm, State
 from fdi_torch.monitor.detection import CHARTS, make_detector
 from fdi_torch.monitor.events import Event
-from fdi_torch.monitor.monitor import Monitor
+from fdi_torch.monitor.monitor import Monitor, ResidualTrace
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
 from fdi_torch.monitor.samples import ABSENT, ClockState, Samples, samples_of_recording, split_at_gaps
@@ -155,6 +155,20 @@ def test_a_misfit_that_has_passed_does_not_hide_a_change() -> None:
     first = int((statistic > watch.detector.threshold).to(torch.int8).argmax())
     assert 260 + first in range(400, 410)
     assert torch.equal(residuals_to_test(replace(state, believed=state.healthy), 499, reach)[100:], white[101:])
+
+
+def test_on_a_slow_clock_as_many_residuals_are_kept_as_the_detector_compares_with() -> None:
+    """The state keeps `longest` + `lookback` seconds, here 18 samples; the detector compares with 60 residuals."""
+    watch, samples = monitor(lookback=60.0, longest=100.0), recorded(lambda t: SPACE.nominal(), 1800)
+    rows, traces = torch.arange(0, 1800, 9), []
+    slow = replace(samples, time=samples.time[rows], inputs=samples.inputs[rows], readings=samples.readings[rows])
+    for chunk in (1, 199):
+        state = watch.start(slow, SPACE.vector({"T1.leak.size": 0.1}), learning_until=1e9)
+        parts: list[ResidualTrace] = []
+        for first in range(1, 200, chunk):
+            state, _ = watch.advance(state, slow.segment(first, first + chunk), parts.append)
+        traces.append(torch.cat([part.statistic for part in parts]))
+    assert torch.equal(*traces)
 
 
 def drained(mouth: float, seconds: int, folder: Path) -> list[Event]:
