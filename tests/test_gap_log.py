@@ -131,7 +131,7 @@ def test_an_ambiguous_answer_writes_the_next_input(tmp_path: Path, capsys: pytes
     limits = json.loads(capsys.readouterr().out)
     assert set(limits["shown"]) == {f"{q}.{e}" for q in ("Q1", "Q2") for e in ("pump_lag", "pump_delay")}
     assert cli.main(["plan", *planned_words, "--noise", "0"]) == cli.MISUSE
-    assert "--noise: expected a positive standard deviation, got 0" in capsys.readouterr().err
+    assert "--noise: expected a positive standard deviation such as '1 mm', got '0'" in capsys.readouterr().err
 
 
 def test_nothing_to_adopt_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,7 +23,7 @@ from torch import Tensor
 from fdi_torch.estimate.kalman import SCATTER, KalmanFilter, Propagation, Score, SensorNoise, StateNoise
 
 CORRELATION_TIMES = (0.0, 5.0, 20.0, 80.0, 320.0)  # grid of candidates, in sampling intervals; 0: white
-LIKELIHOOD_TOLERANCE = 0.1  # nats; the optimisation ends when an iteration gains less or the slopes promise less
+LIKELIHOOD_TOLERANCE = 0.1  # nats; the optimisation ends when an iteration gains less
 RIDGE = 1e-12  # relative to a unit curvature: keeps parameters without information in the data in place
 MIN_DETERMINED = 1e-2  # lower limit on the effective number of readings per parameter, for its scaling
 LOG_BOUND = 10.0  # bound on |log(intensity / unit)| and |log(scale)| in the optimisation
@@ -171,15 +171,13 @@ class _Problem:
             likeliest = max(likeliest, (value, score), key=itemgetter(0))
             return (start_value - value) / samples, -score.slope.numpy() / samples / unit
 
-        # With unit curvature, a slope g of each of N variables promises a gain of N g^2 / 2.
-        negligible_slope = math.sqrt(2.0 * LIKELIHOOD_TOLERANCE / samples / len(x_start))
         optimum = minimize(
             cost,
             x_start.clip(-LOG_BOUND * unit, LOG_BOUND * unit),
             jac=True,
             method="L-BFGS-B",
             bounds=[(-LOG_BOUND * u, LOG_BOUND * u) for u in unit],
-            options={"ftol": LIKELIHOOD_TOLERANCE / samples, "gtol": negligible_slope},
+            options={"ftol": LIKELIHOOD_TOLERANCE / samples, "gtol": LIKELIHOOD_TOLERANCE / samples},
         )
         noise, value = noise_at(optimum.x / unit), start_value - float(optimum.fun) * samples
         return Likelihood(noise, value, start_value, bool(optimum.success), likeliest[1].determined)
