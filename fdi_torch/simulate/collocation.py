@@ -124,6 +124,8 @@ class Collocation:
         Newton steps on a whole trajectory that reaches a rim or a floor move the time of the kink by few steps at a
         time, because the slopes on the other side of it hold until then. A segment that does not converge is halved.
         """
+        if len(theta) > 1:  # each lane by itself: the length of its segments does not depend on the others
+            return torch.cat([self.converge_in_segments(lane) for lane in theta.split(1)])
         path = self._path(theta, self.constant_guess(theta))
         first, length, last = 0, SEGMENT, path.shape[-1] - 1
         while first < last:
