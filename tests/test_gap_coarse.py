@@ -1,13 +1,23 @@
 """Recordings with long sampling intervals, and tanks without a sensor."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from fdi_torch.config.plant_file import load_plant
+from fdi_torch.effects import build_network, effect
 from fdi_torch.gap.channel_noise import estimate_noise
+from fdi_torch.gap.dataset import data_set_of, step_errors
 from fdi_torch.gap.problem import checked_data_set
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of, with_simulated_levels
 from fdi_torch.recording import Recording
+from fdi_torch.simulate.collocation import Collocation
+from fdi_torch.simulate.experiment import Experiment, divided, lay_out
+from fdi_torch.simulate.reference_engine import ReferenceEngine
+from tests.rigs import constant_inputs, three_tank
 from tests.test_gap import nominal_plant, recorded
 
 
@@ -45,3 +55,51 @@ def test_samples_far_apart_are_simulated_in_shorter_steps() -> None:
         for n in (1, 5, 10, 12)
     ]
     assert steps == pytest.approx([1.0, 2.5, 2.5, 2.4], abs=1e-12)
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_the_error_of_a_step_follows_from_third_differences(every: int) -> None:
+    """Samples `every` steps apart, of a cubic: h = 0.1 + 2e-4 t^3, so that dt^3 h''' / 24 = 5e-5 dt^3."""
+    blank = constant_inputs(nominal_plant(), 8.0, sample=every)
+    cubic = (0.1 + 2e-4 * blank.time**3).unsqueeze(1).expand(-1, 3)
+    flat = torch.full_like(cubic, 0.1)
+    noise = torch.tensor([1e-3, 1e-3, 2e-3], dtype=torch.float64)
+    for readings, error in ((torch.stack([flat[:, 0], flat[:, 1], cubic[:, 2]], dim=1), 5e-5 / 2e-3), (flat, 0.0)):
+        part = data_set_of(nominal_plant(), (), replace(blank, outputs=readings, mask=None), 1.0).parts[0]
+        assert step_errors(part, noise).tolist() == pytest.approx([error] * len(part.experiment.steps), abs=1e-9)
+
+
+def test_steps_in_which_a_level_moves_fast_are_divided() -> None:
+    """T1 starts 10 cm above the crest of a wide overflow, and falls to it within two seconds."""
+    plant = three_tank(start=(0.5, 0.2, 0.1))
+    notch = Placement(effect("overflow"), "T1", {"below_rim": 0.6, "crest": 0.2})
+    blank, network = constant_inputs(plant, 200.0, sample=1.0), build_network(plant, [notch])
+    space = ParameterSpace([network.constants["P13.discharge_coefficient"]])
+    theta = space.nominal().unsqueeze(0)
+    exact = ReferenceEngine(network, space, lay_out(blank, plant.channels(), 0.02)).readings(theta)[0]
+    std = 1e-3  # m
+    noise = std * torch.randn(exact.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    data = data_set_of(plant, (), replace(blank, outputs=exact + noise, mask=None), 1.0)
+    assert len(data.experiment.steps) < len(blank) + 20, "steps in which all levels move slowly are not divided"
+    assert torch.equal(data.experiment.sample_times, blank.time)
+    assert torch.equal(data.experiment.nodes[data.experiment.sample_step[1:] + 1], blank.time[1:])
+
+    def error(experiment: Experiment) -> float:
+        engine = Collocation(network, space, experiment)
+        return float((engine.converge(theta, engine.constant_guess(theta)).readings[0] - exact).abs().max())
+
+    assert error(lay_out(blank, plant.channels(), 1.0)) > 20.0 * std
+    assert error(data.experiment) < std
+
+
+def test_divided_steps_keep_the_inputs_and_their_means() -> None:
+    recording = recorded({}, 3, samples=200)
+    whole = lay_out(recording, nominal_plant().channels(), 1.0)
+    counts = torch.ones(len(whole.steps), dtype=torch.int64)
+    counts[4], counts[69], counts[-1] = 3, 2, 4
+    parts = divided(whole, counts)
+    assert len(parts.steps) == int(counts.sum())
+    assert parts.steps[4:7].tolist() == pytest.approx([1.0 / 3.0] * 3)
+    assert parts.resolution[[3, 4, 7]].tolist() == pytest.approx([1.0, 1.0 / 3.0, 1.0])
+    volume = torch.cumsum(parts.inputs * parts.steps.unsqueeze(1), 0)[torch.cumsum(counts, 0) - 1]
+    assert torch.allclose(volume, torch.cumsum(whole.inputs * whole.steps.unsqueeze(1), 0), rtol=1e-12, atol=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -14,9 +14,10 @@ SAME_INSTANT = 1e-9  # s; closer than this, two instants differ by rounding only
 
 @dataclass(frozen=True)
 class Clock:
-    """One integration step, or one sampling interval, [start, start + step] in s.
+    """Integration steps, or sampling intervals, [start, start + step] in s.
 
-    resolution: the shortest time that the integrator resolves, s; it sets the smoothing of square roots and rims.
+    resolution: the shortest time that the integrator resolves, s, one for all steps or one for each; it sets the
+    smoothing of square roots and rims.
     explicit: whether the steps are stable only for rates of change below about 2 / resolution.
     """
 
@@ -32,6 +33,15 @@ class Clock:
     @property
     def end(self) -> torch.Tensor:
         return self.start + self.step
+
+    def part(self, steps: slice) -> Clock:
+        """The clock of some of the steps (K,)."""
+        return replace(
+            self,
+            start=self.start[steps],
+            step=self.step[steps],
+            resolution=self.resolution.expand_as(self.step)[steps],
+        )
 
     def share_after(self, instant: torch.Tensor) -> torch.Tensor:
         """Share of the step after `instant`: the exact mean over the step of a switch at that instant."""
@@ -79,6 +89,10 @@ class CumulativeSignal:
         self.slopes = torch.cat([values[:1], mean, values[-1:]])  # slope of the integral before, between, after samples
         steps = torch.diff(time).unsqueeze(1)
         self.integral = torch.cat([torch.zeros_like(values[:1]), torch.cumsum(mean * steps, dim=0)])
+
+    @property
+    def channels(self) -> int:
+        return self.integral.shape[1]
 
     def up_to(self, instant: torch.Tensor, channel: int) -> torch.Tensor:
         """The integral from the first sample to `instant`, any shape."""

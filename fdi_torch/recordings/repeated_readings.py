@@ -39,9 +39,10 @@ class Scatter:
 
 
 def resolution(values: Tensor) -> float:
-    """The smallest difference of two distinct values, apart from rounding in the file; 0 for a constant."""
-    steps = torch.diff(values.unique())
-    steps = steps[steps > 1e-9 * float(values.abs().max())]
+    """The smallest difference of two distinct values (n,), apart from rounding in the file; 0 for fewer than two."""
+    distinct = values.unique()
+    steps = torch.diff(distinct)
+    steps = steps[steps > 1e-9 * distinct[1:].abs()]
     return float(steps.min()) if len(steps) else 0.0
 
 
@@ -51,7 +52,7 @@ def scatter(values: Tensor) -> Scatter:
     Second differences of white noise quantized in steps q have the variance 6 (s^2 + q^2 / 12); those of the level are
     small. noise is 0 if the readings scatter by less than a step.
     """
-    step = resolution(values) if len(values) else 0.0
+    step = resolution(values)
     if len(values) < 3 or step == 0.0:
         return Scatter(0.0, step)
     total = float(torch.diff(values, n=2).abs().median()) / (NORMAL_MEDIAN * math.sqrt(6.0))

@@ -92,8 +92,7 @@ class NetworkStage:
         return self.outputs(signals, memory, self.clock, with_parameters(self.values, self.names, theta))
 
     def first(self, signals: Signals, theta: Signals) -> Memory:
-        first = Clock(self.clock.start[:1], self.clock.step[:1], self.clock.resolution)
-        return self.steady(signals, first, with_parameters(self.values, self.names, theta))
+        return self.steady(signals, self.clock.part(slice(1)), with_parameters(self.values, self.names, theta))
 
 
 def with_parameters(values: PlaceValues, names: Sequence[str], theta: Signals) -> PlaceValues:

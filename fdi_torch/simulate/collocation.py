@@ -204,7 +204,8 @@ class Collocation:
         values, tanks = self.network.bind(self.space, theta.unsqueeze(-2)), len(self._rims)
         held = [torch.cat([c, c[:, -1:]], dim=1) for c in self._commands(values, [], len(theta))[0]]
         clock, last = self._actuation.clock, slice(-1, None)
-        clock = Clock(self.experiment.nodes, torch.cat([clock.step, clock.step[last]]), clock.resolution)
+        step, resolution = (torch.cat([x, x[last]]) for x in (clock.step, clock.resolution.expand_as(clock.step)))
+        clock = Clock(self.experiment.nodes, step, resolution)
         state = self.network.with_steady_states(path[:, :tanks].unbind(1), held, clock, values)
         return torch.stack([x.expand(path[:, 0].shape) for x in state], dim=1)
 
@@ -225,7 +226,7 @@ class Collocation:
         """Complete the levels at the start (L, tanks) and their slopes by those of effects in steady state."""
         lanes, tanks = start.shape
         commands, command_slopes, columns = self._commands(values, moving, lanes)
-        clock = Clock(self.experiment.nodes[:1], self.experiment.steps[:1], self.experiment.resolution)
+        clock = self._actuation.clock.part(slice(1))
         count = tanks + len(commands)
 
         def steady(x: list[Tensor]) -> list[Tensor]:
@@ -266,13 +267,12 @@ class Collocation:
         network = self.network if reaches_rim else self._without_overflow
         values, moving = self.network.bind(self.space, theta.unsqueeze(-2)), self._columns(theta) if slopes else []
         commands, command_slopes, columns = self._commands(values, moving, len(theta))
-        clock = self._actuation.clock
         found = traced_rates(network, self.space.names)(
             middle,
             [command[:, part] for command in commands],
             theta,
             network.nominal,
-            Clock(clock.start[part], clock.step[part], clock.resolution),
+            self._actuation.clock.part(part),
             driven=[i for i, slopes in enumerate(command_slopes) if slopes is not None],
             moved=self._moved if slopes else [],
         )

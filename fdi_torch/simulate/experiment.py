@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from fdi_torch.capacity import expect_room
@@ -24,7 +24,8 @@ class Experiment:
     nodes (K+1,) s: the ends of the steps, which coincide with the switches of a held input where possible. inputs (K,
     channels): exact mean of each channel over each step; signal: the same for any delayed interval. sample_times (S,)
     s; sample k is at the fraction `sample_share` (0..1] of step `sample_step` (the first one at 0 of step 0).
-    resolution: time scale of the smoothing of square roots and rims, s; the longest step, or that of `step_control`.
+    resolution: time scale of the smoothing of square roots and rims, s; the longest step, or that of `step_control`;
+    one per step (K,) where some steps are divided.
     step_control: None for fixed steps, or the control by which each lane divides the steps.
     """
 
@@ -80,22 +81,39 @@ def lay_out(
     inputs = _select(recording, channels)
     time = recording.time - recording.time[0]
     nodes = grid_nodes(time, inputs, recording.hold, step, every=step_control is not None)
-    signal = CumulativeSignal(time, inputs, recording.hold)
+    longest = torch.diff(nodes).max()
+    resolution = longest if step_control is None else longest.new_tensor(step_control.resolution)
+    return _on_nodes(nodes, CumulativeSignal(time, inputs, recording.hold), time, resolution, step_control)
+
+
+def divided(experiment: Experiment, counts: Int[Tensor, " K"]) -> Experiment:
+    """The experiment with each step k, and its resolution, divided by counts[k]."""
+    step = torch.repeat_interleave(torch.arange(len(counts)), counts)
+    within = torch.arange(len(step)) - (torch.cumsum(counts, 0) - counts)[step]
+    starts = experiment.nodes[step] + experiment.steps[step] * within / counts[step]
+    nodes = torch.cat([starts, experiment.nodes[-1:]])
+    resolution = experiment.resolution / counts[step]
+    return _on_nodes(nodes, experiment.signal, experiment.sample_times, resolution, experiment.step_control)
+
+
+def _on_nodes(
+    nodes: Tensor, signal: CumulativeSignal, times: Tensor, resolution: Tensor, step_control: StepControl | None
+) -> Experiment:
+    """The experiment with step ends `nodes` (K+1,) and samples at `times` (S,), s."""
     starts, steps = nodes[:-1], torch.diff(nodes)
-    means = torch.empty(len(starts), len(channels), dtype=time.dtype, device=time.device)
+    means = torch.empty(len(starts), signal.channels, dtype=times.dtype, device=times.device)
     for block in _blocks(len(starts)):
-        for c in range(len(channels)):
+        for c in range(signal.channels):
             means[block, c] = signal.average(starts[block], steps[block], c)
-    index = torch.clamp(torch.searchsorted(nodes, time) - 1, min=0)
-    share = (time - nodes[index]) / steps[index]
+    index = torch.clamp(torch.searchsorted(nodes, times) - 1, min=0)
     return Experiment(
         nodes=nodes,
         inputs=means,
         signal=signal,
-        sample_times=time,
+        sample_times=times,
         sample_step=index,
-        sample_share=share,
-        resolution=steps.max() if step_control is None else steps.new_tensor(step_control.resolution),
+        sample_share=(times - nodes[index]) / steps[index],
+        resolution=resolution,
         step_control=step_control,
     )
 

@@ -83,7 +83,7 @@ class OutputMap:
         self.network, self.names = network, names
         self.samples, self.times = SampleGrid(experiment), experiment.sample_times
         intervals = torch.diff(self.times, prepend=2 * self.times[:1] - self.times[1:2])
-        self.clock = Clock(self.times - intervals, intervals, experiment.resolution)
+        self.clock = Clock(self.times - intervals, intervals, experiment.resolution.max())
 
     def read(self, path: Float[Tensor, "L tanks nodes"], values: PlaceValues) -> Float[Tensor, "L C S"]:
         """Readings (L, C, S) of levels path (L, tanks, K+1)."""

@@ -47,7 +47,7 @@ class TracedRates:
             for i, name in enumerate(network.constants.names)
         }
         start, step = (graph.input("clock", i, Varies.STEP) for i in (0, 1))
-        resolution = graph.input("resolution", 0, Varies.NEVER)
+        resolution = graph.input("resolution", 0, Varies.STEP)
         clock = Clock(tracer.tensor(start), tracer.tensor(step), tracer.tensor(resolution))
         state, commands = ([tracer.tensor(n) for n in nodes] for nodes in (self._state, self._commands))
         with tracer:
@@ -79,7 +79,7 @@ class TracedRates:
         inputs |= {("nominal", i): x for i, x in enumerate(nominal.to(state).unsqueeze(-1).unbind())}
         inputs |= {("lifted", i): x for i, x in enumerate(state.new_tensor(self._graph.lifted).unsqueeze(-1).unbind())}
         inputs |= {("clock", 0): clock.start.unsqueeze(0), ("clock", 1): clock.step.unsqueeze(0)}
-        inputs["resolution", 0] = clock.resolution.reshape(1)
+        inputs["resolution", 0] = clock.resolution.expand(steps).unsqueeze(0)
         rates, by_state = state.new_empty(lanes, n, steps), state.new_zeros(lanes, n, n, steps)
         others = state.new_empty(len(slopes.by_command) + len(slopes.by_parameter), lanes, steps).unbind()
         into = [*rates.unbind(1), *(by_state[:, i, j] for i, j in slopes.by_state), *others]
