@@ -7,8 +7,10 @@ import torch
 
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, effect
+from fdi_torch.gap.accurate_steps import errors_by_readings, with_accurate_steps
 from fdi_torch.gap.channel_noise import estimate_noise
-from fdi_torch.gap.dataset import data_set_of, step_errors
+from fdi_torch.gap.dataset import data_set_of
+from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Placement
@@ -66,7 +68,7 @@ def test_the_error_of_a_step_follows_from_third_differences(every: int) -> None:
     noise = torch.tensor([1e-3, 1e-3, 2e-3], dtype=torch.float64)
     for readings, error in ((torch.stack([flat[:, 0], flat[:, 1], cubic[:, 2]], dim=1), 5e-5 / 2e-3), (flat, 0.0)):
         part = data_set_of(nominal_plant(), (), replace(blank, outputs=readings, mask=None), 1.0).parts[0]
-        assert step_errors(part, noise).tolist() == pytest.approx([error] * len(part.experiment.steps), abs=1e-9)
+        assert errors_by_readings(part, noise).tolist() == pytest.approx([error] * len(part.experiment.steps), abs=1e-9)
 
 
 def test_steps_in_which_a_level_moves_fast_are_divided() -> None:
@@ -79,7 +81,7 @@ def test_steps_in_which_a_level_moves_fast_are_divided() -> None:
     exact = ReferenceEngine(network, space, lay_out(blank, plant.channels(), 0.02)).readings(theta)[0]
     std = 1e-3  # m
     noise = std * torch.randn(exact.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
-    data = data_set_of(plant, (), replace(blank, outputs=exact + noise, mask=None), 1.0)
+    data = with_accurate_steps(data_set_of(plant, (), replace(blank, outputs=exact + noise, mask=None), 1.0))
     assert len(data.experiment.steps) < len(blank) + 20, "steps in which all levels move slowly are not divided"
     assert torch.equal(data.experiment.sample_times, blank.time)
     assert torch.equal(data.experiment.nodes[data.experiment.sample_step[1:] + 1], blank.time[1:])
@@ -103,3 +105,42 @@ def test_divided_steps_keep_the_inputs_and_their_means() -> None:
     assert parts.resolution[[3, 4, 7]].tolist() == pytest.approx([1.0, 1.0 / 3.0, 1.0])
     volume = torch.cumsum(parts.inputs * parts.steps.unsqueeze(1), 0)[torch.cumsum(counts, 0) - 1]
     assert torch.allclose(volume, torch.cumsum(whole.inputs * whole.steps.unsqueeze(1), 0), rtol=1e-12, atol=0)
+
+
+def test_steps_are_accurate_for_a_tank_that_exchanges_its_water_fast() -> None:
+    """T1 has a tenth of the others' area, so that its level follows that of T3 within seconds."""
+    plant, recording = three_tank(start=(0.5, 0.2, 0.1)), recorded({}, 7, samples=600)
+    plant = replace(plant, tanks=(replace(plant.tanks[0], area=1.6e-3), *plant.tanks[1:]))
+    network = build_network(plant, [])
+    space = ParameterSpace([network.constants["P13.discharge_coefficient"]])
+    theta = space.nominal().unsqueeze(0)
+    exact = ReferenceEngine(network, space, lay_out(recording, plant.channels(), 0.02)).readings(theta)[0]
+    std = 2e-4  # m
+    noise = std * torch.randn(exact.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    data = data_set_of(plant, (), replace(recording, outputs=exact + noise, mask=None), 1.0)
+    accurate = with_accurate_steps(data)
+
+    def chi_square(experiment: Experiment) -> float:
+        engine = Collocation(network, space, experiment)
+        error = engine.converge(theta, engine.constant_guess(theta)).readings[0] - exact
+        return float((error / std).square().sum(dim=0).max())
+
+    assert chi_square(data.experiment) > 100.0
+    assert chi_square(accurate.experiment) < 10.0, "one for the errors of single steps, which add up for a while"
+    assert len(accurate.experiment.steps) < 3 * len(recording)
+    assert with_accurate_steps(accurate).experiment.steps.shape == accurate.experiment.steps.shape
+
+
+@pytest.mark.slow
+def test_a_sound_rig_with_a_small_tank_has_no_gap() -> None:
+    """With steps of 1 s throughout, the errors of the integration were named as a cause."""
+    plant = replace(nominal_plant(), tanks=three_tank(start=(0.5, 0.2, 0.1)).tanks)
+    plant = replace(plant, tanks=(replace(plant.tanks[0], area=1.6e-3), *plant.tanks[1:]))
+    recording, network = recorded({}, 7, samples=1200), build_network(plant, [])
+    space = ParameterSpace([network.constants["P13.discharge_coefficient"]])
+    fine = lay_out(recording, plant.channels(), 0.02)
+    exact = ReferenceEngine(network, space, fine).readings(space.nominal().unsqueeze(0))[0]
+    noise = 3e-4 * torch.randn(exact.shape, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
+    library = ("pump_gain", "pump_lag", "laminar_flow", "leak", "sensor_bias", "flow_exponent")
+    found = diagnose(plant, replace(recording, outputs=exact + noise, mask=None), settings=Settings(library=library))
+    assert found.verdict == "no_gap"

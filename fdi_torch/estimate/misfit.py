@@ -63,18 +63,23 @@ def misfit_of(rms: Mapping[str, float], recordings: Sequence[Recording], plant: 
 
 
 def unexplained_ratio(rms: Tensor, values: Tensor, weight: Tensor) -> float:
-    """The ratio for residuals of root mean square rms (C,) of readings (S, C) of this weight; 0 masks a reading.
+    """The ratio for residuals of root mean square rms (C,) of readings (S, C) of this weight; 0 masks a reading."""
+    noise = torch.maximum(sample_noise(values, weight), least_noise(values, weight))
+    ratio = torch.where((weight > 0).any(dim=0), rms / noise, 0.0)
+    return max(0.0, *ratio.nan_to_num(nan=math.inf, posinf=math.inf).tolist())
+
+
+def least_noise(values: Float[Tensor, "S C"], weight: Float[Tensor, "S C"]) -> Float[Tensor, " C"]:
+    """The least noise (C,) of such readings: of rounding, and the error of simulated readings.
 
     Rounding in steps of q adds q^2 / 12 to the variance of the readings, which second differences of a slow level do
     not show.
     """
-    ratios = [0.0]
-    for c, noise in enumerate(sample_noise(values, weight).tolist()):
-        valid, rms_of_channel = values[weight[:, c] > 0, c], float(rms[c])
-        if len(valid):
-            least = max(resolution(valid) / math.sqrt(12.0), EXACT * float(valid.abs().max()), 1e-12)
-            ratios.append(rms_of_channel / max(noise, least) if math.isfinite(rms_of_channel) else math.inf)
-    return max(ratios)
+    valid = [values[weight[:, c] > 0, c] for c in range(values.shape[1])]
+    least = [
+        max(resolution(x) / math.sqrt(12.0), EXACT * float(x.abs().max()), 1e-12) if len(x) else 1.0 for x in valid
+    ]
+    return values.new_tensor(least)
 
 
 def sample_noise(values: Float[Tensor, "S C"], weight: Float[Tensor, "S C"]) -> Float[Tensor, " C"]:

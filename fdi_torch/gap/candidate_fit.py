@@ -20,7 +20,7 @@ from fdi_torch.effects import EFFECTS
 from fdi_torch.estimate.kalman import KalmanWhitening
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.channel_noise import Noise, low_frequency_excess
-from fdi_torch.gap.dataset import DataSet, RecordingPart
+from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.gap.start_choice import Start, likeliest_starts, vector_of
 from fdi_torch.gap.trajectory_problem import CAP, FAR, DescentResult, TrajectoryProblem, descend
@@ -31,7 +31,6 @@ from fdi_torch.plant.scales import length_scale
 from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.joint_collocation import JointCollocation
 from fdi_torch.simulate.linearised import Linearised
-from fdi_torch.simulate.resampling import interpolate
 
 
 class Fitter:
@@ -137,33 +136,14 @@ class Fitter:
     def first_trajectory(self, engine: Collocation | JointCollocation, theta: Tensor) -> Tensor:
         """The model's levels (L, K+1, n) at theta (L, P), found from the levels that the sensors show."""
         constant = engine.constant_guess(theta)
-        measured = torch.cat([self._measured_levels(part) for part in self.data.parts])
+        measured = torch.cat([part.measured_levels(self.data.plant) for part in self.data.parts])
         levels = constant[..., : measured.shape[-1]]
         return engine.converge(theta, torch.where(measured.isfinite(), measured, levels)).levels
 
-    def _measured_levels(self, part: RecordingPart) -> Tensor:
-        """Measured levels at the ends of the steps (K+1, n); NaN for a tank without a sensor."""
-        plant, nodes = self.data.plant, part.experiment.nodes
-        names = [t.name for t in plant.tanks]
-        measured = nodes.new_full((len(nodes), len(names)), math.nan)
-        for i, sensor in enumerate(plant.sensors):
-            tank, valid = names.index(sensor.tank), part.mask[:, i]
-            if bool(valid.any()):
-                level = (part.readings[valid, i] - sensor.offset) / sensor.gain
-                level = level.clamp(0.0, plant.tanks[tank].height)
-                measured[:, tank] = interpolate(nodes, part.experiment.sample_times[valid], level)
-        return measured
-
     def first_levels(self) -> dict[str, float]:
-        """Initial levels from the mean of the first readings, by name."""
-        levels = {}
-        for k, part in enumerate(self.data.parts):
-            for i, sensor in enumerate(self.data.plant.sensors):
-                readings = part.readings[:5, i][part.mask[:5, i]]
-                if len(readings):
-                    level = max(float(readings.mean() - sensor.offset) / sensor.gain, 0.0)
-                    levels[name_in_recording(f"{sensor.tank}.start_level", k)] = level
-        return levels
+        """Initial levels from the mean of the first readings, m, by name."""
+        each = [part.first_levels(self.data.plant) for part in self.data.parts]
+        return {name_in_recording(name, k): level for k, levels in enumerate(each) for name, level in levels.items()}
 
     def descend(
         self,

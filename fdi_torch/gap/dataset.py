@@ -8,24 +8,19 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from fdi_torch.estimate.misfit import sample_noise
 from fdi_torch.parameters import name_in_recording
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.repeated_readings import resolution
-from fdi_torch.simulate.experiment import Experiment, divided, lay_out
+from fdi_torch.simulate.experiment import Experiment, lay_out
 from fdi_torch.simulate.resampling import interpolate, step_means
 
 FEWEST = 0.5
 """Least valid readings of a mean, as a share of the usual number in a step; it limits the variance to twice the usual
 one."""
-STEP_ERROR = 0.2
-"""Error, in units of the readings' noise, to which a step is divided whose error exceeds that noise."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +35,27 @@ class RecordingPart:
     experiment: Experiment
     readings: Tensor
     mask: Tensor
+
+    def measured_levels(self, plant: PlantDescription) -> Tensor:
+        """Measured levels at the ends of the steps, (K+1, tanks) m; NaN for a tank without a sensor."""
+        nodes, names = self.experiment.nodes, [t.name for t in plant.tanks]
+        measured = nodes.new_full((len(nodes), len(names)), math.nan)
+        for i, sensor in enumerate(plant.sensors):
+            tank, valid = names.index(sensor.tank), self.mask[:, i]
+            if bool(valid.any()):
+                level = (self.readings[valid, i] - sensor.offset) / sensor.gain
+                level = level.clamp(0.0, plant.tanks[tank].height)
+                measured[:, tank] = interpolate(nodes, self.experiment.sample_times[valid], level)
+        return measured
+
+    def first_levels(self, plant: PlantDescription) -> dict[str, float]:
+        """Initial levels of the tanks with sensors from the mean of the first readings, m, by name."""
+        levels = {}
+        for i, sensor in enumerate(plant.sensors):
+            readings = self.readings[:5, i][self.mask[:5, i]]
+            if len(readings):
+                levels[f"{sensor.tank}.start_level"] = max(float(readings.mean() - sensor.offset) / sensor.gain, 0.0)
+        return levels
 
 
 @dataclass(frozen=True)
@@ -152,32 +168,8 @@ def _part(plant: PlantDescription, recording: Recording, step: float, averaged: 
     order = [recording.output_names.index(n) for n in names]
     experiment = lay_out(recording, plant.channels(), step)
     readings, mask = recording.outputs[:, order], recording.mask[:, order]
-    rounding = [resolution(readings[mask[:, c], c]) / math.sqrt(12.0) for c in range(len(names))]
     if averaged:
         experiment, readings, counts = step_means(experiment, readings, mask)
         usual = torch.where(counts > 0, counts, torch.nan).nanmedian(dim=0).values
         mask = counts >= FEWEST * usual
-    part = RecordingPart(recording, experiment, readings, mask)
-    noise = torch.maximum(sample_noise(readings.nan_to_num(), mask), readings.new_tensor(rounding))
-    errors = step_errors(part, noise)
-    divisions = torch.where(errors > 1.0, torch.ceil(torch.sqrt(errors / STEP_ERROR)), 1.0).to(torch.int64)
-    return replace(part, experiment=divided(experiment, divisions)) if int(divisions.max()) > 1 else part
-
-
-def step_errors(part: RecordingPart, noise: Float[Tensor, " C"]) -> Float[Tensor, " K"]:
-    """Error of the midpoint rule in each step, dt^3 |d^3h/dt^3| / 24, in units of the readings' noise (C,).
-
-    The third derivative is the largest of all sensors and of all four neighbouring samples that enclose the step, by
-    divided differences. White noise alone makes errors of 0.19 (standard deviation).
-    """
-    times, steps = part.experiment.sample_times, part.experiment.steps
-    derivative = torch.where(part.mask, part.readings, torch.nan) / noise
-    for order in (1, 2, 3):
-        derivative = order * torch.diff(derivative, dim=0) / (times[order:] - times[:-order]).unsqueeze(1)
-    if not len(derivative):
-        return torch.zeros_like(steps)
-    largest = derivative.abs().nan_to_num(nan=0.0).amax(dim=1)
-    around = torch.nn.functional.max_pool1d(largest[None, None], 3, 1, padding=1)[0, 0]
-    middle = part.experiment.nodes[:-1] + 0.5 * steps
-    enclosing = (torch.searchsorted(times, middle) - 2).clamp(0, len(around) - 1)
-    return around[enclosing] * steps**3 / 24.0
+    return RecordingPart(recording, experiment, readings, mask)

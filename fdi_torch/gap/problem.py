@@ -10,6 +10,7 @@ from functools import partial
 import torch
 
 from fdi_torch.effects import effect
+from fdi_torch.gap.accurate_steps import with_accurate_steps
 from fdi_torch.gap.dataset import DataSet, data_set_of
 from fdi_torch.gap.library import library_of
 from fdi_torch.gap.preprocess.acquisition import StuckSegment, usable, without_sensors
@@ -116,7 +117,7 @@ def _without_outliers(
     all_outliers: list[SensorOutliers] = []
     columns = {s.name: s.column for s in plant.sensors}
     for recording in recordings:
-        lay_out = partial(data_set_of, plant, nominal_effects, step=step or _step(plant, [recording]), averaged=True)
+        lay_out = partial(_laid_out, plant, nominal_effects, step=step)
         mask, of_recording = recording.mask, outliers_of(recording, lay_out)
         for of_sensor in of_recording:
             mask = without(mask, of_sensor.each, recording.output_names.index(columns[of_sensor.sensor]))
@@ -208,12 +209,23 @@ def checked_data_set(
     """Lay the recordings out on the grid of their simulation, with the mean of the readings in each step.
 
     step: s; None for the sampling interval of the first recording, or the multiple or fraction of it that lies between
-    SHORTEST_STEP and LONGEST_STEP, for about MANY_STEPS at most.
+    SHORTEST_STEP and LONGEST_STEP, for about MANY_STEPS at most, in parts where that is not accurate enough.
     """
-    data = data_set_of(plant, nominal_effects, recordings, step or _step(plant, recordings), averaged=True)
+    data = _laid_out(plant, nominal_effects, recordings, step)
     for sensor, count in zip(plant.sensors, data.mask.sum(dim=0).tolist(), strict=True):
         _expect_enough(data.recording.source, sensor.name, count)
     return data
+
+
+def _laid_out(
+    plant: PlantDescription,
+    nominal_effects: Sequence[Placement],
+    recordings: Recording | Sequence[Recording],
+    step: float | None,
+) -> DataSet:
+    each = [recordings] if isinstance(recordings, Recording) else recordings
+    data = data_set_of(plant, nominal_effects, each, step or _step(plant, each), averaged=True)
+    return with_accurate_steps(data) if step is None else data
 
 
 def _step(plant: PlantDescription, recordings: Sequence[Recording]) -> float:

@@ -92,7 +92,7 @@ def divided(experiment: Experiment, counts: Int[Tensor, " K"]) -> Experiment:
     within = torch.arange(len(step)) - (torch.cumsum(counts, 0) - counts)[step]
     starts = experiment.nodes[step] + experiment.steps[step] * within / counts[step]
     nodes = torch.cat([starts, experiment.nodes[-1:]])
-    resolution = experiment.resolution / counts[step]
+    resolution = experiment.resolution.expand_as(counts)[step] / counts[step]
     return _on_nodes(nodes, experiment.signal, experiment.sample_times, resolution, experiment.step_control)
 
 

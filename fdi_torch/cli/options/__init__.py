@@ -92,7 +92,8 @@ def add_leave_out(parser: argparse.ArgumentParser) -> None:
 
 
 def add_step(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--step", metavar="TIME", type=seconds, help="integration step (default: as sampled, <= 5 s)")
+    help_text = "integration step (default: as sampled, <= 5 s, less where levels move fast)"
+    parser.add_argument("--step", metavar="TIME", type=seconds, help=help_text)
 
 
 def names(text: str | None) -> tuple[str, ...]:
