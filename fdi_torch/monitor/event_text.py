@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 
@@ -89,28 +90,36 @@ class EventWriter:
         number: int,
         names: Sequence[str],
         observable: bool,
+        ends: tuple[float, float] | None,
     ) -> Event:
-        """Recovery of the faults of one alarm. observable: whether the readings would show them if still present."""
+        """Recovery of the faults of one alarm. observable: whether the readings would show them if still present.
+
+        ends: first and last time at which they may have ended, s; None if the fit's onset says it.
+        """
         explanations = tuple(self.explanation(f, state, change) for f in fits)
-        faults = ", ".join(map(parameter_words, names))
-        text = f"{faults}: back to nominal, {_onset_text(fits[0], fits[0].hypothesis.incipient)}"
+        faults, when = ", ".join(map(parameter_words, names)), _onset_text(fits[0], fits[0].hypothesis.incipient)
+        if ends is not None:
+            when = f"between {ends[0]:.1f} s and {ends[1]:.1f} s"
+            explanations = (_at_any_time(explanations[0], *ends), *explanations[1:])
+        text = f"{faults}: back to nominal, {when}"
         if " or " in headline(explanations):
             text += f"; {headline(explanations)}"
         if not observable:
             text = f"{faults}: the readings since {fits[0].onset:.1f} s would not show whether it still stands"
         kind: Kind = "recovered" if observable else "cannot tell"
-        delay = change.alarm_time - fits[0].onset
+        delay = change.alarm_time - (fits[0].onset if explanations[0].onset is None else explanations[0].onset)
         return self._event(state, kind, text, state.alarm(number), explanations=explanations, delay=delay)
 
     def end_shown(self, state: MonitorState, number: int, faults: Sequence[HiddenFault]) -> Event:
         """The end of hidden faults of one alarm, once the readings have shown it."""
         names = [parameter_words(self.space.names[f.track.column]) for f in faults]
-        last = max(faults, key=lambda f: f.ended)
-        text = f"{', '.join(names)}: back to nominal, as the readings since {max(f.seen for f in faults):.1f} s show"
+        first, seen = min(f.ended for f in faults), max(f.seen for f in faults)
+        text = f"{', '.join(names)}: back to nominal between {first:.1f} s and {state.now:.1f} s, "
+        text += f"as the readings since {seen:.1f} s show"
         nominal = [self.space.parameters[f.track.column] for f in faults]
         sizes = tuple(Size(p.name, p.nominal, 0.0, p.unit, estimate_words(p.name, p.unit, p.nominal)) for p in nominal)
-        explanations = (Explanation(1.0, sizes, last.ended, last.ended_std, gone=True),)
-        return self._event(state, "recovered", text, state.alarm(number), explanations=explanations)
+        explanation = _at_any_time(Explanation(1.0, sizes, gone=True), first, state.now)
+        return self._event(state, "recovered", text, state.alarm(number), explanations=(explanation,))
 
     def followed(
         self, state: MonitorState, tracks: Sequence[FaultTrack], announced: Sequence[FaultTrack]
@@ -202,6 +211,11 @@ class EventWriter:
             state.now, kind, text, alarm.number, alarm.state, shares=alarm.shares, first=alarm.first, last=alarm.last,
             count=alarm.count, believed=believed, **more,  # type: ignore[arg-type]
         )  # fmt: skip
+
+
+def _at_any_time(explanation: Explanation, first: float, last: float) -> Explanation:
+    """The explanation with an onset at any time between two, s: mean and standard deviation."""
+    return replace(explanation, onset=0.5 * (first + last), onset_std=(last - first) / 12.0**0.5)
 
 
 def _onset_text(change: HypothesisFit | FaultTrack, growing: bool = False) -> str:
