@@ -118,7 +118,8 @@ class EventWriter:
         text += f"as the readings since {seen:.1f} s show"
         nominal = [self.space.parameters[f.track.column] for f in faults]
         sizes = tuple(Size(p.name, p.nominal, 0.0, p.unit, estimate_words(p.name, p.unit, p.nominal)) for p in nominal)
-        explanation = _at_any_time(Explanation(1.0, sizes, gone=True), first, state.now)
+        ended = tuple(p.name for p in nominal)
+        explanation = _at_any_time(Explanation(1.0, sizes, ended=ended), first, state.now)
         return self._event(state, "recovered", text, state.alarm(number), explanations=(explanation,))
 
     def followed(
@@ -158,9 +159,10 @@ class EventWriter:
     def explanation(self, fit: HypothesisFit, state: MonitorState, change: DetectedChange | None = None) -> Explanation:
         """A fit in the form that events report."""
         h, now, sizes = fit.hypothesis, state.now, []
+        hidden = [f.track.column for f in state.hidden] if change is not None else []
         for c in h.columns:
             p, size, std = self.space.parameters[c], float(fit.value[c]), float(fit.std[c])
-            if change is not None and c in [f.track.column for f in state.hidden]:
+            if c in hidden:
                 sizes.append(Size(p.name, size, float("inf"), p.unit, f"{ParameterName.parse(p.name).field} unknown"))
                 continue
             grows = change is not None and h.incipient and c in h.sizes and now > fit.onset
@@ -168,8 +170,8 @@ class EventWriter:
             sizes.append(size_of(p, size, std, rate))
         if not sizes:
             return Explanation(fit.probability, ())
-        recovered = set(h.recovered) >= set(h.sizes)
-        return Explanation(fit.probability, tuple(sizes), fit.onset, fit.onset_std, h.incipient, recovered)
+        ended = tuple(self.space.names[c] for c in h.recovered if c not in hidden)
+        return Explanation(fit.probability, tuple(sizes), fit.onset, fit.onset_std, h.incipient, ended)
 
     def _limits(self, state: MonitorState, change: DetectedChange, fits: Sequence[HypothesisFit]) -> tuple[Limit, ...]:
         """Forecast of overflow and dry tanks. The random draws depend on the alarm's number only."""
