@@ -139,17 +139,22 @@ def recovered_columns(space: ParameterSpace, change: DetectedChange) -> list[int
     return [c for c in change.best.hypothesis.sizes if _is_recovered(space, change, c)]
 
 
+def _law_error(track: FaultTrack) -> float:
+    """Three standard deviations of what the error of a fault's model moves in the white innovations."""
+    return 3.0 * FAULT_MODEL_ERROR * track.effect_rms
+
+
 def _recovery_is_observable(
     observer: ObserverBank, state: MonitorState, change: DetectedChange, track: FaultTrack
 ) -> bool:
     """Whether the readings since the recovery would show the fault if it were still present.
 
-    They would not if it adds less to the white innovations than three standard deviations of its model's error, the
-    share FAULT_MODEL_ERROR of its earlier effect, for example in a dry tank or behind a closed valve.
+    They would not if it adds less to the white innovations than its model's error, for example in a dry tank or behind
+    a closed valve.
     """
     window, size = state.window(change.best.onset), float(change.before[track.column])
     effect, _ = effect_of_value(observer, window, change.before, change.hypothesis, track.column, size)
-    return effect >= 3.0 * FAULT_MODEL_ERROR * track.effect_rms
+    return effect >= _law_error(track)
 
 
 def possible_ends(
@@ -175,7 +180,7 @@ def possible_ends(
     misfits = 0.5 * white.square().sum((1, 2)) / best.misfit_ratio
     between = ((window.times > times[:, None]) != (window.times > best.onset)).to(white.dtype)
     moved = ((white[:-1] - white[-1]).square().mean(-1) * between).sum(-1) / between.sum(-1).clamp(min=1.0)
-    law_error = 0.0 if best.fits else 3.0 * FAULT_MODEL_ERROR * max(t.effect_rms for t in change.ended)
+    law_error = 0.0 if best.fits else max(map(_law_error, change.ended))
     possible = (misfits[:-1] - misfits[-1] <= 4.5) | (moved.sqrt() < law_error)
     before, after = times <= best.onset, times > best.onset
     first = min([best.onset, *_while(times[before].flip(0), possible[before].flip(0))])
@@ -196,7 +201,7 @@ def _end_is_shown(observer: ObserverBank, state: MonitorState, fault: HiddenFaul
     window = state.window(start)
     present = ChangeHypotheses(state.believed[None], window.samples.time[:1], torch.tensor([False]))
     effect, misfit = effect_of_value(observer, window, state.believed, present, fault.track.column, fault.size)
-    return effect >= 3.0 * FAULT_MODEL_ERROR * fault.track.effect_rms and misfit > STRONG_EVIDENCE
+    return effect >= _law_error(fault.track) and misfit > STRONG_EVIDENCE
 
 
 def reset_to_nominal(space: ParameterSpace, change: DetectedChange, recovered: Sequence[int]) -> Tensor:
