@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from itertools import groupby, pairwise
 from typing import Any
 
-import orjson
 import torch
 from torch import Tensor
 
@@ -21,10 +20,11 @@ from fdi_torch.amounts import parameter_words
 from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.gap.preprocess.acquisition import usable
+from fdi_torch.jobs.event_messages import event_fields
 from fdi_torch.jobs.monitor_rows import CLOCK, FROM_SOURCE, samples_of_rows
 from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.monitor.diagnosability import diagnosability
-from fdi_torch.monitor.events import FORMAT, Event
+from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.monitor import Monitor, ResidualTrace
 from fdi_torch.monitor.monitor_setup import PreparedMonitor, fault_free_part, prepare_monitor
 from fdi_torch.monitor.samples import Samples, samples_of_recording
@@ -263,40 +263,6 @@ def _positions(clock: Sequence[float], times: Sequence[tuple[float, bool]]) -> l
         k = clock.index(time_of_item, k + 1 if is_later else max(k, 0))
         positions.append(k)
     return positions
-
-
-def event_key(payload: dict[str, Any]) -> tuple[Any, ...]:
-    """Key by which a logged event is recognised in another log."""
-    return payload["t"], payload["event"], payload["message"]
-
-
-def event_fields(event: Event) -> dict[str, Any]:
-    """An event's fields for the log: numbers, texts and flat lists, and the whole event as JSON in `details`."""
-    fields: dict[str, Any] = {
-        "alarm": event.alarm or None,
-        "state": str(event.state),
-        "headline": event.headline if event.explanations else None,
-        "faults": list(event.faults) or None,
-        "sizes": list(event.sizes) or None,
-        "stds": list(event.stds) or None,
-        "units": list(event.units) or None,
-        "onset": event.onset,
-        "onset_std": event.onset_std,
-        "delay": event.delay,
-        "growing": event.growing if event.faults else None,
-        "explanations": [e.text for e in event.explanations] or None,
-        "masses": [e.mass for e in event.explanations] or None,
-        "sensors": [name for name, _ in event.shares] or None,
-        "shares": [share for _, share in event.shares] or None,
-        "first": event.first,
-        "last": event.last,
-        "count": event.count,
-        "severity": event.severity or None,
-        "announced": event.announced,
-        "format": FORMAT,
-        "details": orjson.dumps(event.to_dict()).decode(),
-    }
-    return fields
 
 
 def _prepare(run: MonitorRun, whole: Recording) -> PreparedMonitor:

@@ -20,9 +20,10 @@ from fdi_torch.config.growing_recordings import Row, growing_rows
 from fdi_torch.config.live_source import LiveRows
 from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor_file import MonitorRun
+from fdi_torch.jobs.event_messages import event_key
 from fdi_torch.jobs.live_batches import DelayWatch, LiveBatches
 from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
-from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks, event_key
+from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.monitor_rows import (
     ALARM,
     logged_items,
