@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fdi_torch.amounts import estimate_words, parameter_words, rounded, sized_words, with_error
-from fdi_torch.monitor.events import Explanation, Size, headline
+from fdi_torch.monitor.events import Event, Explanation, Size, headline
 from fdi_torch.quantities import displayed_in
 from fdi_torch.tables import Table
 
@@ -38,7 +38,12 @@ def test_parameters_of_one_effect_and_several_effects_stand_together() -> None:
     assert Explanation(1.0, (*wave, *LEAK.sizes)).text == (
         "pulsation at Q (2.00 ± 0.10 cm^3/s, phase 0.310 ± 0.020) and leak at A (size 0.2024 ± 0.0016)"
     )
-    assert Explanation(1.0, (size("A.leak.size", 0.0, 0.0),), gone=True).text == "leak at A back to size 0"
+    both = size("A.leak.size", 0.0, 0.0), size("B.leak.size", 0.2, 0.01)
+    assert Explanation(1.0, both[:1], ended=("A.leak.size",)).text == "leak at A back to nominal"
+    mixed = Explanation(0.4, both, ended=("A.leak.size",))
+    assert mixed.text == "leak at B (size 0.200 ± 0.010), with leak at A back to nominal"
+    assert mixed.causes == "leak at B, with leak at A back to nominal"
+    assert Event(1.0, "explained", "", explanations=(mixed,)).masses == {"B.leak.size": 0.4}
     assert Explanation(1.0, ()).text == "chance" and sized_words("A.leak.size", []) == "leak at A"
 
 

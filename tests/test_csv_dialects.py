@@ -95,7 +95,8 @@ def test_stamps_are_followed_from_the_first_on(tmp_path: Path) -> None:
         file.write("2026-03-29T08:01:00.5Z,50,12\nsoon,50,12\n")
     seconds, _, readings, troubles = growing.new()
     assert (seconds.tolist(), readings.tolist()) == ([60.5], [[0.12]])
-    assert "row 5, column time: expected a time stamp" in troubles[0]
+    [(rows_before, trouble)] = troubles
+    assert rows_before == 1 and "row 5, column time: expected a time stamp" in trouble
 
 
 @pytest.mark.parametrize("cell", ["५०.५", "٥٠", "５０", "1_000"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -81,6 +82,21 @@ def test_sums_of_the_white_residual_spread_like_those_of_white_noise(correlation
     samples = disturbed(correlation_time, 3 * LEARN)
     noise, _ = learn_noise(NETWORK, samples.segment(0, LEARN))
     white = noise.whitening(Observer(NETWORK, noise.gain).run(samples).steady_residual)[LEARN:]
+    assert white.std(dim=0).tolist() == pytest.approx([1.0] * 3, abs=0.1)
+    assert spread_of_sums(white).tolist() == pytest.approx([1.0] * 3, abs=4.0 * math.hypot(0.11, 0.06))
+
+
+def test_correlated_noise_of_sensors_is_not_taken_for_random_flows() -> None:
+    """AR(1) noise of 0.7. As flows, it would leave sums whose spread is a third of that of white noise."""
+    still, keep = disturbed(None, 3 * LEARN), 0.7
+    shocks = math.sqrt(1.0 - keep**2) * (still.readings - disturbed_levels()[-1])
+    noise = torch.zeros_like(shocks)
+    for k in range(1, len(noise)):
+        noise[k] = keep * noise[k - 1] + shocks[k]
+    samples = replace(still, readings=disturbed_levels()[-1] + noise)
+    learnt, _ = learn_noise(NETWORK, samples.segment(0, LEARN))
+    white = learnt.whitening(Observer(NETWORK, learnt.gain).run(samples).steady_residual)[LEARN:]
+    assert learnt.whitening.flows is None
     assert white.std(dim=0).tolist() == pytest.approx([1.0] * 3, abs=0.1)
     assert spread_of_sums(white).tolist() == pytest.approx([1.0] * 3, abs=4.0 * math.hypot(0.11, 0.06))
 

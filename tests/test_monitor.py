@@ -412,7 +412,7 @@ def test_the_command_prints_one_line_of_json_an_event(
     )
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [e["kind"] for e in events] == ["watching", "notice", "alarm", "isolated", "summary"]
-    assert all(e["format"] == "fdi_torch.event/2" for e in events)
+    assert all(e["format"] == "fdi_torch.event/3" for e in events)
 
 
 def test_the_report_prints_the_inseparable_pair(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,21 +7,23 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 
 import pytest
 import yaml
 
 from fdi_torch.cli import INTERRUPTED, main
+from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
-from fdi_torch.jobs.live_batches import DelayWatch, LiveBatches
-from fdi_torch.jobs.monitor_rows import rows_until
+from fdi_torch.jobs.live_batches import LARGEST_BATCH, DelayWatch, LiveBatches
+from fdi_torch.jobs.monitor_rows import resumed_items, rows_until
 from fdi_torch.jobs.replay import repeat_run
-from fdi_torch.logbook import RunLog, follow, read_run, series
+from fdi_torch.logbook import RunLog, content_hash, follow, read_run, series
 from tests.test_monitor import recorded, step_to
 
 FAULT, ONSET, SAMPLES = "T3.leak.size", 200.0, 300
@@ -359,10 +361,17 @@ def logged_events(path: Path) -> list[dict[str, object]]:
 def test_a_growing_file_is_followed_on_after_a_kill_to_the_same_events(
     rotated: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Killed between alarm and isolation; rotated: the file then holds only what came since."""
-    whole = written(tmp_path / "all.csv")
-    expected = monitored(["--config", config(tmp_path, recording={"file": "all.csv"})], capsys)
-    lines, file = whole.read_text().splitlines(keepends=True), tmp_path / "rig.csv"
+    """Killed between alarm and isolation, with unreadable rows before and after; rotated: the file then holds only what
+    came since.
+    """
+    whole, file = written(tmp_path / "all.csv"), tmp_path / "rig.csv"
+    lines = whole.read_text().splitlines(keepends=True)
+    if not rotated:  # their sentences name the line
+        lines.insert(270, "50,oops,50,1,2,3\n")
+    lines.insert(60, "50,oops,50,1,2,3\n")
+    whole.write_text("".join(lines))
+    all_of_it = ["--config", config(tmp_path, recording={"file": "all.csv"}), "--follow", "--idle", "0.3"]
+    expected = monitored(all_of_it, capsys)
     file.write_text("".join(lines[:250]))
     words = ["--config", config(tmp_path), "--follow", "--idle", "0.3"]
     with monkeypatch.context() as patch:
@@ -374,6 +383,7 @@ def test_a_growing_file_is_followed_on_after_a_kill_to_the_same_events(
         assert main(["monitor", *words, "--json", "--quiet"]) == INTERRUPTED
     early = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert kinds(early) == ["alarm"]
+    expected = [json.loads(json.dumps(event).replace("all.csv", "rig.csv")) for event in expected]
     file.write_text(lines[0] + "".join(lines[240:] if rotated else lines[1:]))
     late = monitored([*words, "--resume"], capsys)
     assert early + late == expected
@@ -381,6 +391,47 @@ def test_a_growing_file_is_followed_on_after_a_kill_to_the_same_events(
     assert [(m["t"], m["event"], m["message"]) for m in logged_events(logs[0])] == [
         (e["time"], e["kind"], e["text"]) for e in expected
     ]
+
+
+def test_a_resumed_source_goes_on_after_the_logged_rows_and_notices() -> None:
+    rows: list[Row] = [(float(k), [], []) for k in range(6)]
+    logged: list[Row | str] = [rows[0], "row 2 is no row", rows[1], "delay", rows[2], "row 5 is no row"]
+    file: list[Row | str] = [rows[0], "row 2 is no row", *rows[1:3], "row 5 is no row", rows[3], "late", *rows[4:]]
+    later: list[Row | str] = [rows[3], "late", rows[4], rows[5]]
+    assert list(resumed_items(logged, file)) == [*logged, *later]
+    assert list(resumed_items(logged[:-1], file)) == [*logged, *later]
+    assert list(resumed_items(logged, ["lost", *rows[2:4], "late", *rows[4:]])) == [*logged, "lost", *later]
+    assert list(resumed_items(logged, [])) == logged
+
+
+@pytest.mark.parametrize("size", [1, 7, 151, 299])
+def test_neither_log_nor_replay_depends_on_how_many_rows_come_at_once(
+    size: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Among them unreadable rows, a repeated one, a hole, and a clock that jumps back."""
+    rows = [row(k if k < 280 else k - 20, levels) for k, levels in enumerate(readings())]
+    rows[210:225] = []
+    rows[170:170] = ["50,oops,50,1,2,3\n", rows[169], rows[170]]
+    (tmp_path / "rig.csv").write_text(HEADER + rows[0] + "50,oops,50,1,2,3\n" + "".join(rows[1:]))
+    logs = []
+    for count in (LARGEST_BATCH, size):
+        monkeypatch.setattr("fdi_torch.jobs.monitor.LiveBatches", lambda source, n=count: batched(source, n))
+        folder = tmp_path / str(count)
+        monitored(["--config", config(tmp_path), "--follow", "--idle", "0.1", "--out", str(folder)], capsys)
+        logs += folder.glob("*.mcap")
+    whole, pieces = (content_hash(read_run(log).messages()) for log in logs)
+    assert whole == pieces
+    assert main(["replay", str(logs[1]), "--quiet"]) == 0
+    assert capsys.readouterr().out.startswith("bit-equal")
+    notices = [e["message"] for e in logged_events(logs[1]) if e["event"] == "notice"]
+    assert sum("oops" in str(text) for text in notices) == 2 and "jumps back" in str(notices)
+
+
+def batched(source: Iterable[Row | str], count: int) -> Iterator[list[Row | str]]:
+    """At most `count` items at once, as from `LiveBatches`."""
+    items = iter(source)
+    while batch := list(islice(items, count)):
+        yield batch
 
 
 def test_a_run_of_another_configuration_is_not_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -171,10 +171,10 @@ def test_on_a_slow_clock_as_many_residuals_are_kept_as_the_detector_compares_wit
     assert torch.equal(*traces)
 
 
-def drained(mouth: float, seconds: int, folder: Path) -> list[Event]:
-    """Events of two tanks: the drain of T opens at 400 s and closes at 600 s, U leaks from 500 s on.
+def drained(mouth: float, seconds: int, folder: Path, closes: int = 600, fills: int = 640) -> list[Event]:
+    """Events of two tanks: the drain of T opens at 400 s and closes, U leaks from 500 s on.
 
-    A pump fills T again from 640 s on. The drain's mouth (m) lies above the floor: water stays, and Torricelli's law
+    A pump then fills T again. The drain's mouth (m) lies above the floor: water stays, and Torricelli's law
     does not hold.
     """
     (folder / "tank.yaml").write_text(
@@ -189,12 +189,12 @@ def drained(mouth: float, seconds: int, folder: Path) -> list[Event]:
     time, generator = torch.arange(seconds, dtype=torch.float64), torch.Generator().manual_seed(4)
     disturbed, noise = (s * torch.randn(800, 2, generator=generator, dtype=torch.float64) for s in (1e-4, 5e-4))
     kept = torch.full_like(time, outlet * rest**0.5)
-    pumped = torch.stack([torch.where(time < 400.0, kept, torch.where(time < 640.0, 0.0, 2e-5)), kept], dim=1)
+    pumped = torch.stack([torch.where(time < 400.0, kept, torch.where(time < fills, 0.0, 2e-5)), kept], dim=1)
     levels = [torch.tensor([rest, rest], dtype=torch.float64)]
     for k in range(seconds - 1):
         level = levels[-1]
         for _ in range(20):
-            drain = 60.0 * outlet * max(float(level[0]) - mouth, 0.0) ** 0.5 if 400 <= k < 600 else 0.0
+            drain = 60.0 * outlet * max(float(level[0]) - mouth, 0.0) ** 0.5 if 400 <= k < closes else 0.0
             leak = 0.5 * outlet * float(level[1]) ** 0.5 if k >= 500 else 0.0
             lost = outlet * level.sqrt() + torch.tensor([drain, leak])
             level = (level + 0.05 * (pumped[k] - lost) / 0.01).clamp(min=0.0)
@@ -223,5 +223,18 @@ def test_a_closed_drain_is_told_once_its_tank_fills_even_if_a_fault_came_between
     first, last = next(e for e in events if e.kind == "cannot tell"), next(e for e in events if e.kind == "recovered")
     assert first.time < 500.0 and 640.0 < last.time < 700.0
     assert (last.alarm, last.faults) == (1, ("T.leak.size",))
+    assert last.onset is not None and last.onset_std is not None
+    assert abs(last.onset - 600.0) < 2.0 * last.onset_std, "it closed while the tank was dry"
     assert any(e.faults == ("U.leak.size",) and 500.0 < e.time < 600.0 for e in events)
     assert [e.state for e in events if e.kind == "summary" and e.alarm == 1] == [State.RECOVERED]
+
+
+@pytest.mark.parametrize(("mouth", "closes"), [(0.0, 450), (0.0, 490), (0.014, 460)])
+def test_the_end_of_a_drain_lies_within_the_time_in_which_its_dry_tank_does_not_show_it(
+    mouth: float, closes: int, tmp_path: Path
+) -> None:
+    events = drained(mouth, 600, tmp_path, closes, closes + 10)
+    last = next(e for e in events if e.kind == "recovered")
+    assert last.onset is not None and last.onset_std is not None and last.onset_std < 40.0
+    assert abs(last.onset - closes) <= 3.0**0.5 * last.onset_std + 1.0
+    assert "back to nominal" in last.text and " between 4" in last.text and "inf" not in last.text

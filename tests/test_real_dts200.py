@@ -134,6 +134,11 @@ def test_each_drain_that_opens_is_told_within_5_s_first_with_the_same_sizes_and_
         opens = k % 2 == 0
         latest = moment + 5.0 if opens else max(moment, float(pumped[pumped >= moment - 5.0][0])) + 10.0
         assert any(moment - 5.0 <= alarm <= latest for alarm in alarms), (opens, moment)
+    drains = [e for e in events if e.kind == "recovered" and {"L.leak.size", "R.leak.size"} & set(e.faults)]
+    for event in drains:  # the valves begin to move 4 s before the half-way moment
+        assert event.onset is not None and event.onset_std is not None and event.onset_std < 60.0
+        assert min(abs(event.onset - closed) for closed in half[1::2]) < 3.0**0.5 * event.onset_std + 5.0, event.text
+    assert len(drains) >= 4
     answers = [e for e in events if e.kind in ("explained", "isolated")]
     first = [next(e for e in answers if e.time > opened) for opened in half[::2]]
     sizes = [dict(zip(e.faults, e.sizes, strict=True)) for e in first]

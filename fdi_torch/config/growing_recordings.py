@@ -90,8 +90,13 @@ def _csv_rows(
         seconds, commands, readings, troubles = file.new()
         if began is not None and len(seconds) and (zero := file.clock_zero) is not None:
             began(zero)
-        yield from (f"{trouble}; the row is left out" for trouble in troubles)
-        yield from zip(seconds.tolist(), commands.tolist(), readings.tolist(), strict=True)
+        rows = list(zip(seconds.tolist(), commands.tolist(), readings.tolist(), strict=True))
+        first = 0
+        for count, trouble in troubles:
+            yield from rows[first:count]
+            yield f"{trouble}; the row is left out"
+            first = count
+        yield from rows[first:]
         if len(seconds):
             quiet_since = time.monotonic()
         else:

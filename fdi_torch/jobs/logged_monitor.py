@@ -1,24 +1,30 @@
-"""A monitor together with its log: samples, residuals, events and estimated faults are logged as they come."""
+"""A monitor together with its log: samples, residuals, events and estimated faults, in the order of the samples.
+
+A sample is followed by its residual and by the events that it causes. The log therefore does not depend on how many
+samples are processed at once.
+"""
 
 from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby, pairwise
 from typing import Any
 
-import orjson
 import torch
 from torch import Tensor
 
 from fdi_torch.amounts import parameter_words
+from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.gap.preprocess.acquisition import usable
-from fdi_torch.jobs.monitor_rows import CLOCK
-from fdi_torch.logbook import Listener, RunLog
+from fdi_torch.jobs.event_messages import event_fields
+from fdi_torch.jobs.monitor_rows import CLOCK, FROM_SOURCE, samples_of_rows
+from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.monitor.diagnosability import diagnosability
-from fdi_torch.monitor.events import FORMAT, Event
+from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.monitor import Monitor, ResidualTrace
 from fdi_torch.monitor.monitor_setup import PreparedMonitor, fault_free_part, prepare_monitor
 from fdi_torch.monitor.samples import Samples, samples_of_recording
@@ -29,7 +35,6 @@ from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import data_warnings
 
 CHUNK = 2048  # samples of a recording that are processed at a time
-ALARM = "/observer/alarm"
 
 
 @dataclass(frozen=True)
@@ -109,23 +114,33 @@ class LoggedMonitor:
         for warning in (*data_warnings(part, self.plant), *prepared.warnings):
             self.notice(warning)
 
+    def process_items(self, items: Iterable[Row | str]) -> bool:
+        """Process rows, and notices of their source, in order. Returns whether the observer had to restart."""
+        restarted = False
+        for is_notice, group in groupby(items, lambda item: isinstance(item, str)):
+            if is_notice:
+                for text in group:
+                    self.notice(str(text), from_source=True)
+            else:
+                rows = [row for row in group if not isinstance(row, str)]
+                restarted |= self.process(samples_of_rows(rows, self.run))
+        return restarted
+
     def process(self, samples: Samples) -> bool:
         """Process further samples. Returns whether the observer had to restart."""
         start = time.monotonic()
-        self._log_samples(samples)
+        traces: list[ResidualTrace] = []
+        events: list[Event] = []
+        further = samples
         if self.state is None:
             self.state, self._first_time = self._start(samples), float(samples.time[0])
-            samples = samples.segment(1, len(samples))
-        events: list[Event] = []
-        if len(samples):
-            traces: list[ResidualTrace] = []
-            try:
-                self.state, events = self.monitor.advance(self.state, samples, traces.append)
-            finally:  # written in one call, which takes a third of the time
-                self._log_residuals(traces)
-            self._now = float(samples.time[-1])
-        for event in events:
-            self._report(event)
+            further = samples.segment(1, len(samples))
+        try:
+            if len(further):
+                self.state, events = self.monitor.advance(self.state, further, traces.append)
+        finally:
+            self._log_in_order(samples, traces, events)
+        self._now = float(samples.time[-1])
         self.spent += time.monotonic() - start
         return any(event.kind == "notice" for event in events)
 
@@ -138,9 +153,9 @@ class LoggedMonitor:
         for event in self.monitor.close(self.state) if self.state is not None else []:
             self._report(event)
 
-    def notice(self, text: str) -> None:
-        """Report a notice that is not caused by the plant."""
-        self._report(Event(self._now, "notice", text, believed=self._present_faults))
+    def notice(self, text: str, from_source: bool = False) -> None:
+        """Report a notice that is not caused by the plant. from_source: about the delivery of samples."""
+        self._report(Event(self._now, "notice", text, believed=self._present_faults), from_source)
 
     def faults(self) -> list[str]:
         """Names of the parameters that are off nominal at present."""
@@ -171,10 +186,11 @@ class LoggedMonitor:
             return self.monitor.start(samples, self.believed)
         return self.monitor.start(samples, self.believed, learning_until=self.run.config.fault_free[1])
 
-    def _report(self, event: Event) -> None:
+    def _report(self, event: Event, from_source: bool = False) -> None:
         """Log an event and the faults after it, and pass it on unless an earlier log of the run has it."""
         self.events += 1
-        self.log.alarm(event.time, event.kind, " + ".join(event.faults), event.text, **event_fields(event))
+        fields = event_fields(event) | {FROM_SOURCE: from_source or None}
+        self.log.alarm(event.time, event.kind, " + ".join(event.faults), event.text, **fields)
         self._present_faults = event.believed
         if event.kind != "notice":
             self._log_faults(event)
@@ -200,68 +216,53 @@ class LoggedMonitor:
             self.log.fault(at.at_place, at.place, name in present, t=event.time, **numbers)
         self._ever_suspected.update(dict.fromkeys([*present, *masses]))
 
-    def _log_samples(self, samples: Samples) -> None:
-        plant = self.plant
-        sensors = plant.sensors
-        self.log.recording(
-            samples.time,
-            samples.inputs,
-            torch.nan_to_num(samples.readings, nan=float("nan")),
-            plant.channels(),
-            [s.column for s in sensors],
-            list(plant.channel_units().values()),
-            [s.unit for s in sensors],
-            mask=torch.isfinite(samples.readings),
-            hold=samples.hold,
-        )
+    def _log_in_order(self, samples: Samples, traces: Sequence[ResidualTrace], events: Sequence[Event]) -> None:
+        """Log samples, each followed by its residual and its events. The first after a restart has no residual."""
+        clock = samples.time.tolist()
+        tested = _positions(clock, [(t, True) for trace in traces for t in trace.time.tolist()])
+        raised = _positions(clock, [(event.time, event.kind == "notice") for event in events])
+        residuals = samples.readings.new_full((len(clock), len(self.plant.sensors) + 2), torch.nan)
+        if traces:
+            residuals[tested] = torch.cat([self._residual_rows(trace) for trace in traces])
+        has_residual = torch.zeros(len(clock), dtype=torch.bool)
+        has_residual[tested] = True
+        changes = (torch.diff(has_residual.to(torch.int8)).nonzero().flatten() + 1).tolist()
+        waiting = list(zip(raised, events, strict=True))
+        for first, last in pairwise(sorted({0, *changes, *(k + 1 for k in raised), len(clock)})):
+            self._log_samples(samples.segment(first, last), residuals[first:last] if has_residual[first] else None)
+            while waiting and waiting[0][0] < last:
+                self._report(waiting.pop(0)[1])
 
-    def _log_residuals(self, traces: Sequence[ResidualTrace]) -> None:
-        """Log the residuals, the detector's statistic and its threshold."""
-        if not traces:
-            return
-        names, units = [s.column for s in self.plant.sensors], [s.unit for s in self.plant.sensors]
-        chart = self.monitor.detector.chart
-        time, residual, statistic = (
-            torch.cat(parts) for parts in zip(*((t.time, t.residual, t.statistic) for t in traces), strict=True)
-        )
-        threshold = torch.full_like(statistic, self.monitor.detector.threshold)
-        table = torch.cat([residual, torch.stack([statistic, threshold], dim=1)], dim=1)
-        names += [f"{chart}_statistic", f"{chart}_threshold"]
-        self.log.samples("/observer/residual", time, table, names, [*units, "", ""])
+    def _residual_rows(self, trace: ResidualTrace) -> Tensor:
+        """Residuals, the detector's statistic and its threshold, (S, sensors + 2)."""
+        threshold = torch.full_like(trace.statistic, self.monitor.detector.threshold)
+        return torch.cat([trace.residual, torch.stack([trace.statistic, threshold], dim=1)], dim=1)
+
+    def _log_samples(self, samples: Samples, residuals: Tensor | None) -> None:
+        """Log samples, and the rows of `_residual_rows` if they have been tested."""
+        units, chart = self.plant.channel_units(), self.monitor.detector.chart
+        names, sensor_units = [s.column for s in self.plant.sensors], [s.unit for s in self.plant.sensors]
+        mask, readings = samples.readings.isfinite(), torch.nan_to_num(samples.readings, nan=torch.nan)
+        signals: list[tuple[Any, ...]] = [
+            ("/plant/input", as_array(samples.inputs), list(units), list(units.values()), None, {"hold": samples.hold}),
+            ("/plant/output", as_array(readings), names, sensor_units, as_array(mask), None),
+        ]
+        if residuals is not None:
+            columns = [*names, f"{chart}_statistic", f"{chart}_threshold"]
+            signals.append(("/observer/residual", as_array(residuals), columns, [*sensor_units, "", ""], None, None))
+        self.log.recording_blocks(signals, as_array(samples.time))
 
 
-def event_key(payload: dict[str, Any]) -> tuple[Any, ...]:
-    """Key by which a logged event is recognised in another log."""
-    return payload["t"], payload["event"], payload["message"]
+def _positions(clock: Sequence[float], times: Sequence[tuple[float, bool]]) -> list[int]:
+    """Index on the clock of each of the times, which follow it in order; True: after that of the time before.
 
-
-def event_fields(event: Event) -> dict[str, Any]:
-    """An event's fields for the log: numbers, texts and flat lists, and the whole event as JSON in `details`."""
-    fields: dict[str, Any] = {
-        "alarm": event.alarm or None,
-        "state": str(event.state),
-        "headline": event.headline if event.explanations else None,
-        "faults": list(event.faults) or None,
-        "sizes": list(event.sizes) or None,
-        "stds": list(event.stds) or None,
-        "units": list(event.units) or None,
-        "onset": event.onset,
-        "onset_std": event.onset_std,
-        "delay": event.delay,
-        "growing": event.growing if event.faults else None,
-        "explanations": [e.text for e in event.explanations] or None,
-        "masses": [e.mass for e in event.explanations] or None,
-        "sensors": [name for name, _ in event.shares] or None,
-        "shares": [share for _, share in event.shares] or None,
-        "first": event.first,
-        "last": event.last,
-        "count": event.count,
-        "severity": event.severity or None,
-        "announced": event.announced,
-        "format": FORMAT,
-        "details": orjson.dumps(event.to_dict()).decode(),
-    }
-    return fields
+    The clock may jump back, which causes a notice. Each notice belongs to a sample of its own.
+    """
+    positions, k = [], -1
+    for time_of_item, is_later in times:
+        k = clock.index(time_of_item, k + 1 if is_later else max(k, 0))
+        positions.append(k)
+    return positions
 
 
 def _prepare(run: MonitorRun, whole: Recording) -> PreparedMonitor:

@@ -20,16 +20,17 @@ from fdi_torch.config.growing_recordings import Row, growing_rows
 from fdi_torch.config.live_source import LiveRows
 from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor_file import MonitorRun
+from fdi_torch.jobs.event_messages import event_key
 from fdi_torch.jobs.live_batches import DelayWatch, LiveBatches
 from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
-from fdi_torch.jobs.logged_monitor import ALARM, LoggedMonitor, MonitorCallbacks, event_key
+from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.monitor_rows import (
+    ALARM,
+    logged_items,
     logged_origin,
-    logged_rows,
     recording_of_rows,
-    resumed_rows,
+    resumed_items,
     rows_until,
-    samples_of_rows,
 )
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook import RunLog
@@ -65,7 +66,7 @@ def run_monitor(
     if not follow:
         callbacks.tell(0.0, "reading")
     whole = None if follow else read_recording(run.config.recording, run.plant, run.base, run.given)
-    earlier_rows = logged_rows(unfinished, run) if follow and unfinished is not None else []
+    earlier = logged_items(unfinished, run) if follow and unfinished is not None else []
     origin = logged_origin(unfinished) if unfinished is not None else None
     messages = unfinished.messages([ALARM]) if unfinished is not None else ()
     reported = Counter(event_key(message.payload) for message in messages)
@@ -74,7 +75,7 @@ def run_monitor(
         try:
             if whole is None:
                 zeros: list[float] = []
-                _follow(monitor, callbacks, _source(run, idle, origin, earlier_rows, zeros), earlier_rows, zeros)
+                _follow(monitor, callbacks, _source(run, idle, origin, _rows(earlier), zeros), earlier, zeros)
             else:
                 show_clock([whole.clock_zero])
                 if run.config.recording.every > 1:  # the inputs' mean until the next kept sample is known only then
@@ -120,52 +121,45 @@ def _follow(
     monitor: LoggedMonitor,
     callbacks: MonitorCallbacks,
     source: Iterator[Row | str],
-    earlier_rows: Sequence[Row],
+    earlier: Sequence[Row | str],
     zeros: list[float],
 ) -> None:
     """Process samples as they come, after waiting for the end of the fault-free part."""
     run = monitor.run
-    batches = LiveBatches(resumed_rows(earlier_rows, source) if earlier_rows else source)
+    batches = LiveBatches(resumed_items(earlier, source) if _rows(earlier) else source)
     callbacks.tell(0.0, "waiting for samples")
-    rows, notices = _wait_for_fault_free_part(run, callbacks, batches)
+    first = _until_fault_free_part_ends(run, callbacks, batches)
     zero = source.origin if isinstance(source, LiveRows) else next(iter(zeros), None)
     show_clock([zero])
+    rows = _rows(first)
     monitor.learn(recording_of_rows(rows_until(rows, run.config.fault_free[1]) or rows, run))
     if zero is not None:
         monitor.log_origin(zero)
     delay_watch = DelayWatch(time.monotonic)
-    first: list[Row | str] = [*notices, *rows]
-    every_batch: Iterable[list[Row | str]] = chain([first], batches)
-    for batch in every_batch:
-        rows, notices = _rows_and_notices(batch)
-        notices += delay_watch.received([row[0] for row in rows]) if rows else []
-        for notice in notices:
-            monitor.notice(notice)
+    for batch in chain([first], batches):
+        rows = _rows(batch)
+        notices = delay_watch.received([row[0] for row in rows]) if rows else []
+        if monitor.process_items([*notices, *batch]):
+            delay_watch.clock_jumped()
         if rows:
-            if monitor.process(samples_of_rows(rows, run)):
-                delay_watch.clock_jumped()
-            for notice in delay_watch.processed(rows[-1][0]):
-                monitor.notice(notice)
+            monitor.process_items(delay_watch.processed(rows[-1][0]))
             callbacks.tell(0.5, f"{rows[-1][0]:g} s")
 
 
-def _wait_for_fault_free_part(
+def _until_fault_free_part_ends(
     run: MonitorRun, callbacks: MonitorCallbacks, batches: LiveBatches[Row | str]
-) -> tuple[list[Row], list[str]]:
+) -> list[Row | str]:
     """Rows and notices up to the end of the fault-free part, or of the file."""
-    rows: list[Row] = []
-    notices: list[str] = []
+    items: list[Row | str] = []
     end = run.config.fault_free[1]
     for batch in batches:
-        new_rows, new_notices = _rows_and_notices(batch)
-        rows += new_rows
-        notices += new_notices
+        items += batch
+        rows = _rows(items)
         callbacks.tell(0.0, f"{rows[-1][0]:g} s, learning until {end:g} s" if rows else "waiting for samples")
         if rows_until(rows, end):
             break
-    return rows, notices
+    return items
 
 
-def _rows_and_notices(batch: Iterable[Row | str]) -> tuple[list[Row], list[str]]:
-    batch = list(batch)
-    return [row for row in batch if not isinstance(row, str)], [row for row in batch if isinstance(row, str)]
+def _rows(items: Iterable[Row | str]) -> list[Row]:
+    return [item for item in items if not isinstance(item, str)]

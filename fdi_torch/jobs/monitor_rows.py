@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import chain, pairwise
+from itertools import chain, pairwise, takewhile
 
 import torch
 
@@ -14,7 +15,9 @@ from fdi_torch.logbook import series
 from fdi_torch.monitor.samples import GAP, Samples
 from fdi_torch.recording import Recording
 
-CLOCK = "/source/clock"
+ALARM, CLOCK = "/observer/alarm", "/source/clock"
+FROM_SOURCE = "from_source"
+"""Field of an alarm message: whether it is a notice about the delivery of samples."""
 
 
 def samples_of_rows(rows: Sequence[Row], run: MonitorRun) -> Samples:
@@ -85,29 +88,49 @@ def logged_rows(log: Log, run: MonitorRun) -> list[Row]:
     return [(t, [float(c[k]) for c in commands], [float(r[k]) for r in readings]) for k, t in enumerate(times)]
 
 
+def logged_items(log: Log, run: MonitorRun) -> list[Row | str]:
+    """The samples in a monitor's log and the notices of their source, in their original order."""
+    rows, items = iter(logged_rows(log, run)), list[Row | str]()
+    for message in log.messages(["/plant/output", ALARM]):
+        if message.topic != ALARM:
+            items += [row for row in [next(rows, None)] if row is not None]
+        elif message.payload.get(FROM_SOURCE):
+            items.append(message.payload["message"])
+    return items
+
+
 def logged_origin(log: Log) -> float | None:
     """Time 0 of a live source in a monitor's log, s since 1970; None if its clock has no date."""
     return next((float(message.payload["origin"]) for message in log.messages([CLOCK])), None)
 
 
-def resumed_rows(earlier: Sequence[Row], source: Iterable[Row | str]) -> Iterator[Row | str]:
-    """Rows of a growing file from its beginning, preceded by those of an earlier log that the file no longer has."""
-    rows = iter(source)
-    notices: list[Row | str] = []
-    for row in rows:
-        if not isinstance(row, str):
+def resumed_items(earlier: Sequence[Row | str], source: Iterable[Row | str]) -> Iterator[Row | str]:
+    """Rows and notices of an earlier log, and then what the source has delivered since.
+
+    A growing file begins with the rows that the log has, unless it was rotated.
+    """
+    yield from earlier
+    rows = [item for item in earlier if not isinstance(item, str)]
+    later, head = iter(source), list[Row | str]()
+    for item in later:
+        head.append(item)
+        if not isinstance(item, str):
             break
-        notices.append(row)
-    else:
-        yield from chain(earlier, notices)
+    later = chain(head, later)
+    if not (head and not isinstance(head[-1], str) and _equal_rows(head[-1], rows[0])):
+        yield from (item for item in later if isinstance(item, str) or item[0] > rows[-1][0])
         return
-    if _equal_rows(row, earlier[0]):
-        yield from chain(notices, [row], rows)
-        return
-    yield from chain(earlier, notices)
-    for later in chain([row], rows):
-        if isinstance(later, str) or later[0] > earlier[-1][0]:
-            yield later
+    repeated = 0
+    for item in later:
+        repeated += not isinstance(item, str)
+        if repeated == len(rows):
+            break
+    logged = Counter(takewhile(lambda item: isinstance(item, str), reversed(earlier)))
+    for item in later:
+        if isinstance(item, str) and logged[item] > 0:
+            logged[item] -= 1
+        else:
+            yield item
 
 
 def _equal_rows(a: Row, b: Row) -> bool:

@@ -16,9 +16,9 @@ from fdi_torch.gap.diagnose import Settings
 from fdi_torch.jobs import monitor as monitor_job
 from fdi_torch.jobs import study as study_job
 from fdi_torch.jobs.gap import groups, run_gap
-from fdi_torch.jobs.logged_monitor import ALARM, LoggedMonitor, MonitorCallbacks
+from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.logged_recordings import logged_recording
-from fdi_torch.jobs.monitor_rows import logged_rows, recording_of_rows, rows_until, samples_of_rows
+from fdi_torch.jobs.monitor_rows import logged_items, recording_of_rows, rows_until
 from fdi_torch.jobs.run_setup import fitting_of, requested_space
 from fdi_torch.jobs.study import TRIAL, log_summary, log_trials
 from fdi_torch.jobs.train import STATE, Tell, estimate_logged, log_recordings, origin_of, state_is_due
@@ -79,13 +79,14 @@ def replay_monitor(log: LoggedRun, path: Path, overrides: Iterable[str], tell: T
     _expect_no_data(overrides, ("recording",))
     run = build_monitor(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
     callbacks = MonitorCallbacks(tell, lambda event: None, lambda prepared: None)
-    rows = logged_rows(log, run)
+    items = logged_items(log, run)
+    rows = [item for item in items if not isinstance(item, str)]
     about = log.metadata.get("fdi_torch.data", {})
     data = [{"path": about["0.path"], "sha256": about.get("0.sha256", "")}] if "0.path" in about else []
     with RunLog(path, "monitor", **monitor_job.origin_of(run, None) | {"data": data}, parent_run_id=parent) as again:
         monitor = LoggedMonitor(run, again, callbacks)
         monitor.learn(recording_of_rows(rows_until(rows, run.config.fault_free[1]) or rows, run))
-        monitor.process(samples_of_rows(rows, run))
+        monitor.process_items(items)
         monitor.close()
         again.result({"events": monitor.events, "faults": monitor.faults()})
 
@@ -118,8 +119,6 @@ def comparable(trials: Sequence[int] = ()) -> Select:
     def select(messages: Iterable[Message]) -> Iterator[Message]:
         waiting: list[Message] = []
         for message in messages:
-            if message.topic == ALARM and message.payload.get("event") == "notice":
-                continue  # about delays and unreadable rows, which a replay does not have
             if message.topic.startswith("/estimate/") and message.topic.endswith(("/output", "/residual")):
                 continue  # follow from estimate and recording, which are compared; older logs lack them
             if message.topic == STATE and not state_is_due(message.payload["generation"]):

@@ -22,6 +22,7 @@ from fdi_torch.monitor.known_faults import (
     effect_of_value,
     end_recovered,
     examine_hidden,
+    possible_ends,
     recovered_columns,
     reset_to_nominal,
     size_change,
@@ -247,8 +248,9 @@ class AlarmHandler:
             [fault.size for fault in self.faults],
             lambda c: effect_of_value(self.observer, window, change.before, change.hypothesis, c, healthy[c])[0],
         )
-        state = with_hidden(self.observer, state, change)
-        state, events = end_recovered(self.writer, state, change, reported)
+        ends = possible_ends(self.observer, state, change, self.settings.lookback)
+        state = with_hidden(self.observer, state, change, change.best.onset if ends is None else ends[0])
+        state, events = end_recovered(self.writer, state, change, reported, ends)
         present = [c for c in best.hypothesis.sizes if c not in back]
         if not present:
             numbers = [t.number for t in ended]

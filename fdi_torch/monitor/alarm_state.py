@@ -56,10 +56,6 @@ class Alarm:
     count: int = 1
     explanations: tuple[Explanation, ...] = ()
 
-    @property
-    def is_open(self) -> bool:
-        return self.state in _OPEN or self.state is State.CONFIRMING
-
     def with_state(self, state: State) -> Alarm:
         """The alarm in another state. Raises ValueError for a transition that is not allowed."""
         if state not in FOLLOWS[self.state]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 
@@ -89,28 +90,37 @@ class EventWriter:
         number: int,
         names: Sequence[str],
         observable: bool,
+        ends: tuple[float, float] | None,
     ) -> Event:
-        """Recovery of the faults of one alarm. observable: whether the readings would show them if still present."""
+        """Recovery of the faults of one alarm. observable: whether the readings would show them if still present.
+
+        ends: first and last time at which they may have ended, s; None if the fit's onset says it.
+        """
         explanations = tuple(self.explanation(f, state, change) for f in fits)
-        faults = ", ".join(map(parameter_words, names))
-        text = f"{faults}: back to nominal, {_onset_text(fits[0], fits[0].hypothesis.incipient)}"
+        faults, when = ", ".join(map(parameter_words, names)), _onset_text(fits[0], fits[0].hypothesis.incipient)
+        if ends is not None:
+            when = f"between {ends[0]:.1f} s and {ends[1]:.1f} s"
+            explanations = (_at_any_time(explanations[0], *ends), *explanations[1:])
+        text = f"{faults}: back to nominal, {when}"
         if " or " in headline(explanations):
             text += f"; {headline(explanations)}"
         if not observable:
             text = f"{faults}: the readings since {fits[0].onset:.1f} s would not show whether it still stands"
         kind: Kind = "recovered" if observable else "cannot tell"
-        delay = change.alarm_time - fits[0].onset
+        delay = change.alarm_time - (fits[0].onset if explanations[0].onset is None else explanations[0].onset)
         return self._event(state, kind, text, state.alarm(number), explanations=explanations, delay=delay)
 
     def end_shown(self, state: MonitorState, number: int, faults: Sequence[HiddenFault]) -> Event:
         """The end of hidden faults of one alarm, once the readings have shown it."""
         names = [parameter_words(self.space.names[f.track.column]) for f in faults]
-        last = max(faults, key=lambda f: f.ended)
-        text = f"{', '.join(names)}: back to nominal, as the readings since {max(f.seen for f in faults):.1f} s show"
+        first, seen = min(f.ended for f in faults), max(f.seen for f in faults)
+        text = f"{', '.join(names)}: back to nominal between {first:.1f} s and {state.now:.1f} s, "
+        text += f"as the readings since {seen:.1f} s show"
         nominal = [self.space.parameters[f.track.column] for f in faults]
         sizes = tuple(Size(p.name, p.nominal, 0.0, p.unit, estimate_words(p.name, p.unit, p.nominal)) for p in nominal)
-        explanations = (Explanation(1.0, sizes, last.ended, last.ended_std, gone=True),)
-        return self._event(state, "recovered", text, state.alarm(number), explanations=explanations)
+        ended = tuple(p.name for p in nominal)
+        explanation = _at_any_time(Explanation(1.0, sizes, ended=ended), first, state.now)
+        return self._event(state, "recovered", text, state.alarm(number), explanations=(explanation,))
 
     def followed(
         self, state: MonitorState, tracks: Sequence[FaultTrack], announced: Sequence[FaultTrack]
@@ -149,9 +159,10 @@ class EventWriter:
     def explanation(self, fit: HypothesisFit, state: MonitorState, change: DetectedChange | None = None) -> Explanation:
         """A fit in the form that events report."""
         h, now, sizes = fit.hypothesis, state.now, []
+        hidden = [f.track.column for f in state.hidden] if change is not None else []
         for c in h.columns:
             p, size, std = self.space.parameters[c], float(fit.value[c]), float(fit.std[c])
-            if change is not None and c in [f.track.column for f in state.hidden]:
+            if c in hidden:
                 sizes.append(Size(p.name, size, float("inf"), p.unit, f"{ParameterName.parse(p.name).field} unknown"))
                 continue
             grows = change is not None and h.incipient and c in h.sizes and now > fit.onset
@@ -159,8 +170,8 @@ class EventWriter:
             sizes.append(size_of(p, size, std, rate))
         if not sizes:
             return Explanation(fit.probability, ())
-        recovered = set(h.recovered) >= set(h.sizes)
-        return Explanation(fit.probability, tuple(sizes), fit.onset, fit.onset_std, h.incipient, recovered)
+        ended = tuple(self.space.names[c] for c in h.recovered if c not in hidden)
+        return Explanation(fit.probability, tuple(sizes), fit.onset, fit.onset_std, h.incipient, ended)
 
     def _limits(self, state: MonitorState, change: DetectedChange, fits: Sequence[HypothesisFit]) -> tuple[Limit, ...]:
         """Forecast of overflow and dry tanks. The random draws depend on the alarm's number only."""
@@ -202,6 +213,11 @@ class EventWriter:
             state.now, kind, text, alarm.number, alarm.state, shares=alarm.shares, first=alarm.first, last=alarm.last,
             count=alarm.count, believed=believed, **more,  # type: ignore[arg-type]
         )  # fmt: skip
+
+
+def _at_any_time(explanation: Explanation, first: float, last: float) -> Explanation:
+    """The explanation with an onset at any time between two, s: mean and standard deviation."""
+    return replace(explanation, onset=0.5 * (first + last), onset_std=(last - first) / 12.0**0.5)
 
 
 def _onset_text(change: HypothesisFit | FaultTrack, growing: bool = False) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
@@ -28,7 +28,7 @@ Kind = Literal[
     "estimate",
     "notice",
 ]
-FORMAT = "fdi_torch.event/2"
+FORMAT = "fdi_torch.event/3"
 SMALLEST_SHARE = 0.05  # headlines name explanations with at least this probability, and sensors with this share
 
 
@@ -54,7 +54,7 @@ class Size:
 class Explanation:
     """One possible cause of an alarm. mass: its posterior probability. Without sizes: a false alarm.
 
-    onset, onset_std: s. growing: an incipient fault. gone: the faults recovered.
+    onset, onset_std: s. growing: an incipient fault. ended: those of the parameters that are back to nominal.
     """
 
     mass: float
@@ -62,7 +62,7 @@ class Explanation:
     onset: float | None = None
     onset_std: float | None = None
     growing: bool = False
-    gone: bool = False
+    ended: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -70,14 +70,20 @@ class Explanation:
 
     @property
     def text(self) -> str:
-        if not self.sizes:
-            return "chance"
-        return " and ".join(_words(sizes, self.gone) for sizes in _by_effect(self.sizes))
+        return self._in_words(lambda sizes: sized_words(sizes[0].name, [s.shown for s in sizes]))
 
     @property
     def causes(self) -> str:
         """The text without sizes."""
-        return " and ".join(parameter_words(sizes[0].name) for sizes in _by_effect(self.sizes)) or self.text
+        return self._in_words(lambda sizes: parameter_words(sizes[0].name))
+
+    def _in_words(self, words: Callable[[Sequence[Size]], str]) -> str:
+        """'leak at A (size 0.200 ± 0.010), with leak at B back to nominal'. words: of the sizes of one fault."""
+        faults = _by_effect(self.sizes)
+        present = " and ".join(words(sizes) for sizes in faults if sizes[0].name not in self.ended)
+        back = " and ".join(parameter_words(sizes[0].name) for sizes in faults if sizes[0].name in self.ended)
+        both = ", with " if present and back else ""
+        return f"{present}{both}{back}{' back to nominal' if back else ''}" or "chance"
 
     def restricted_to(self, names: Sequence[str]) -> Explanation:
         """The explanation with the sizes of some parameters only."""
@@ -176,7 +182,7 @@ class Event:
         """The probability that each parameter has changed, summed over the explanations."""
         total: dict[str, float] = {}
         for e in self.explanations:
-            for name in e.names if not e.gone else ():
+            for name in (n for n in e.names if n not in e.ended):
                 total[name] = total.get(name, 0.0) + e.mass
         return total
 
@@ -210,12 +216,6 @@ def _by_effect(sizes: Sequence[Size]) -> list[list[Size]]:
     for size in sizes:
         grouped.setdefault(ParameterName.parse(size.name).prefix, []).append(size)
     return list(grouped.values())
-
-
-def _words(sizes: Sequence[Size], gone: bool) -> str:
-    """'leak at A (size 0.200 ± 0.010)', or 'leak at A back to size 0' for one that has gone."""
-    shown = [s.shown for s in sizes]
-    return f"{parameter_words(sizes[0].name)} back to {', '.join(shown)}" if gone else sized_words(sizes[0].name, shown)
 
 
 def percent_text(mass: float) -> str:

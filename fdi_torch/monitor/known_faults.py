@@ -131,6 +131,7 @@ def with_new_sizes(state: MonitorState, fit: HypothesisFit, revise: float) -> tu
 
 # Assumed error of a fault's model, as a share of the fault's effect: a real leak is not an ideal orifice.
 FAULT_MODEL_ERROR = 0.1
+END_CANDIDATES = 200  # times in a window at which a fault may have ended
 
 
 def recovered_columns(space: ParameterSpace, change: DetectedChange) -> list[int]:
@@ -138,17 +139,61 @@ def recovered_columns(space: ParameterSpace, change: DetectedChange) -> list[int
     return [c for c in change.best.hypothesis.sizes if _is_recovered(space, change, c)]
 
 
+def _law_error(track: FaultTrack) -> float:
+    """Three standard deviations of what the error of a fault's model moves in the white innovations."""
+    return 3.0 * FAULT_MODEL_ERROR * track.effect_rms
+
+
 def _recovery_is_observable(
     observer: ObserverBank, state: MonitorState, change: DetectedChange, track: FaultTrack
 ) -> bool:
     """Whether the readings since the recovery would show the fault if it were still present.
 
-    They would not if it adds less to the white innovations than three standard deviations of its model's error, the
-    share FAULT_MODEL_ERROR of its earlier effect, for example in a dry tank or behind a closed valve.
+    They would not if it adds less to the white innovations than its model's error, for example in a dry tank or behind
+    a closed valve.
     """
     window, size = state.window(change.best.onset), float(change.before[track.column])
     effect, _ = effect_of_value(observer, window, change.before, change.hypothesis, track.column, size)
-    return effect >= 3.0 * FAULT_MODEL_ERROR * track.effect_rms
+    return effect >= _law_error(track)
+
+
+def possible_ends(
+    observer: ObserverBank, state: MonitorState, change: DetectedChange, lookback: float
+) -> tuple[float, float] | None:
+    """First and last time at which the faults that a change ended may have ended, s; None if the fit's onset and its
+    standard deviation say it.
+
+    In a dry tank the readings determine no onset. And where the fit leaves more than noise, its onset may be where the
+    fault's law is wrong, as in a tank that runs dry. Another onset is possible if its misfit is at most that of three
+    standard deviations larger, or if what it moves in the white innovations is within the error of the fault's law.
+    """
+    best = change.best
+    if not change.ended or best.hypothesis.incipient:
+        return None
+    window = state.window(max(best.onset - lookback, change.since))
+    times = window.samples.time[:: max(len(window) // END_CANDIDATES, 1)]
+    onsets = torch.cat([times, times.new_tensor([best.onset])])
+    sudden = torch.zeros(len(onsets), dtype=torch.bool)
+    lanes = ChangeHypotheses(best.value.repeat(len(onsets), 1), onsets, sudden)
+    blocks = observer.in_blocks(window, lanes)
+    white = torch.cat([observer.white_innovations(window, change.before, block) for block in blocks])
+    misfits = 0.5 * white.square().sum((1, 2)) / best.misfit_ratio
+    between = ((window.times > times[:, None]) != (window.times > best.onset)).to(white.dtype)
+    moved = ((white[:-1] - white[-1]).square().mean(-1) * between).sum(-1) / between.sum(-1).clamp(min=1.0)
+    law_error = 0.0 if best.fits else max(map(_law_error, change.ended))
+    possible = (misfits[:-1] - misfits[-1] <= 4.5) | (moved.sqrt() < law_error)
+    before, after = times <= best.onset, times > best.onset
+    first = min([best.onset, *_while(times[before].flip(0), possible[before].flip(0))])
+    last = max([best.onset, *_while(times[after], possible[after])])
+    step = float(torch.diff(times).max())
+    reach = 3.0 * best.onset_std + step
+    is_sharp = best.onset_std <= step and first >= best.onset - reach and last <= best.onset + reach
+    return None if is_sharp else (first, last)
+
+
+def _while(times: Tensor, possible: Tensor) -> list[float]:
+    """The times up to the first that is not possible."""
+    return times[possible.to(torch.int8).cumprod(0).to(torch.bool)].tolist()
 
 
 def _end_is_shown(observer: ObserverBank, state: MonitorState, fault: HiddenFault, start: float) -> bool:
@@ -156,7 +201,7 @@ def _end_is_shown(observer: ObserverBank, state: MonitorState, fault: HiddenFaul
     window = state.window(start)
     present = ChangeHypotheses(state.believed[None], window.samples.time[:1], torch.tensor([False]))
     effect, misfit = effect_of_value(observer, window, state.believed, present, fault.track.column, fault.size)
-    return effect >= 3.0 * FAULT_MODEL_ERROR * fault.track.effect_rms and misfit > STRONG_EVIDENCE
+    return effect >= _law_error(fault.track) and misfit > STRONG_EVIDENCE
 
 
 def reset_to_nominal(space: ParameterSpace, change: DetectedChange, recovered: Sequence[int]) -> Tensor:
@@ -185,11 +230,13 @@ def _is_recovered(space: ParameterSpace, change: DetectedChange, column: int) ->
     return before != space.parameters[column].nominal and _is_nominal(space, change.best, column) and distinct
 
 
-def with_hidden(observer: ObserverBank, state: MonitorState, change: DetectedChange) -> MonitorState:
+def with_hidden(
+    observer: ObserverBank, state: MonitorState, change: DetectedChange, earliest_end: float
+) -> MonitorState:
     """The state with the faults that recovered at a change but that the readings since would not show."""
     best, now = change.best, state.now
     hidden = [t for t in change.ended if not _recovery_is_observable(observer, state, change, t)]
-    new = [HiddenFault(t, float(change.before[t.column]), best.onset, best.onset_std, now) for t in hidden]
+    new = [HiddenFault(t, float(change.before[t.column]), earliest_end, now) for t in hidden]
     judged = {*best.hypothesis.columns, *state.off_nominal.nonzero().flatten().tolist()}
     return replace(state, hidden=(*(h for h in state.hidden if h.track.column not in judged), *new))
 
@@ -213,9 +260,16 @@ def examine_hidden(
 
 
 def end_recovered(
-    writer: EventWriter, state: MonitorState, change: DetectedChange, reported: Sequence[HypothesisFit]
+    writer: EventWriter,
+    state: MonitorState,
+    change: DetectedChange,
+    reported: Sequence[HypothesisFit],
+    ends: tuple[float, float] | None,
 ) -> tuple[MonitorState, list[Event]]:
-    """End the alarms of recovered faults; "cannot tell" if the readings would not show one of them any more."""
+    """End the alarms of recovered faults; "cannot tell" if the readings would not show one of them any more.
+
+    ends: see `possible_ends`.
+    """
     events, unseen = [], [h.track.column for h in state.hidden]
     for number in sorted({t.number for t in change.ended}):
         columns, alarm = [t.column for t in change.ended if t.number == number], state.alarm(number)
@@ -224,5 +278,5 @@ def end_recovered(
         if alarm.state is not answer:
             state = state.with_alarm(alarm.with_state(answer))
             names = [writer.space.names[c] for c in hidden or columns]
-            events.append(writer.ended(state, change, reported, number, names, not hidden))
+            events.append(writer.ended(state, change, reported, number, names, not hidden, ends))
     return state, events

@@ -46,13 +46,12 @@ class FaultTrack:
 class HiddenFault:
     """A fault that seems to have ended, but that the readings since would not show, for example in a dry tank.
 
-    track: before it ended. size: before it ended. ended, ended_std: s. seen: until when the readings were examined, s.
+    track: before it ended. size: before it ended. ended: not before, s. seen: until when the readings were examined, s.
     """
 
     track: FaultTrack
     size: float
     ended: float
-    ended_std: float
     seen: float
 
 

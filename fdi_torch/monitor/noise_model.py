@@ -29,6 +29,8 @@ from fdi_torch.simulate.build import BuildError
 
 # log10 of the process noise per sample over the measurement noise, both in m: from negligible to dominant.
 EXPONENTS = tuple(0.5 * i - 4.0 for i in range(11))
+# Difference of information criteria from which evidence is "very strong" (Kass and Raftery, 1995).
+VERY_STRONG = 10.0
 FINE = tuple(0.125 * i for i in range(-4, 5))
 
 
@@ -148,13 +150,17 @@ def _noise(network: TankNetwork, linear: Linear, best: _Candidate) -> NoiseModel
 def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation) -> Whitening:
     """Whitening of an observer's residuals: random flows by their Kalman filter, what remains by an autoregression.
 
-    Without a compiler there is no flow filter.
+    Without the flows if the readings speak strongly against them: correlated measurement noise would be taken for flows
+    without a correlation time, and slow sums of the innovations would be far smaller than their model says. Without a
+    compiler there is no flow filter.
     """
     residual = seen.steady_residual
+    score, of_residual = score_whitenings(residual)[0]
     flows = _flow_filter(network, linear, gain, seen)
-    innovations = residual if flows is None else flows(residual)[0]
-    whitening = score_whitenings(innovations)[0][1]
-    return replace(whitening, flows=flows)
+    if flows is None:
+        return of_residual
+    score_with_flows, of_innovations = score_whitenings(flows(residual)[0])[0]
+    return of_residual if score_with_flows - score > VERY_STRONG else replace(of_innovations, flows=flows)
 
 
 def _flow_filter(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation) -> FlowFilter | None:

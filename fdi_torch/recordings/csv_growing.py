@@ -60,23 +60,24 @@ class GrowingCsv:
         dated = self._first is not None and (self._clock.stamps or self._first > SINCE_1970)
         return self._first + self._columns.read_stamp.offset if dated and self._first is not None else None
 
-    def new(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
-        """The rows completed since the last call: times (R,) s, inputs (R, M), outputs (R, N), SI.
+    def new(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[int, str]]]:
+        """The rows completed since the last call: times (R,) s, inputs (R, M), outputs (R, N), SI. Time may jump.
 
-        The fourth result has one sentence for each row that could not be read. Time may jump.
+        The fourth result has, for each row that could not be read, the number of rows before it and a sentence.
         """
         with self.path.open("rb") as raw:
             raw.seek(self._place)
             data = raw.read()
         whole = data[: data.rfind(b"\n") + 1]
         self._place += len(whole)
-        rows, troubles = [], []
+        rows: list[np.ndarray] = []
+        troubles = []
         for line in whole.decode(self._encoding, errors="replace").splitlines():
             try:
                 row = parse_carefully([line], self._columns, self._line)
                 rows += [values for values in row if np.isfinite(values[0])]
             except ValueError as error:
-                troubles.append(str(error))
+                troubles.append((len(rows), str(error)))
             self._line += 1
         table = np.array(rows).reshape(len(rows), len(self._columns.positions))
         inputs, outputs = (channels_in_si(table, self._columns, bounds) for bounds in (self._inputs, self._outputs))
