@@ -100,6 +100,8 @@ def test_every_shipped_plant_can_be_taken_apart_and_put_together_in_code(name: s
         (lambda: Pipe("P", "A", "B", area="1e14 m^2", discharge_coefficient=0.6), "pipes.P.area: expected a quantity"),
         (lambda: in_code(sensors=[]), "sensors: expected at least one, got none"),
         (lambda: in_code(tolerances={"linc.area": 0.1}), "tolerances.linc.area: expected a constant"),
+        (lambda: in_code(tanks=Tank("A", 0.02, 0.6)), "expected a list such as [Tank(...), ...], got a Tank"),
+        (lambda: in_code(tanks=["A"]), "tanks: expected a list such as [Tank(...), ...], got a str"),
         (lambda: in_code(tolerances={"link.area": -0.1}), "tolerances.link.area: expected a positive tolerance"),
         (lambda: in_code(varying=["link.area"]), "varying: expected a constant with a tolerance"),
         (lambda: in_code(gravity="9.81 m"), "gravity: expected a quantity in m/s^2"),
@@ -339,6 +341,7 @@ def test_a_data_frame_follows_the_rules_of_files() -> None:
     found = fdi_torch.read_frame(frame, RIG, columns=columns)
     assert found.time.tolist() == [0.0, 2.0, 4.0, 6.0] and found.mask[:, 0].tolist() == [True, False, True, True]
     assert found.outputs[2, 0] == 0.12 and found.began is not None
+    assert fdi_torch.read_frame(frame.set_index("time").rename_axis(None), RIG, columns=columns).began == found.began
     with pytest.raises(fdi_torch.ConfigError, match=r"^data frame: expected a column for h "):
         fdi_torch.read_frame(frame, RIG)
     with pytest.raises(fdi_torch.ConfigError, match=r"data frame: colums: |data frame: expected a known key"):

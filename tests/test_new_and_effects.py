@@ -197,6 +197,12 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
     assert load_monitor("monitor.yaml").config.recording.file == "trend.csv"
     assert load_run("run.yaml").config.recordings[0].file == "trend.csv"
     assert "then check again; fdi gap --plant rig.yaml --recording trend.csv says" in capsys.readouterr().out
+    Path("german.csv").write_text(
+        "Datum/Uhrzeit;Zulauf [l/h];Füllstand B1 [%]\n29.3.2026 08:30:00;3000;40,5\n29.3.2026 08:31:00;3000;41\n"
+    )
+    fdi("new", "plant", "--recording", "german.csv", "--out", "german.yaml")
+    plant = load_plant(Path("german.yaml"))
+    assert [s.column for s in plant.sensors] == ["Füllstand B1"] and list(plant.channels()) == ["Zulauf"]
     Path("none.csv").write_text("t_s,a,b\n0,1,2\n1,1,2\n")
     assert cli.main(["new", "plant", "--recording", "none.csv", "--out", "none.yaml"]) != cli.DONE
     assert "expected a column of a level with its unit in the header" in capsys.readouterr().err

@@ -73,7 +73,7 @@ def test_summary_tells_range_resolution_and_what_does_not_count() -> None:
 def test_gap_in_the_clock() -> None:
     late = healthy().time + 30 * (healthy().time > 200)
     channel, text = found(check_recording(replace(healthy(), time=late), PLANT), "gap")
-    assert (channel, text) == ("t", "1 gaps longer than 3 sampling intervals (1 s), the longest of 31 s after 200 s")
+    assert (channel, text) == ("t", "1 gap longer than 3 sampling intervals (1 s), the longest of 31 s after 200 s")
 
 
 @pytest.mark.parametrize("missing", [2, 3])

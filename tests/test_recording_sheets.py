@@ -146,7 +146,7 @@ def test_rows_in_any_order_are_sorted_where_that_is_said(plant: PlantDescription
     assert same(recording, read(plant, tmp_path, PLAIN))
     found = {f.text for f in check_recording(recording, plant).findings if f.kind == "read"}
     assert found == {
-        "run.csv: one row repeating the one before left out",
+        "run.csv: 1 row repeating the one before left out",
         "run.csv: rows sorted by time: 3 came late, 2 had the time of another",
     }
 

@@ -18,6 +18,7 @@ from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.run_file import load_run
 from fdi_torch.gap.preprocess.acquisition import examined
+from fdi_torch.names import counted
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
 from fdi_torch.plant.scales import emptying_time
 from fdi_torch.quantities import display_unit, significant
@@ -98,8 +99,8 @@ def _show_plant(plant: PlantDescription, screen: Screen) -> None:
     flows = [(getattr(plant, kind.part()), kind.__name__.lower()) for kind in FLOW_KINDS]
     always = (plant.tanks, plant.pipes, plant.pumps, plant.sensors)
     counts = [(plant.tanks, "tank"), *flows, (plant.sensors, "sensor")]
-    parts = ", ".join(_count(len(c), what) for c, what in counts if c or any(c is a for a in always))
-    screen.say(f"plant {plant.name}: {parts}, {_count(len(plant.tolerances), 'constant')} with a tolerance")
+    parts = ", ".join(counted(len(c), what) for c, what in counts if c or any(c is a for a in always))
+    screen.say(f"plant {plant.name}: {parts}, {counted(len(plant.tolerances), 'constant')} with a tolerance")
     (area, per_area), (height, per_height) = display_unit("m^2"), display_unit("m")
     rows = []
     for tank in plant.tanks:
@@ -116,13 +117,11 @@ def _show_plant(plant: PlantDescription, screen: Screen) -> None:
     screen.table("", header, rows)
 
 
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
 def _show(check: RecordingCheck, screen: Screen) -> None:
     screen.say()
-    screen.say(f"{check.source}: {check.samples} samples, {check.duration:g} s, one every {check.interval:.6g} s")
+    screen.say(
+        f"{check.source}: {counted(check.samples, 'sample')}, {check.duration:g} s, one every {check.interval:.6g} s"
+    )
     header = ("channel", "", "unit", "lowest", "highest", "mean", "smallest step", "missing", "masked")
     screen.table("", header, [_row(channel) for channel in check.channels], left=3)
     for finding in check.findings:

@@ -45,14 +45,15 @@ class _Column(NamedTuple):
 def plant_from_recording(path: Path, name: str) -> str:
     """The text of a plant file: a pump for each flow or command, and a row of tanks, one for each level.
 
-    A column is a reading if its unit is a length or a pressure, or if its name begins with L, H, P or X; otherwise it
-    is a command. Raises ValueError if no column with a unit in its header can be a reading.
+    A column is a reading if its unit is a length or a pressure, or if its name begins with L, H, P or X; if there is
+    none, each with a unit that sensors have is one. Others are commands. Raises ValueError if no column with a unit in
+    its header can be a reading.
     """
     header = read_header(path)
     clock = bind_clock(path, header, None).header
     named = [column for column in header if column != clock]
     columns = _columns(path, [column for column in named if header_unit(column)])
-    sensors = [column for column in columns if column.is_reading]
+    sensors = [column for column in columns if column.is_reading] or [c for c in columns if c.kind in AT_RIM]
     if not sensors:
         raise ValueError(
             f"{path}: expected a column of a level with its unit in the header, such as LT-101 (cm), got "
@@ -60,7 +61,7 @@ def plant_from_recording(path: Path, name: str) -> str:
         )
     tanks = [f"T{k + 1}" for k in range(len(sensors))] if len(sensors) > 26 else list(ascii_uppercase[: len(sensors)])
     pipes = [(f"{a}_{b}", a, b) for a, b in pairwise(tanks)] + [("outlet", tanks[-1], OUTSIDE)]
-    pumps = [_pump(column, tanks[0]) for column in columns if not column.is_reading]
+    pumps = [_pump(column, tanks[0]) for column in columns if column not in sensors]
     without = [column for column in named if header_unit(column) is None]
     lines = [
         f"# From the columns of {path.name}. Correct what follows a !, then check it.",
@@ -77,7 +78,7 @@ def plant_from_recording(path: Path, name: str) -> str:
         ),
         "",
         *(["pumps:    # ! the tank that each fills, and its greatest flow", *pumps, ""] if pumps else []),
-        "sensors:  # ! the tank of each, and its gain: what it reads at the rim, divided by the height",
+        "sensors:  # ! the tank of each, and its gain: reading at the rim divided by height; commands go to pumps",
         *(_sensor(column, tank) for column, tank in zip(sensors, tanks, strict=True)),
         "",
         "tolerances:    # one standard deviation; constants without one count as exact",

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fdi_torch.names import counted
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
 from fdi_torch.report.predictions import predicted
@@ -35,7 +36,7 @@ def progress_of(material: Material) -> Progress:
         return Progress(text)
     trials = material.counts.get("/study/trial", 0)
     if trials:
-        return Progress(f"{trials} trial{'s' if trials != 1 else ''} done")
+        return Progress(f"{counted(trials, 'trial')} done")
     if material.kind == "monitor" and material.recordings and len(material.recordings[0].time):
         return Progress(f"monitored until {number(float(material.recordings[0].time[-1]), 6)} s")
     said = material.of("/log")
