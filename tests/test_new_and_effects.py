@@ -80,9 +80,12 @@ def test_a_new_plant_file_does_not_wait_for_the_library_of_units(tmp_path: Path)
     assert load_plant(tmp_path / "rig.yaml").name == "rig"
 
 
+LOGS = Path(__file__).parent / "data"
 WITHOUT_TORCH = [
     *("new plant --out rig.yaml", "new run --out run.yaml", "new monitor --out watch.yaml", "new study --out st.yaml"),
     *("effects", "effects leak pump_lag", "effects --plant quadruple_tank --json", "completion bash"),
+    *("check --plant three_tank", f"view {LOGS} --list"),
+    f"compare {LOGS}/log_format_1_train.mcap {LOGS}/log_format_1_gap.mcap",
 ]
 
 
