@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from fdi_torch import cli
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.recording import Recording
@@ -52,6 +53,16 @@ def found(check: RecordingCheck, kind: str) -> tuple[str, str]:
     """Channel and text of the one finding, which must be of that kind."""
     assert [finding.kind for finding in check.findings] == [kind]
     return check.findings[0].channel, check.findings[0].text
+
+
+def test_a_rig_without_pumps_is_checked_with_a_long_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("rig.yaml").write_text("tanks: {A: {area: 1 m^2, height: 1 m}}\nsensors: {h: {tank: A}}\n")
+    Path("run.csv").write_text("t_s,h_cm\n" + "".join(f"{k},{50 + k % 7}\n" for k in range(2500)))
+    assert cli.main(["check", "--plant", "rig.yaml", "--recording", "run.csv"]) == cli.DONE
+    assert "1 tank, 0 pipes, 0 pumps, 1 sensor, 0 constants with" in capsys.readouterr().out
 
 
 def test_nothing_is_found_in_a_healthy_recording() -> None:
@@ -157,7 +168,9 @@ def test_level_at_the_rim_is_told_with_its_times() -> None:
     levels[100:140] = 1.0 + 1e-3 * torch.randn(40, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     channel, text = found(check_recording(with_h1(levels), PLANT), "rim")
     assert channel == "h1"
-    assert text == "within 2% of the rim of T1 (100 cm) in 40 samples between 100 s and 139 s: water may overflow there"
+    assert (
+        text == "within 2 % of the rim of T1 (100 cm) in 40 samples between 100 s and 139 s: water may overflow there"
+    )
     levels[100:140] -= 0.05
     assert not [f for f in check_recording(with_h1(levels), PLANT).findings if f.kind == "rim"]
 

@@ -78,9 +78,9 @@ def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[Recor
 
 def _show_plant(plant: PlantDescription, screen: Screen) -> None:
     flows = [(getattr(plant, kind.part()), kind.__name__.lower()) for kind in FLOW_KINDS]
-    always = (plant.tanks, plant.pipes, plant.pumps, plant.sensors)
+    always = ("tank", "pipe", "pump", "sensor")
     counts = [(plant.tanks, "tank"), *flows, (plant.sensors, "sensor")]
-    parts = ", ".join(counted(len(c), what) for c, what in counts if c or any(c is a for a in always))
+    parts = ", ".join(counted(len(c), what) for c, what in counts if c or what in always)
     screen.say(f"plant {plant.name}: {parts}, {counted(len(plant.tolerances), 'constant')} with a tolerance")
     (area, per_area), (height, per_height) = display_unit("m^2"), display_unit("m")
     rows = []
