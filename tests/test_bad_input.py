@@ -73,6 +73,7 @@ WRONG_DATA = {
     "missing column": (",h3_cm", ",x3_cm", "expected a column for h3", "map it under columns"),
     "unit": ("Q1_cm3_s", "Q1_cm", "Q1", "expected a unit of the kind m^3/s"),
     "per cent of a level": ("h1_cm", "h1_pct", "h1", "(a level in %: gain: 100 %/m)"),
+    "per cent of a pump": ("Q1_cm3_s", "Q1_pct", "Q1", "(a command in %: gain: "),
     "no number": ("\n5,50,50,45,", "\n5,50,50,five,", "row 7, column h1_cm", "got 'five'"),
     "fewer cells": ("\n5,50,50,45,", "\n5,50,", "row 7", "expected 6 cells"),
 }
