@@ -11,7 +11,7 @@ from fdi_torch.names import shortened, unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text, si_unit_of
 from fdi_torch.recordings.csv_files import read_header
-from fdi_torch.recordings.header import header_unit
+from fdi_torch.recordings.header import header_unit, names_in
 from fdi_torch.recordings.source import ChannelSource, ClockSource
 
 
@@ -156,7 +156,7 @@ def _without_column(path: Path, names: Collection[str], config: FileConfig | Non
     if not names or is_log(path):
         return []
     header = read_header(path) if config is None else read_header(path, config.header, config.sheet)
-    present = {*header, *(split[0] for column in header if (split := header_unit(column)))}
+    present = names_in(header)
     return [name for name in names if name not in present]
 
 
