@@ -88,7 +88,8 @@ def run_study(
 
 def origin_of(study: Study) -> dict[str, Any]:
     """Configuration and seed of a study, as its log records them."""
-    resolved = study.run.resolved | {"study": study.config.model_dump(mode="json")}
+    keys = study.config.model_dump(mode="json") | {"all_trials": study.plan.trials}
+    resolved = study.run.resolved | {"study": keys}
     return {"config_text": study.text, "config": resolved, "seeds": {"seed": study.plan.seed}}
 
 
