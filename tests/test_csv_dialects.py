@@ -96,7 +96,7 @@ def test_stamps_are_followed_from_the_first_on(tmp_path: Path) -> None:
     growing = GrowingCsv(path, ["Q1"], ["h1"])
     assert growing.new()[0].tolist() == [0.0, 5.0]
     with path.open("a") as file:
-        file.write("2026-03-29T08:01:00.5Z,50,12\nsoon,50,12\n")
+        file.write("2026-03-29T08:01:00.5Z,50,12\nsoon,50,12\n,50,12\n")
     seconds, _, readings, troubles = growing.new()
     assert (seconds.tolist(), readings.tolist()) == ([60.5], [[0.12]])
     assert "row 5, column time: expected a time stamp" in troubles[0]
@@ -113,6 +113,11 @@ def test_a_date_beside_a_time_of_day_is_followed_and_takes_a_format(tmp_path: Pa
         file.write("50,3/30/2026,12:01:00 AM,12\n50,3/30/2026\n")
     seconds, _, readings, troubles = growing.new()
     assert (seconds.tolist(), readings.tolist()) == ([61.0], [[0.12]]) and "expected 3 cells" in troubles[0]
+
+
+def test_a_last_line_without_its_last_cell_is_left_out(tmp_path: Path) -> None:
+    recording = read(tmp_path, PLAIN + "15,20")
+    assert len(recording) == 3 and recording.notes == ("run.csv: the last line is cut off and left out: '15,20'",)
 
 
 def test_rows_that_share_a_time_are_told_from_rows_in_disorder(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 
 import fdi_torch
@@ -15,6 +16,7 @@ from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_in
 from fdi_torch.recordings.plant_units import wrong_units
+from fdi_torch.recordings.volume_balance import volumes_along
 
 PLANT = """
 tanks:
@@ -150,6 +152,14 @@ def test_a_steady_state_without_noise_is_no_wrong_unit(tmp_path: Path, flow: str
     fdi_torch.write_csv(run, tmp_path / "run.csv")
     read = fdi_torch.read_recording(tmp_path / "run.csv", plant)
     assert wrong_units(plant, read) == ""
+
+
+def test_flows_follow_from_levels_not_from_readings(folder: Path) -> None:
+    plant = load_plant(folder / "rig.yaml")
+    run = recorded(plant, {})
+    shifted = replace(plant, sensors=tuple(replace(sensor, offset=0.3) for sensor in plant.sensors))
+    then, now = volumes_along(plant, run), volumes_along(shifted, replace(run, outputs=run.outputs + 0.3))
+    torch.testing.assert_close(now.by_laws, then.by_laws, rtol=1e-9, atol=0.0)
 
 
 def test_swapped_sensors_are_no_wrong_unit(folder: Path) -> None:

@@ -141,6 +141,15 @@ def test_clipped_channel() -> None:
     assert "the highest value 49 cm was read" in clipped.findings[0].text
 
 
+def test_an_end_is_compared_with_its_neighbour() -> None:
+    """The readings next to the highest one are rare; how often low ones were read does not matter."""
+    h1 = torch.cat([torch.full((40,), 0.2), torch.full((30,), 0.21), torch.tensor([0.3]), torch.full((20,), 0.4)])
+    run = healthy(len(h1))
+    clipped = check_recording(replace(run, outputs=torch.stack([h1.double(), *run.outputs.T[1:]], dim=-1)), PLANT)
+    text = "h1: the highest value 40 cm was read 20 times: clipped there, or at rest"
+    assert [f"{f.channel}: {f.text}" for f in clipped.findings if f.kind == "clipped"] == [text]
+
+
 def test_frozen_channel() -> None:
     h1 = healthy().outputs[:, 0].clone()
     h1[100:160] = h1[100]
