@@ -50,6 +50,11 @@ class Estimate:
     draws: Draws | None = field(default=None, repr=False)
 
     @property
+    def warning(self) -> str:
+        """The warning of an estimate that has not converged; empty for one that has."""
+        return convergence_warning(self.status)
+
+    @property
     def correlation(self) -> torch.Tensor:
         """Correlation matrix (P, P); NaN in rows and columns of undetermined parameters."""
         return self.covariance / (self.std[:, None] * self.std[None, :])
@@ -162,6 +167,13 @@ def wider_than_range(space: ParameterSpace, std: Float[torch.Tensor, " P"]) -> t
 def chi_square_quantile(confidence: float) -> float:
     """Quantile of chi-square with one degree of freedom."""
     return NormalDist().inv_cdf(0.5 + 0.5 * confidence) ** 2
+
+
+def convergence_warning(status: str) -> str:
+    """The warning of a refinement that ended with a status other than 'converged'; empty for that."""
+    if status in ("converged", ""):
+        return ""
+    return f"Not converged ({status.replace('_', ' ')}): sizes may be off by more than their standard errors"
 
 
 def plain_value(value: Any, name: str) -> Any:

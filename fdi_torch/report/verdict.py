@@ -9,6 +9,7 @@ from fdi_torch.amounts import parameter_words
 from fdi_torch.clock import clock_text
 from fdi_torch.estimate.combinations import Combination
 from fdi_torch.estimate.misfit import UNRELIABLE, Misfit
+from fdi_torch.estimate.uncertainty import convergence_warning
 from fdi_torch.gap.verdict_words import verdict_sentence
 from fdi_torch.names import counted
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
@@ -56,12 +57,15 @@ def headline(material: Material) -> str:
 
 
 def unreliable_words(material: Material) -> str:
-    """The warning of an estimate whose model does not explain its recording; logs before 2026-11 lack its ratio."""
+    """The warning of an estimate that has not converged or whose model does not explain its recording; logs before
+    2026-11 lack its ratio.
+    """
     result = material.about("result")
-    if result.get("explained") != "false":
-        return ""
-    ratio = result.get("unexplained_ratio", "null")
-    return f"{UNRELIABLE if ratio == 'null' else Misfit(float(ratio)).warning}. "
+    warnings = [convergence_warning(result.get("status", "")) if material.kind == "train" else ""]
+    if result.get("explained") == "false":
+        ratio = result.get("unexplained_ratio", "null")
+        warnings.append(UNRELIABLE if ratio == "null" else Misfit(float(ratio)).warning)
+    return "".join(f"{warning}. " for warning in warnings if warning)
 
 
 def fault_words(material: Material) -> str:
