@@ -236,6 +236,11 @@ def test_arguments_of_another_kind_are_named() -> None:
         fdi_torch.ConfigError, match=r"inputs.Q: expected a value such as .* or \{steps: .*got \[3, 4\]"
     ):
         fdi_torch.simulate(RIG, inputs={"Q": [3, 4]})
+    with pytest.raises(
+        fdi_torch.ConfigError, match=r"A.leak.onset: expected less than the duration of 100 s, got 200 s"
+    ):
+        late: dict[str, Any] = {"A.leak": 0.2, "A.leak.onset": "200 s"}
+        fdi_torch.simulate(RIG, inputs={"Q": "3 l/min"}, duration="100 s", faults=late)
     with pytest.raises(fdi_torch.ConfigError, match=r"simulate.noise: expected \{std: .*, got 1 mm"):
         fdi_torch.simulate(RIG, inputs={"Q": "3 l/min"}, noise="1 mm")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"start level of A: expected equilibrium, free or a level in m, got 'eq'"):
