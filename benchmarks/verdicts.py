@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from fdi_torch.blind import blind_benchmark
+from fdi_torch.blind.benchmark import blind_benchmark
 from fdi_torch.blind.plants import RIGS
 from fdi_torch.blind.scaling import Scales
 from fdi_torch.blind.scored_rows import scores_of

@@ -14,6 +14,11 @@ def shortened(text: str) -> str:
     return text if len(text) <= MOST_SHOWN else f"{text[: MOST_SHOWN - 3]}..."
 
 
+def counted(number: int, noun: str) -> str:
+    """'1 gap', '2 gaps'."""
+    return f"{number} {noun}" + ("" if number == 1 else "s")
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """'; the nearest is X', or an empty text if no known name is similar."""
     near = difflib.get_close_matches(name[:MOST_SHOWN], list(known), n=1, cutoff=0.5)

@@ -253,7 +253,7 @@ class Recording(Shown):
         block = torch.arange(len(self.time), device=self.time.device) // step
         first = self.inputs[::step]
         volume = torch.zeros_like(first).index_add_(0, block, (self.inputs - first[block]) * held)
-        return first + volume / torch.zeros_like(first[:, :1]).index_add_(0, block, held)
+        return first + volume / held.new_zeros(len(first), 1).index_add_(0, block, held)
 
     def known_segments(self) -> list[Recording]:
         """The longest segments in which all inputs are known."""

@@ -9,6 +9,9 @@ import pytest
 
 from fdi_torch import cli
 from fdi_torch.config.yaml_files import SHIPPED
+from fdi_torch.logbook import read_run
+from fdi_torch.report.material import gather
+from fdi_torch.report.verdict import headline
 
 HEADER = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm"
 ROWS = [f"{t},{50 + 10 * (t // 20)},50,{40 + t % 11},{30 + t % 5},{35 + t % 3}" for t in range(60)]
@@ -73,6 +76,7 @@ WRONG_DATA = {
     "missing column": (",h3_cm", ",x3_cm", "expected a column for h3", "map it under columns"),
     "unit": ("Q1_cm3_s", "Q1_cm", "Q1", "expected a unit of the kind m^3/s"),
     "per cent of a level": ("h1_cm", "h1_pct", "h1", "(a level in %: gain: 100 %/m)"),
+    "per cent of a pump": ("Q1_cm3_s", "Q1_pct", "Q1", "(a command in %: gain: "),
     "no number": ("\n5,50,50,45,", "\n5,50,50,five,", "row 7, column h1_cm", "got 'five'"),
     "fewer cells": ("\n5,50,50,45,", "\n5,50,", "row 7", "expected 6 cells"),
 }
@@ -123,3 +127,13 @@ def test_missing_readings_are_counted_and_unknown_inputs_cut_out(outcome, tmp_pa
     assert code in (cli.DONE, cli.NOT_CONVERGED, cli.NOT_EXPLAINED) and not said
     assert f"{tmp_path / 'rig.csv'}: 1 of 177 readings are missing or masked and do not count" in shown
     assert f"{tmp_path / 'rig.csv'}: an input is sometimes unknown; fitted as 2 segments with known inputs" in shown
+
+
+def test_a_fit_that_has_not_converged_says_so_first(outcome, tmp_path: Path) -> None:
+    once = replaced("estimate: {", "estimate: {refine: {iterations: 1}, ")
+    code, _, shown = outcome(job=once)
+    assert code == cli.NOT_CONVERGED
+    warning = "Not converged (max iterations): sizes may be off by more than their standard errors"
+    assert f"{warning}.\n- next: estimate fewer parameters" in shown.partition("parameter ")[0]
+    (log,) = (tmp_path / "logs").glob("*.mcap")
+    assert headline(gather(read_run(log))).startswith(warning)

@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdi_torch.blind import blind_benchmark, joined, tables
-from fdi_torch.blind.benchmark import always_null
+from fdi_torch.blind.benchmark import always_null, blind_benchmark
 from fdi_torch.blind.case_drafts import plans
 from fdi_torch.blind.cases import Case
 from fdi_torch.blind.plants import three_tank
 from fdi_torch.blind.score import by_effect, judge, summary, utility
-from fdi_torch.blind.scored_rows import reliability, write_rows
+from fdi_torch.blind.scored_rows import joined, reliability, tables, write_rows
 from fdi_torch.blind.sealed_files import manifest, open_key, read_plant, read_recording, write_cases
 from fdi_torch.blind.sizes import size_errors, sizes
 from fdi_torch.blind.statistics import clopper_pearson, mean_interval, median_interval, root_mean_square_interval
@@ -213,7 +212,7 @@ def test_what_is_concluded_stands_in_the_folder(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "out" / "scores.json").read_text()).keys() == {"three_tank"}
     text = (tmp_path / "out" / "scores.md").read_text()
     assert "2 cases of seeds 1, answered by the code of abc (2)." in text
-    assert "| single | 1/2 (1 .. 99 %) |" in text and "| 0.5 to 0.9 | 0.900 | 1/1 (3 .. 100 %) |" in text
+    assert "| single | 1/2 (1 .. 99 %) |" in text and "| 0.5 to 0.9 | 0.900 | 1/1 (2 .. 100 %) |" in text
     assert "| single | three_tank | 1 | case1 | pump_lag at Q1 | named |  |" in text
     log = read_run(tmp_path / "out" / LOG)
     assert [m.payload["truth"] for m in log.messages(["/study/trial"])] == [["pump_lag@Q1"]] * 2

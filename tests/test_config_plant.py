@@ -147,6 +147,7 @@ def test_numbers_without_a_short_form_read_back_to_the_last_bit() -> None:
         ("tanks.T1.overflow_to", "T9", "tanks.T1.overflow_to: expected one of the tanks"),
         ("tanks.T1.leak_reference", "P9", "tanks.T1.leak_reference: expected one of the pipes P12, got 'P9'"),
         ("tolerances", {"P12.discharge": 0.1}, "got 'P12.discharge'; the nearest is 'P12.discharge_coefficient'"),
+        ("tolerances", {"*.area": 10}, "expected a share of T1.area up to 100 %, such as 3 %, got 10"),
         ("tolerances", {"*.area": "-3 %"}, "tolerances.\\*.area: expected a positive tolerance such as 3 %, got -3 %"),
         (
             "effects",

@@ -10,9 +10,10 @@ import torch
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_csv, read_csv_files
 from fdi_torch.recordings.csv_growing import GrowingCsv
-from fdi_torch.recordings.source import ChannelSource, FileSource
+from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource
 
 PLAIN = "t_s,Q1_cm3_s,h1_cm\n0,50.5,10\n5,50.5,11\n10,20,12.5\n"
+DATED = "Datum;Uhrzeit;Q1_cm3_s;h1_cm\n{};08:30:00;50,5;10\n{};08:30:05;50,5;11\n{};08:30:10;20;12,5\n"
 STAMPED = "time;Q1_cm3_s;h1_cm\n{};50,5;10\n{};50,5;11\n{};20;12,5\n"
 
 
@@ -37,6 +38,9 @@ def read(folder: Path, text: str | bytes, encoding: str = "utf-8", **mapping: Ch
         (PLAIN.replace("t_s,Q1_cm3_s,h1_cm", "n,Time [s],Q1 (cm3/s),h1 [cm]").replace("\n", "\n1,")[:-2], "utf-8"),
         ("time_ms,Q1_cm3_s,h1_cm\n1790000000500,50.5,10\n1790000005500,50.5,11\n1790000010500,20,12.5\n", "utf-8"),
         (STAMPED.format("2026-03-29 00:30:00", "2026-03-29 00:30:05", "2026-03-29T00:30:10.000"), "utf-8"),
+        ("Datum/Uhrzeit" + STAMPED[4:].format("29.3.2026 8:30:00", "29.3.2026 8:30:05", "29.3.2026 8:30:10"), "utf-8"),
+        (DATED.format("29.03.2026", "29.03.2026", "29.03.2026"), "utf-8"),
+        (DATED.format('"2026-03-29 00:00:00"', "2026-03-29", "2026-03-29T00:00:00"), "utf-8"),
         (STAMPED.format("2026-03-29T00:59:55Z", "2026-03-29T03:00:00+02:00", "2026-03-29 03:00:05+0200"), "utf-8"),
     ],
 )
@@ -92,11 +96,37 @@ def test_stamps_are_followed_from_the_first_on(tmp_path: Path) -> None:
     growing = GrowingCsv(path, ["Q1"], ["h1"])
     assert growing.new()[0].tolist() == [0.0, 5.0]
     with path.open("a") as file:
-        file.write("2026-03-29T08:01:00.5Z,50,12\nsoon,50,12\n")
+        file.write("2026-03-29T08:01:00.5Z,50,12\nsoon,50,12\n,50,12\n")
     seconds, _, readings, troubles = growing.new()
     assert (seconds.tolist(), readings.tolist()) == ([60.5], [[0.12]])
     [(rows_before, trouble)] = troubles
     assert rows_before == 1 and "row 5, column time: expected a time stamp" in trouble
+
+
+def test_a_date_beside_a_time_of_day_is_followed_and_takes_a_format(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text("Q1_cm3_s,Date,Time,h1_cm\n50,3/29/2026,11:59:59 PM,10\n50,3/30/2026,12:00:00 AM,11\n")
+    mapping = {"t": ClockSource(stamps="%m/%d/%Y %I:%M:%S %p")}
+    assert read_csv(path, ["Q1"], ["h1"], mapping).time.tolist() == [0.0, 1.0]
+    growing = GrowingCsv(path, ["Q1"], ["h1"], mapping)
+    assert growing.new()[0].tolist() == [0.0, 1.0]
+    with path.open("a") as file:
+        file.write("50,3/30/2026,12:01:00 AM,12\n50,3/30/2026\n")
+    seconds, _, readings, troubles = growing.new()
+    assert (seconds.tolist(), readings.tolist()) == ([61.0], [[0.12]]) and "expected 3 cells" in troubles[0]
+
+
+def test_a_last_line_without_its_last_cell_is_left_out(tmp_path: Path) -> None:
+    recording = read(tmp_path, PLAIN + "15,20")
+    assert len(recording) == 3 and recording.notes == ("run.csv: the last line is cut off and left out: '15,20'",)
+
+
+def test_rows_that_share_a_time_are_told_from_rows_in_disorder(tmp_path: Path) -> None:
+    stamps = ("2026-03-29 00:30:00", "2026-03-29 00:30:00", "2026-03-29 00:30:01")
+    with pytest.raises(ValueError, match=r"1 such row\); keep the last row of each time by .*period: 50 ms"):
+        read(tmp_path, STAMPED.replace("10\n", "9\n").format(*stamps))
+    with pytest.raises(ValueError, match=r"1 such row\); correct the clock, or let rows be sorted"):
+        read(tmp_path, STAMPED.format(*stamps[::2], stamps[1]))
 
 
 @pytest.mark.parametrize("cell", ["५०.५", "٥٠", "５０", "1_000"])

@@ -12,6 +12,7 @@ from rigs import blank_recording, constant_inputs, three_tank
 from torch import Tensor
 
 from fdi_torch.effects import build_network, effect, placements_for
+from fdi_torch.effects.coefficient_drift import elapsed
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlacedEffect, Sensor, Tank
 from fdi_torch.plant.effect import Effect, Local, Memory, Placement
@@ -368,6 +369,13 @@ def test_a_taper_measured_at_the_floor_is_a_cone_from_there() -> None:
     assert 160e-4 * (level + 0.8 * level**2 / 6.0) == pytest.approx(30e-3, rel=1e-6)
 
 
+def test_a_drift_that_hardly_settles_follows_the_same_law() -> None:
+    """The series for slow settling equals (1 - exp(-b t))/b to all digits of the difference of exponentials."""
+    settling = torch.tensor([0.5e-7, 0.999e-7, 1.001e-7, -0.999e-7], dtype=torch.float64)
+    time = torch.tensor(1000.0, dtype=torch.float64)
+    torch.testing.assert_close(elapsed(time, settling), -torch.expm1(-settling * time) / settling, rtol=1e-11, atol=0.0)
+
+
 @pytest.mark.parametrize(
     ("settling", "expected"),
     [
@@ -383,6 +391,21 @@ def test_a_coefficient_drifts_steadily_to_rest_or_away(settling: float, expected
     assert float(drifted) == pytest.approx(2e-5 * expected, rel=1e-12)
     almost = drift.flow(number(2e-5), there, values(rate=1e-4, settling=settling + 1e-12))
     assert float(almost) == pytest.approx(float(drifted), rel=1e-9)
+
+
+def test_an_oscillation_of_a_sensor_leads_by_its_phase() -> None:
+    p = values(amplitude=0.02, period=4.0, phase=1.0)
+    read, _ = effect("sensor_oscillation").reading(number(0.5), (), Clock(number(2.0), number(0.5), number(0.5)), p)
+    assert float(read) == pytest.approx(0.5 + 0.02 * math.sin(2.0 * math.pi * 2.5 / 4.0 + 1.0), rel=1e-12)
+
+
+def test_a_tank_loses_what_evaporates_from_its_surface() -> None:
+    assert float(effect("evaporation").inflow(local(0.5), values(rate=2e-7))) == pytest.approx(-2e-7 * 0.01, rel=1e-12)
+
+
+def test_a_pipe_that_has_silted_up_passes_nothing_and_nothing_back() -> None:
+    there = replace(local(0.5), clock=Clock(number(999.5), number(1.0), number(1.0)))
+    assert float(effect("coefficient_drift").flow(number(2e-5), there, values(rate=-2e-3, settling=0.0))) == 0.0
 
 
 def test_a_drooping_pump_loses_with_a_power_of_the_level() -> None:

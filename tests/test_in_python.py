@@ -100,6 +100,8 @@ def test_every_shipped_plant_can_be_taken_apart_and_put_together_in_code(name: s
         (lambda: Pipe("P", "A", "B", area="1e14 m^2", discharge_coefficient=0.6), "pipes.P.area: expected a quantity"),
         (lambda: in_code(sensors=[]), "sensors: expected at least one, got none"),
         (lambda: in_code(tolerances={"linc.area": 0.1}), "tolerances.linc.area: expected a constant"),
+        (lambda: in_code(tanks=Tank("A", 0.02, 0.6)), "expected a list such as [Tank(...), ...], got a Tank"),
+        (lambda: in_code(tanks=["A"]), "tanks: expected a list such as [Tank(...), ...], got a str"),
         (lambda: in_code(tolerances={"link.area": -0.1}), "tolerances.link.area: expected a positive tolerance"),
         (lambda: in_code(varying=["link.area"]), "varying: expected a constant with a tolerance"),
         (lambda: in_code(gravity="9.81 m"), "gravity: expected a quantity in m/s^2"),
@@ -234,6 +236,11 @@ def test_arguments_of_another_kind_are_named() -> None:
         fdi_torch.ConfigError, match=r"inputs.Q: expected a value such as .* or \{steps: .*got \[3, 4\]"
     ):
         fdi_torch.simulate(RIG, inputs={"Q": [3, 4]})
+    with pytest.raises(
+        fdi_torch.ConfigError, match=r"A.leak.onset: expected less than the duration of 100 s, got 200 s"
+    ):
+        late: dict[str, Any] = {"A.leak": 0.2, "A.leak.onset": "200 s"}
+        fdi_torch.simulate(RIG, inputs={"Q": "3 l/min"}, duration="100 s", faults=late)
     with pytest.raises(fdi_torch.ConfigError, match=r"simulate.noise: expected \{std: .*, got 1 mm"):
         fdi_torch.simulate(RIG, inputs={"Q": "3 l/min"}, noise="1 mm")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"start level of A: expected equilibrium, free or a level in m, got 'eq'"):
@@ -339,6 +346,7 @@ def test_a_data_frame_follows_the_rules_of_files() -> None:
     found = fdi_torch.read_frame(frame, RIG, columns=columns)
     assert found.time.tolist() == [0.0, 2.0, 4.0, 6.0] and found.mask[:, 0].tolist() == [True, False, True, True]
     assert found.outputs[2, 0] == 0.12 and found.began is not None
+    assert fdi_torch.read_frame(frame.set_index("time").rename_axis(None), RIG, columns=columns).began == found.began
     with pytest.raises(fdi_torch.ConfigError, match=r"^data frame: expected a column for h "):
         fdi_torch.read_frame(frame, RIG)
     with pytest.raises(fdi_torch.ConfigError, match=r"data frame: colums: |data frame: expected a known key"):

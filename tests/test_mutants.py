@@ -9,7 +9,7 @@ import pytest
 
 from tests.mutants import ROOT, Mutant, mutants
 
-ROOMS = ("config", "effects", "estimate", "gap", "logbook", "monitor", "plant", "simulate", "study")
+ROOMS = ("config", "effects", "estimate", "gap", "logbook", "monitor", "plant", "recordings", "simulate", "study")
 
 
 @pytest.mark.parametrize("mutant", mutants(), ids=lambda m: f"{m.file}: {m.breaks}")

@@ -80,9 +80,12 @@ def test_a_new_plant_file_does_not_wait_for_the_library_of_units(tmp_path: Path)
     assert load_plant(tmp_path / "rig.yaml").name == "rig"
 
 
+LOGS = Path(__file__).parent / "data"
 WITHOUT_TORCH = [
     *("new plant --out rig.yaml", "new run --out run.yaml", "new monitor --out watch.yaml", "new study --out st.yaml"),
     *("effects", "effects leak pump_lag", "effects --plant quadruple_tank --json", "completion bash"),
+    *("check --plant three_tank", f"view {LOGS} --list"),
+    f"compare {LOGS}/log_format_1_train.mcap {LOGS}/log_format_1_gap.mcap",
 ]
 
 
@@ -182,7 +185,7 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
         "rig.yaml; next: correct what follows a !, then fdi check --plant rig.yaml --recording trend.csv"
         in capsys.readouterr().out
     )
-    assert "# Left out, as their header has no unit: operator\n" in Path("rig.yaml").read_text()
+    assert "# Left out, as their header has no unit of a level or command: operator\n" in Path("rig.yaml").read_text()
     plant = load_plant(Path("rig.yaml"))
     assert [sensor.column for sensor in plant.sensors] == ["LT-101", "PT 7", "level"]
     assert list(plant.channels()) == ["FIC-101 PV", "valve"] and [p.target for p in plant.pipes] == [
@@ -197,6 +200,17 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
     assert load_monitor("monitor.yaml").config.recording.file == "trend.csv"
     assert load_run("run.yaml").config.recordings[0].file == "trend.csv"
     assert "then check again; fdi gap --plant rig.yaml --recording trend.csv says" in capsys.readouterr().out
+    Path("german.csv").write_text(
+        "Datum/Uhrzeit;Zulauf [l/h];Füllstand B1 [%]\n29.3.2026 08:30:00;3000;40,5\n29.3.2026 08:31:00;3000;41\n"
+    )
+    fdi("new", "plant", "--recording", "german.csv", "--out", "german.yaml")
+    plant = load_plant(Path("german.yaml"))
+    assert [s.column for s in plant.sensors] == ["Füllstand B1"] and list(plant.channels()) == ["Zulauf"]
+    Path("duty.csv").write_text("t_s,pwm_duty,u_pump_V,y_lower_V,pulses_per_s,mass (s)\n0,1,2,1,0,2\n1,1,2,1,0,2\n")
+    fdi("new", "plant", "--recording", "duty.csv", "--out", "duty.yaml")
+    assert "or command: pulses_per_s, mass (s)\n" in Path("duty.yaml").read_text()
+    plant = load_plant(Path("duty.yaml"))
+    assert [s.column for s in plant.sensors] == ["y_lower"] and list(plant.channels()) == ["pwm", "u_pump"]
     Path("none.csv").write_text("t_s,a,b\n0,1,2\n1,1,2\n")
     assert cli.main(["new", "plant", "--recording", "none.csv", "--out", "none.yaml"]) != cli.DONE
     assert "expected a column of a level with its unit in the header" in capsys.readouterr().err

@@ -7,13 +7,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
+import yaml
 
 import fdi_torch
 from fdi_torch.cli import DONE, MISUSE, main
-from fdi_torch.config.plant_file import load_plant
+from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_in
 from fdi_torch.recordings.plant_units import wrong_units
+from fdi_torch.recordings.volume_balance import volumes_along
 
 PLANT = """
 tanks:
@@ -139,6 +142,24 @@ def test_flows_that_no_recording_can_tell_apart_are_no_wrong_unit(folder: Path) 
     run = recorded(plant, {})
     constant = replace(run, inputs=0.0 * run.inputs + 5e-5, outputs=0.0 * run.outputs + 0.1)
     assert wrong_units(plant, constant) == ""
+
+
+@pytest.mark.parametrize("flow", ["1 l/min", "3 l/min", "3.3 l/min"])
+def test_a_steady_state_without_noise_is_no_wrong_unit(tmp_path: Path, flow: str) -> None:
+    """All sums of the balance are equal but for the digits of the file, whose scatter says nothing of its error."""
+    plant = build_plant(yaml.safe_load(PLANT), "plant.yaml")
+    run = fdi_torch.simulate(plant, inputs={"Q": flow}, duration="600 s")
+    fdi_torch.write_csv(run, tmp_path / "run.csv")
+    read = fdi_torch.read_recording(tmp_path / "run.csv", plant)
+    assert wrong_units(plant, read) == ""
+
+
+def test_flows_follow_from_levels_not_from_readings(folder: Path) -> None:
+    plant = load_plant(folder / "rig.yaml")
+    run = recorded(plant, {})
+    shifted = replace(plant, sensors=tuple(replace(sensor, offset=0.3) for sensor in plant.sensors))
+    then, now = volumes_along(plant, run), volumes_along(shifted, replace(run, outputs=run.outputs + 0.3))
+    torch.testing.assert_close(now.by_laws, then.by_laws, rtol=1e-9, atol=0.0)
 
 
 def test_swapped_sensors_are_no_wrong_unit(folder: Path) -> None:

@@ -82,6 +82,12 @@ def test_every_leaves_an_unknown_input_unknown() -> None:
     assert torch.isnan(thin.inputs.flatten()).tolist() == [True, False]
 
 
+def test_every_of_a_rig_without_commands() -> None:
+    full = recording([0, 1, 2, 3], [0, 0, 0, 0], [0, 1, 2, 3])
+    thin = replace(full, inputs=full.inputs[:, :0], input_names=(), input_units=()).every(2)
+    assert thin.inputs.shape == (2, 0) and thin.outputs.flatten().tolist() == [0, 2]
+
+
 def test_every_is_a_whole_number_from_one() -> None:
     with pytest.raises(ValueError, match="expected every to be a whole number from 1, got 0"):
         ramp(4).every(0)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from fdi_torch import cli
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.recording import Recording
@@ -54,6 +55,16 @@ def found(check: RecordingCheck, kind: str) -> tuple[str, str]:
     return check.findings[0].channel, check.findings[0].text
 
 
+def test_a_rig_without_pumps_is_checked_with_a_long_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("rig.yaml").write_text("tanks: {A: {area: 1 m^2, height: 1 m}}\nsensors: {h: {tank: A}}\n")
+    Path("run.csv").write_text("t_s,h_cm\n" + "".join(f"{k},{50 + k % 7}\n" for k in range(2500)))
+    assert cli.main(["check", "--plant", "rig.yaml", "--recording", "run.csv"]) == cli.DONE
+    assert "1 tank, 0 pipes, 0 pumps, 1 sensor, 0 constants with" in capsys.readouterr().out
+
+
 def test_nothing_is_found_in_a_healthy_recording() -> None:
     check = check_recording(healthy(), PLANT)
     assert check.findings == ()
@@ -73,7 +84,7 @@ def test_summary_tells_range_resolution_and_what_does_not_count() -> None:
 def test_gap_in_the_clock() -> None:
     late = healthy().time + 30 * (healthy().time > 200)
     channel, text = found(check_recording(replace(healthy(), time=late), PLANT), "gap")
-    assert (channel, text) == ("t", "1 gaps longer than 3 sampling intervals (1 s), the longest of 31 s after 200 s")
+    assert (channel, text) == ("t", "1 gap longer than 3 sampling intervals (1 s), the longest of 31 s after 200 s")
 
 
 @pytest.mark.parametrize("missing", [2, 3])
@@ -130,6 +141,15 @@ def test_clipped_channel() -> None:
     assert "the highest value 49 cm was read" in clipped.findings[0].text
 
 
+def test_an_end_is_compared_with_its_neighbour() -> None:
+    """The readings next to the highest one are rare; how often low ones were read does not matter."""
+    h1 = torch.cat([torch.full((40,), 0.2), torch.full((30,), 0.21), torch.tensor([0.3]), torch.full((20,), 0.4)])
+    run = healthy(len(h1))
+    clipped = check_recording(replace(run, outputs=torch.stack([h1.double(), *run.outputs.T[1:]], dim=-1)), PLANT)
+    text = "h1: the highest value 40 cm was read 20 times: clipped there, or at rest"
+    assert [f"{f.channel}: {f.text}" for f in clipped.findings if f.kind == "clipped"] == [text]
+
+
 def test_frozen_channel() -> None:
     h1 = healthy().outputs[:, 0].clone()
     h1[100:160] = h1[100]
@@ -157,7 +177,9 @@ def test_level_at_the_rim_is_told_with_its_times() -> None:
     levels[100:140] = 1.0 + 1e-3 * torch.randn(40, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     channel, text = found(check_recording(with_h1(levels), PLANT), "rim")
     assert channel == "h1"
-    assert text == "within 2% of the rim of T1 (100 cm) in 40 samples between 100 s and 139 s: water may overflow there"
+    assert (
+        text == "within 2 % of the rim of T1 (100 cm) in 40 samples between 100 s and 139 s: water may overflow there"
+    )
     levels[100:140] -= 0.05
     assert not [f for f in check_recording(with_h1(levels), PLANT).findings if f.kind == "rim"]
 

@@ -119,7 +119,7 @@ def test_blank_lines_comments_and_quotes_are_passed_over(tmp_path: Path) -> None
         (GOOD + "3,fifty,13\n", "run.csv: row 5, column Q1_cm3_s: expected a number or an empty cell, got 'fifty'"),
         (GOOD + "3,50\n", "run.csv: row 5: expected 3 cells as in the header, got 2"),
         (GOOD + ",50,13\n", "run.csv: row 5, column t_s: expected a time in every row, got none"),
-        (GOOD + "2,50,13\n", r"run.csv: row 5, column t_s: expected time that increases, got 2 s after 2 s \(one such"),
+        (GOOD + "2,50,13\n", r"run.csv: row 5, column t_s: expected time that increases, got 2 s after 2 s \(1 such"),
         (GOOD + "1.5,50,13\n", "run.csv: row 5, column t_s: expected time that increases, got 1.5 s after 2 s"),
     ],
 )

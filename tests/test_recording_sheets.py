@@ -47,6 +47,13 @@ def same(a: Recording, b: Recording) -> bool:
     return equal(a.time, b.time) and equal(a.inputs, b.inputs) and equal(a.outputs, b.outputs)
 
 
+def test_a_value_marked_as_bad_ends_the_one_before_it(plant: PlantDescription, tmp_path: Path) -> None:
+    """The command is unknown from the bad value to the next good one; an empty cell alone would hold the first."""
+    text = "t_s,Q_l_min,ok,V_pct,h_mm\n0,60,192,50,500\n1,90,0,50,501\n2,,192,50,502\n3,30,192,50,503\n"
+    found = read(plant, tmp_path, text, columns={"Q": {"column": "Q_l_min", "held": "always", "quality": "ok"}})
+    assert torch.isfinite(found.inputs[:, 0]).tolist() == [True, False, False, True]
+
+
 def test_a_held_input_is_what_a_file_with_every_cell_says(plant: PlantDescription, tmp_path: Path) -> None:
     assert same(read(plant, tmp_path, MIXED, columns=HELD), read(plant, tmp_path, PLAIN))
 
@@ -146,7 +153,7 @@ def test_rows_in_any_order_are_sorted_where_that_is_said(plant: PlantDescription
     assert same(recording, read(plant, tmp_path, PLAIN))
     found = {f.text for f in check_recording(recording, plant).findings if f.kind == "read"}
     assert found == {
-        "run.csv: one row repeating the one before left out",
+        "run.csv: 1 row repeating the one before left out",
         "run.csv: rows sorted by time: 3 came late, 2 had the time of another",
     }
 

@@ -6,7 +6,7 @@ import math
 import sys
 import zipfile
 from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, date, datetime, time, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -160,6 +160,16 @@ def test_a_sheet_is_chosen_and_blank_rows_and_units_below_names_are_known(tmp_pa
         book.active.append(row)
     book.save(path)
     assert read_csv(path, *CHANNELS).outputs[:, 0].tolist() == [0.1, 0.1015]
+
+
+def test_dates_beside_times_of_day_in_a_sheet_are_its_clock(tmp_path: Path) -> None:
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.active.append(["Date", "Time", "Q1 [cm3/s]", "h1 [mm]"])
+    for second in (0, 5):
+        book.active.append([date(2026, 3, 29), time(8, 30, second), 50, 100])
+    book.save(tmp_path / "run.xlsx")
+    assert read_csv(tmp_path / "run.xlsx", *CHANNELS).time.tolist() == [0.0, 5.0]
 
 
 def test_rows_beyond_the_size_that_a_sheet_claims_are_read(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ The factors are not powers of two or ten, so that nothing but rounding may diffe
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -14,6 +15,7 @@ import torch
 from rigs import blank_recording, factor, rescaled, three_tank
 from torch import Tensor
 
+from fdi_torch import Pipe, Plant, Sensor, Tank
 from fdi_torch.config.monitor_file import MonitorConfig
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
@@ -30,7 +32,7 @@ from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.scales import length_scale, time_scale
+from fdi_torch.plant.scales import emptying_time, length_scale, time_scale
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.equilibrium import equilibrium
 from fdi_torch.simulate.experiment import lay_out
@@ -204,3 +206,13 @@ def test_an_onset_is_sought_within_the_recording() -> None:
     run = load_run(overrides=["estimate.parameters=[T1.leak, T1.leak.onset]", "simulate.duration=400 s"])
     fitting = fitting_of(run, requested_space(run), recordings_of(run))
     assert (fitting.space["T1.leak.onset"].low, fitting.space["T1.leak.onset"].high) == (0.0, 400.0)
+
+
+def test_a_full_tank_empties_in_twice_the_time_of_its_first_outflow() -> None:
+    """Torricelli: the root of the level falls evenly, so that the mean outflow is half of the first one."""
+    tank = Tank("A", area="200 cm^2", height="60 cm")
+    drain = Pipe("drain", "A", "outside", area="0.6 cm^2", discharge_coefficient=0.6)
+    first = 0.6 * 0.6e-4 * math.sqrt(2.0 * 9.81 * 0.6)
+    plant = Plant([tank], [drain], sensors=[Sensor("h", "A")])
+    assert emptying_time(plant, tank) == pytest.approx(2.0 * 0.02 * 0.6 / first, rel=1e-12)
+    assert emptying_time(Plant([tank], sensors=[Sensor("h", "A")]), tank) == math.inf

@@ -16,6 +16,8 @@ from fdi_torch.estimate.refinement import starting_points
 from fdi_torch.jobs.study import TRIAL, StudyResult, progress, run_study
 from fdi_torch.logbook import read_run
 from fdi_torch.quantities import displayed_in
+from fdi_torch.report.material import gather
+from fdi_torch.report.progress import progress_of
 from fdi_torch.study.mode_isolation import count_modes
 from fdi_torch.study.monte_carlo import Trial, run_block, run_blocks
 from fdi_torch.study.study_plan import Block, Plan, Setting, fault_modes, fixed_faults, mode_faults, uniform_faults
@@ -102,6 +104,18 @@ def test_faults_without_noise_are_found_wherever_they_lie() -> None:
     summary = summarise(study.plan, study.plan.settings[0], trials)
     assert summary.failures == {"boxed": 0} and summary.worst["boxed"] < 1e-5
     assert {s.over_bound for s in summary.scores} == {None}
+
+
+def test_a_running_study_tells_its_share_of_all_trials(tmp_path: Path) -> None:
+    told = []
+
+    def tell(share: float, text: str) -> None:
+        (path,) = tmp_path.glob("*.partial")
+        told.append((progress_of(gather(read_run(path, salvage=True))), share))
+
+    run_study(quick(tmp_path, "study.snr_db=[30, 20]"), tell=tell)
+    assert [progress.share for progress, _ in told] == [share for _, share in told]
+    assert told[0][0].text == "3 of 14 trials" and told[-1][0].text == "14 of 14 trials"
 
 
 def test_an_interrupted_study_goes_on_and_says_the_same(tmp_path: Path) -> None:

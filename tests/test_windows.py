@@ -86,7 +86,7 @@ def leaking(folder: Path, duration: str, step: str) -> Run:
 
 
 def test_the_step_is_the_one_asked_for(tmp_path: Path) -> None:
-    assert fit_windows(leaking(tmp_path, "100 s", "0.7 s")).step == 0.7
+    assert fit_windows(leaking(tmp_path, "300 s", "0.7 s")).step == 0.7
 
 
 def test_a_leak_that_opens_halfway_is_in_the_windows_after_it(tmp_path: Path) -> None:

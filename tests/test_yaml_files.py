@@ -35,6 +35,8 @@ REFUSED = {
     "bytes": ("a: !!binary aGVsbG8=", "line 1: expected plain values, got the tag"),
     "truth that is none": ("a: !!bool x", "line 1: expected plain values, got the tag"),
     "key that is a list": ("a: {[1]: 2}", "line 1: not valid YAML: found unhashable key"),
+    "alias": ("*.area: 3 %", 'line 1: not valid YAML: text that begins with * needs quotes, as in "*.area": 3 %'),
+    "undefined alias": ("a: *b", "line 1: not valid YAML: text that begins with * needs quotes"),
     "tab": ("a:\n\tb: 1", "line 2: not valid YAML: a line is indented by a tab; indent by spaces"),
     "list": ("[1]", "expected keys and values such as plant: three_tank, got list"),
 }

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from scipy import stats
+from scipy import special
 
 
 def clopper_pearson(k: int, n: int) -> tuple[float, float]:
     """Exact 95 % interval for a share of k in n (Clopper and Pearson, 1934); (0, 1) for n = 0."""
     if n == 0:
         return 0.0, 1.0
-    low, high = stats.binomtest(k, n).proportion_ci(0.95, "exact")
-    return float(low), float(high)
+    low = special.betaincinv(k, n - k + 1, 0.025) if k else 0.0
+    return float(low), float(special.betaincinv(k + 1, n - k, 0.975)) if k < n else 1.0
 
 
 def median_interval(values: Sequence[float]) -> tuple[float, float, float]:
@@ -22,7 +22,7 @@ def median_interval(values: Sequence[float]) -> tuple[float, float, float]:
     if not ranked:
         return math.nan, math.nan, math.nan
     median = 0.5 * (ranked[(n - 1) // 2] + ranked[n // 2])
-    outside = [k for k in range(1, n // 2 + 1) if stats.binom.cdf(k - 1, n, 0.5) <= 0.025]
+    outside = [k for k in range(1, n // 2 + 1) if special.bdtr(k - 1, n, 0.5) <= 0.025]
     if not outside:
         return median, math.nan, math.nan
     return median, ranked[outside[-1] - 1], ranked[n - outside[-1]]
@@ -46,5 +46,5 @@ def root_mean_square_interval(values: Sequence[float]) -> tuple[float, float, fl
     if n == 0:
         return math.nan, math.nan, math.nan
     square = math.fsum(v * v for v in values)
-    low, high = (math.sqrt(square / float(stats.chi2.ppf(p, n))) for p in (0.975, 0.025))
+    low, high = (math.sqrt(square / float(special.chdtri(n, p))) for p in (0.025, 0.975))
     return math.sqrt(square / n), low, high

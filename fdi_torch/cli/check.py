@@ -1,29 +1,27 @@
 """`fdi check`: what it does and prints. Its options: `options/check.py`.
 
-Path: cli.check.run → config.plant_file.chosen_plant → config.loaded_recordings.read_recording →
-recordings.check.check_recording → gap.preprocess.acquisition.examined → recordings.plant_units.wrong_units →
-recordings.volume_balance.volumes_along
+Path: cli.check.run → config.plant_file.chosen_plant → jobs.recording_check.checked →
+config.loaded_recordings.read_recording → recordings.check.check_recording → gap.preprocess.acquisition.examined →
+recordings.plant_units.wrong_units → recordings.volume_balance.volumes_along
 """
 
 from __future__ import annotations
 
 import argparse
 import math
-from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.loaded_recordings import known_segments_of, listed_recordings, read_recording
 from fdi_torch.config.plant_file import chosen_plant
-from fdi_torch.config.recording_config import RecordingConfig
-from fdi_torch.config.run_file import load_run
-from fdi_torch.gap.preprocess.acquisition import examined
+from fdi_torch.names import counted
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
 from fdi_torch.plant.scales import emptying_time
 from fdi_torch.quantities import display_unit, significant
-from fdi_torch.recording import Recording
-from fdi_torch.recordings.channel_finding import ChannelFinding
-from fdi_torch.recordings.check import ChannelSummary, RecordingCheck, check_recording
+
+if TYPE_CHECKING:
+    from fdi_torch.config.recording_config import RecordingConfig
+    from fdi_torch.recordings.check import ChannelSummary, RecordingCheck
 
 WRONG = ("range", "slip", "unit")  # findings that no diagnosis accepts or survives
 
@@ -38,12 +36,12 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
         screen.say(f"picture: {save(schematic(plant), Path(arguments.picture))}")
     for config in recordings:
-        recording = read_recording(config, plant, base)
-        checks.append(_checked(recording, plant))
-        _show(checks[-1], screen)
-        stretches = known_segments_of(recording, config, plant)
-        if len(stretches) > 1 or len(stretches[0].recording) < len(recording):
-            spans = ", ".join(f"{p.recording.time[0]:g} to {p.recording.time[-1]:g} s" for p in stretches)
+        from fdi_torch.jobs.recording_check import checked, usable_spans
+
+        recording, check = checked(config, plant, base)
+        checks.append(check)
+        _show(check, screen)
+        if spans := usable_spans(recording, config, plant):
             screen.say(f"usable with all inputs known: {spans}")
     if checks and arguments.config is None:
         named = f"--plant {arguments.plant} --recording {arguments.recording or arguments.file}"
@@ -54,30 +52,10 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     return 0
 
 
-def _checked(whole: Recording, plant: PlantDescription) -> RecordingCheck:
-    """The check of a recording: readings beyond the tanks first, as they make the rest meaningless, then refused or
-    masked channels.
-    """
-    check = check_recording(whole, plant)
-    examinations = [examined(plant, part) for part in whole.known_segments()]
-    problems = [_slip(", ".join(e.fault.channels), e.fault.text) for e in examinations if e.fault]
-    problems += [
-        ChannelFinding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop})
-        for e in examinations
-        for s in e.stuck
-    ]
-    refused = {channel for e in examinations if e.fault for channel in e.fault.channels}
-    doubts = [f for f in check.findings if not (f.kind == "undersampled" and f.channel in refused)]
-    beyond = [f for f in doubts if f.kind == "range"]
-    return replace(check, findings=(*beyond, *problems, *(f for f in doubts if f not in beyond)))
-
-
-def _slip(channels: str, text: str) -> ChannelFinding:
-    return ChannelFinding("slip", channels, text.removeprefix(f"{channels}: "))
-
-
 def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[RecordingConfig], Path]:
     if arguments.config is not None:
+        from fdi_torch.config.run_file import load_run
+
         run_file = load_run(arguments.config, arguments.set)
         if not run_file.config.recordings:
             raise ValueError("expected recordings in the run file, got a simulation; fdi simulate writes its recording")
@@ -91,15 +69,19 @@ def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[Recor
             "fdi new plant --recording FILE writes one from the columns of a recording"
         )
     plant, folder = chosen_plant(arguments.plant), Path.cwd()
-    return plant, *(([], folder) if recording is None else listed_recordings(recording, plant, folder))
+    if recording is None:
+        return plant, [], folder
+    from fdi_torch.config.loaded_recordings import listed_recordings
+
+    return plant, *listed_recordings(recording, plant, folder)
 
 
 def _show_plant(plant: PlantDescription, screen: Screen) -> None:
     flows = [(getattr(plant, kind.part()), kind.__name__.lower()) for kind in FLOW_KINDS]
-    always = (plant.tanks, plant.pipes, plant.pumps, plant.sensors)
+    always = ("tank", "pipe", "pump", "sensor")
     counts = [(plant.tanks, "tank"), *flows, (plant.sensors, "sensor")]
-    parts = ", ".join(_count(len(c), what) for c, what in counts if c or any(c is a for a in always))
-    screen.say(f"plant {plant.name}: {parts}, {_count(len(plant.tolerances), 'constant')} with a tolerance")
+    parts = ", ".join(counted(len(c), what) for c, what in counts if c or what in always)
+    screen.say(f"plant {plant.name}: {parts}, {counted(len(plant.tolerances), 'constant')} with a tolerance")
     (area, per_area), (height, per_height) = display_unit("m^2"), display_unit("m")
     rows = []
     for tank in plant.tanks:
@@ -116,13 +98,11 @@ def _show_plant(plant: PlantDescription, screen: Screen) -> None:
     screen.table("", header, rows)
 
 
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
 def _show(check: RecordingCheck, screen: Screen) -> None:
     screen.say()
-    screen.say(f"{check.source}: {check.samples} samples, {check.duration:g} s, one every {check.interval:.6g} s")
+    screen.say(
+        f"{check.source}: {counted(check.samples, 'sample')}, {check.duration:g} s, one every {check.interval:.6g} s"
+    )
     header = ("channel", "", "unit", "lowest", "highest", "mean", "smallest step", "missing", "masked")
     screen.table("", header, [_row(channel) for channel in check.channels], left=3)
     for finding in check.findings:

@@ -57,6 +57,10 @@ def show(done: TrainResult, screen: Screen) -> None:
     onsets = [name for name in onsets if name in network.constants and name not in space][:1]
     hints = [f"a fault that begins within the recording: also estimate its onset, such as {name}" for name in onsets]
     say_first(diagnosis.misfit, screen, *hints)
+    if final.warning:
+        screen.say(f"{final.warning}.")
+        screen.say("- next: estimate fewer parameters, take a longer recording, or raise estimate.refine.iterations")
+        screen.say()
     rows = []
     for i, p in enumerate(done.fitting.space):
         unit, scale = display_unit(p.unit, p.name)

@@ -9,9 +9,9 @@ from fdi_torch.config.recording_config import ColumnConfig, FileConfig
 from fdi_torch.config.strict import Amount, quantity
 from fdi_torch.names import shortened, unknown
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.quantities import si_unit_of
+from fdi_torch.quantities import quantity_text, si_unit_of
 from fdi_torch.recordings.csv_files import read_header
-from fdi_torch.recordings.header import header_unit
+from fdi_torch.recordings.header import header_unit, names_in
 from fdi_torch.recordings.source import ChannelSource, ClockSource
 
 
@@ -94,10 +94,11 @@ def expect_units(source: str, names: Sequence[str], units: Sequence[str], plant:
     """Raises ValueError if a channel's SI unit differs from the plant's."""
     expected = _units(plant)
     heights = {tank.name: tank.height for tank in plant.tanks}
-    rims = {sensor.column: heights[sensor.tank] for sensor in plant.sensors}
+    gains = {s.column: f"a level in %: gain: {100.0 / heights[s.tank]:.4g} %/m" for s in plant.sensors}
+    gains |= {p.channel: f"a command in %: gain: {quantity_text(p.max_flow, 'm^3/s')}" for p in plant.metered_flows()}
     for name, unit in zip(names, units, strict=True):
         if unit != expected[name]:
-            share = f" (a level in %: gain: {100.0 / rims[name]:.4g} %/m)" if unit == "1" and name in rims else ""
+            share = f" ({gains[name]})" if unit == "1" and name in gains else ""
             raise ValueError(
                 f"{source}: {name}: expected a unit of the kind {expected[name]} (plant {plant.name}), "
                 f"got one of the kind {unit}; correct the header, columns, or the gain in the plant file{share}"
@@ -155,7 +156,7 @@ def _without_column(path: Path, names: Collection[str], config: FileConfig | Non
     if not names or is_log(path):
         return []
     header = read_header(path) if config is None else read_header(path, config.header, config.sheet)
-    present = {*header, *(split[0] for column in header if (split := header_unit(column)))}
+    present = names_in(header)
     return [name for name in names if name not in present]
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Iterator
-from typing import Annotated, Any, Literal
+from typing import Literal
 
-from pydantic import AllowInfNan, BeforeValidator, Field, field_validator
+from pydantic import Field, field_validator
 
 from fdi_torch.config.channels import expect_units
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recording_config import StartLevels
-from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
+from fdi_torch.config.strict import Amount, HeldFor, Seconds, Strict, quantity
 from fdi_torch.live.address import Address, address_of
 from fdi_torch.live.row_buffer import LiveChannel, Row, RowBuffer
 from fdi_torch.live.values import Connection
@@ -25,10 +25,6 @@ POLL = 0.1
 """Longest time between two looks at the row buffer, s."""
 
 
-def _held(value: Any) -> float:
-    return math.inf if value == "always" else quantity(value, "s")
-
-
 class TagConfig(Strict):
     tag: str | None = Field(
         None,
@@ -39,7 +35,7 @@ class TagConfig(Strict):
     factor: float = Field(1.0, description="the number is multiplied by this")
     offset: float = Field(0.0, description="added after that, in `unit`")
     constant: Amount | None = Field(None, description="the value of an input that is not delivered")
-    held: Annotated[float, AllowInfNan(True), BeforeValidator(_held)] | None = Field(
+    held: HeldFor | None = Field(
         None,
         description="time for which a value is kept until the next; by default inputs always, readings never",
     )

@@ -154,8 +154,10 @@ def read_frame(frame: Any, plant: PlantDescription, **keys: Any) -> Recording:
     Columns have headers as in a CSV file (`h1_cm`, `h1 [cm]`), or the names of the plant's channels with their units in
     `frame.attrs["units"]`, as `Recording.to_pandas` returns them. Time is the index if it has a name, else a column.
     keys: further keys of the entry under `recordings:` in a run file, such as columns={"h1": {"column": "LT1", "unit":
-    "mm"}}. Raises ConfigError naming row and column.
+    "mm"}}. An index of time stamps needs no name. Raises ConfigError naming row and column.
     """
+    if frame.index.name is None and frame.index.dtype.kind == "M":
+        frame = frame.rename_axis(index="t")
     units = frame.attrs.get("units", {})
 
     def header(name: Any) -> Any:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import torch
 
+from fdi_torch.plant.components import COMMAND_UNITS
 from fdi_torch.plant.description import OUTSIDE
 from fdi_torch.quantities import significant, unit_factor
 from fdi_torch.recordings.csv_binding import bind_clock
@@ -20,12 +21,15 @@ from fdi_torch.units import spelled
 HEIGHT = 0.6  # m, of a tank that is still to be measured
 AT_RIM = {"1": 1.0, "V": 10.0, "A": 0.02, "Pa": 9810.0 * HEIGHT}
 """What a sensor reads at the rim, by the unit of its reading: 100 %, 10 V, 20 mA, water."""
-READING_LETTERS = "LHPX"  # of tags of levels and pressures (ISA-5.1), and by custom
+READING = re.compile(r"[LHPX]|.*(level|füllstand|niveau|pegel|pressure|druck)", re.IGNORECASE)
+"""Tags of levels and pressures (ISA-5.1), letters of levels by custom, and words."""
+COMMAND = re.compile(r".*(pump|valve|ventil|pwm|duty|cmd|command|speed|drehzahl)", re.IGNORECASE)
 
 
 class _Column(NamedTuple):
-    """A column with a unit in its header: its name, unit, SI unit and highest value (SI)."""
+    """A column with a unit in its header: its header, name, unit, SI unit and highest value (SI)."""
 
+    header: str
     name: str
     unit: str
     kind: str
@@ -37,22 +41,25 @@ class _Column(NamedTuple):
         return re.sub(r"\W+", "_", self.name).strip("_") or "x"
 
     @property
+    def may_be_reading(self) -> bool:
+        return self.kind in ("m", "Pa") or (self.kind in AT_RIM and not COMMAND.match(self.name))
+
+    @property
     def is_reading(self) -> bool:
-        letter = self.name[:1].upper() in READING_LETTERS
-        return self.kind in ("m", "Pa") or (self.kind in AT_RIM and letter)
+        return self.kind in ("m", "Pa") or (self.may_be_reading and bool(READING.match(self.name)))
 
 
 def plant_from_recording(path: Path, name: str) -> str:
     """The text of a plant file: a pump for each flow or command, and a row of tanks, one for each level.
 
-    A column is a reading if its unit is a length or a pressure, or if its name begins with L, H, P or X; otherwise it
-    is a command. Raises ValueError if no column with a unit in its header can be a reading.
+    A column is a reading if its unit is a length or a pressure, or if its name says so; if none is, each that may be.
+    Others are commands. Raises ValueError if no column with a unit in its header can be a reading.
     """
     header = read_header(path)
     clock = bind_clock(path, header, None).header
     named = [column for column in header if column != clock]
     columns = _columns(path, [column for column in named if header_unit(column)])
-    sensors = [column for column in columns if column.is_reading]
+    sensors = [column for column in columns if column.is_reading] or [c for c in columns if c.may_be_reading]
     if not sensors:
         raise ValueError(
             f"{path}: expected a column of a level with its unit in the header, such as LT-101 (cm), got "
@@ -60,11 +67,13 @@ def plant_from_recording(path: Path, name: str) -> str:
         )
     tanks = [f"T{k + 1}" for k in range(len(sensors))] if len(sensors) > 26 else list(ascii_uppercase[: len(sensors)])
     pipes = [(f"{a}_{b}", a, b) for a, b in pairwise(tanks)] + [("outlet", tanks[-1], OUTSIDE)]
-    pumps = [_pump(column, tanks[0]) for column in columns if not column.is_reading]
-    without = [column for column in named if header_unit(column) is None]
+    commands = [column for column in columns if column not in sensors and column.kind in COMMAND_UNITS.values()]
+    pumps = [_pump(column, tanks[0]) for column in commands]
+    used = {column.header for column in (*sensors, *commands)}
+    without = [column for column in named if column not in used]
     lines = [
         f"# From the columns of {path.name}. Correct what follows a !, then check it.",
-        *([f"# Left out, as their header has no unit: {', '.join(without)}"] if without else []),
+        *([f"# Left out, as their header has no unit of a level or command: {', '.join(without)}"] if without else []),
         f"name: {name}",
         "",
         "tanks:    # ! cross-section, and height from the floor to the rim",
@@ -77,7 +86,7 @@ def plant_from_recording(path: Path, name: str) -> str:
         ),
         "",
         *(["pumps:    # ! the tank that each fills, and its greatest flow", *pumps, ""] if pumps else []),
-        "sensors:  # ! the tank of each, and its gain: what it reads at the rim, divided by the height",
+        "sensors:  # ! the tank of each, and its gain: reading at the rim divided by height; commands go to pumps",
         *(_sensor(column, tank) for column, tank in zip(sensors, tanks, strict=True)),
         "",
         "tolerances:    # one standard deviation; constants without one count as exact",
@@ -88,14 +97,15 @@ def plant_from_recording(path: Path, name: str) -> str:
 
 def _columns(path: Path, headers: list[str]) -> list[_Column]:
     """The columns with a unit, in their order."""
-    split = [pair for header in headers if (pair := header_unit(header))]
+    split = [(header, *pair) for header in headers if (pair := header_unit(header))]
     if not split:
         return []
-    recording = read_csv(path, [], [name for name, _ in split])
+    recording = read_csv(path, [], [name for _, name, _ in split])
     highest = torch.nan_to_num(recording.outputs, nan=0.0).amax(dim=0).tolist()
     kinds = recording.output_units
     return [
-        _Column(name, spelled(unit), kind, high) for (name, unit), kind, high in zip(split, kinds, highest, strict=True)
+        _Column(header, name, spelled(unit), kind, high)
+        for (header, name, unit), kind, high in zip(split, kinds, highest, strict=True)
     ]
 
 

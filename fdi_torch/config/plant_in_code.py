@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
@@ -31,6 +31,7 @@ from fdi_torch.tables import Table
 if TYPE_CHECKING:
     from fdi_torch.simulate.ode import Inputs, PlantOde
 
+Component = TypeVar("Component")
 Read = Callable[[Any, str], float]
 """A function from a value as written and its SI unit to its SI value."""
 
@@ -75,7 +76,12 @@ class Plant(PlantDescription):
         name: str = "plant",
         **further: Iterable[FlowComponent],
     ) -> None:
-        parts = (tuple(tanks), tuple(pipes), tuple(pumps), tuple(sensors))
+        parts = (
+            _listed("tanks", tanks, Tank),
+            _listed("pipes", pipes, Pipe),
+            _listed("pumps", pumps, Pump),
+            _listed("sensors", sensors, Sensor),
+        )
         flows = _further_flows(further)
         without_effects = PlantDescription(name, *parts, gravity=si_value("gravity", gravity, "m/s^2"), **flows)
         if not without_effects.sensors:
@@ -141,6 +147,16 @@ class Plant(PlantDescription):
         return notebook_svg(schematic(self), f"plant-{self.name}", f"plant {self.name}") + table.html()
 
 
+def _listed(part: str, components: Iterable[Component], kind: type[Component]) -> tuple[Component, ...]:
+    """The components of a part. Raises ValueError unless they are a list of that kind."""
+    listed = tuple(components) if isinstance(components, Iterable) else None
+    wrong = components if listed is None else next((each for each in listed if not isinstance(each, kind)), None)
+    if listed is None or wrong is not None:
+        example = f"[{kind.__name__}(...), ...]"
+        raise ValueError(f"{part}: expected a list such as {example}, got a {type(wrong).__name__}")
+    return listed
+
+
 def _units_as_written(plant: PlantDescription) -> dict[str, str]:
     """Units for display, from the quantities of the components that were given as text."""
     listed = {"tanks": plant.tanks, "sensors": plant.sensors, "flows": plant.flow_components()}
@@ -204,6 +220,8 @@ def tolerances_in_si(
             tolerances[name] = si_value(place, value, units.get(name, "1"), read)
             if not tolerances[name] > 0:
                 raise ValueError(f"{place}: expected a positive tolerance such as 3 %, got {value}")
+            if name not in units and tolerances[name] > 1.0:
+                raise ValueError(f"{place}: expected a share of {name} up to 100 %, such as 3 %, got {value}")
     return tolerances
 
 

@@ -52,7 +52,7 @@ def _sentence(finding: Any, known: Sequence[str]) -> str:
         return f"{finding['ctx']['error']}{_elsewhere(finding['ctx']['error'], known)}"
     if finding["type"] in ("list_type", "tuple_type"):
         given = finding["input"]
-        values = ", ".join(map(str, given.values())) if isinstance(given, dict) else given
+        values = ", ".join(map(str, given.values())) if isinstance(given, dict) else str(given).partition("\n")[0]
         return f"expected a list, as in [{values}], got {_shown(given)}"
     if finding["type"] in ("dict_type", "model_type"):
         return f"expected keys with values, got {_shown(finding['input'])}"
@@ -65,10 +65,12 @@ def _elsewhere(error: Exception, known: Sequence[str]) -> str:
         return ""
     if ":" in error.key:
         return "; part key and value by a colon and a space"
+    if error.key[:1].isdigit():
+        return "; a comma ends a value: write decimals with a point"
     places = [path for path in known if path.rpartition(".")[2] == error.key and "NAME." not in path]
     return f"; there is {' and '.join(places)}" if places else ""
 
 
 def _shown(value: Any) -> str:
-    text = repr(value)
+    text = repr(value).partition("\n")[0]
     return text if len(text) < 60 else text[:57] + "..."

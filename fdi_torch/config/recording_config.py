@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -10,10 +9,10 @@ from pathlib import PurePath
 from typing import Annotated, Any, Literal
 from zoneinfo import ZoneInfo
 
-from pydantic import AfterValidator, AllowInfNan, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
 
 from fdi_torch.config.problems import explain
-from fdi_torch.config.strict import Amount, Seconds, Strict, quantity
+from fdi_torch.config.strict import Amount, HeldFor, Seconds, Strict, quantity
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.database import expect_no_password, is_query
 from fdi_torch.recordings.time_stamps import expect_zone
@@ -40,10 +39,6 @@ def _start_levels(value: Any) -> Any:
 
 
 StartLevels = Annotated[Any, BeforeValidator(_start_levels)]
-
-
-def _held(value: Any) -> float:
-    return math.inf if value == "always" else quantity(value, "s")
 
 
 def _words(value: Any) -> Any:
@@ -79,7 +74,7 @@ class ColumnConfig(Strict):
     unit: str | None = Field(None, description="unit of its numbers, if the header does not end in it")
     constant: Amount | None = Field(None, description="the value of an input that was not recorded")
     recorded: bool = Field(True, description="false for an output that is missing in the file")
-    held: Annotated[float, AllowInfNan(True), BeforeValidator(_held)] = Field(
+    held: HeldFor = Field(
         0.0, description="time for which an input is held over empty cells: 15 s, or always (until the next value)"
     )
     words: Annotated[dict[str, Amount | None], BeforeValidator(_words)] = Field(

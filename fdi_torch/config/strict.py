@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AllowInfNan, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.fields import FieldInfo
 
 from fdi_torch.config.problems import UnknownKeyError
@@ -48,6 +49,10 @@ def quantity(value: Any, unit: str) -> float:
     return number
 
 
+def _held(value: Any) -> float:
+    return math.inf if value == "always" else quantity(value, "s")
+
+
 def _each_in_seconds(value: Any) -> Any:
     return [quantity(v, "s") for v in value] if isinstance(value, list) else value
 
@@ -61,6 +66,8 @@ Share = Annotated[float, *quantity_of("1")]
 Length = Annotated[float, *quantity_of("m")]
 Area = Annotated[float, *quantity_of("m^2")]
 Seconds = Annotated[float, *quantity_of("s")]
+HeldFor = Annotated[float, AllowInfNan(True), BeforeValidator(_held)]
+"""A time, s, or always."""
 Decibel = Annotated[float, Field(ge=-300, le=300)]
 _SCALED = "the default is for three_tank"
 ScaledSeconds = Annotated[Seconds, _SCALED]

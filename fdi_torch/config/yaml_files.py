@@ -49,6 +49,8 @@ def _values(text: bytes, source: str) -> Any:
         problem = getattr(error, "problem", None) or str(error).partition("\n")[0]
         if "'\\t'" in problem:
             problem = "a line is indented by a tab; indent by spaces"
+        if getattr(error, "context", None) == "while scanning an alias" or "undefined alias" in problem:
+            problem = 'text that begins with * needs quotes, as in "*.area": 3 %'
         sentence = problem if isinstance(error, _RejectedError) else f"not valid YAML: {problem}"
         raise ConfigError([f"{source}: {line}{sentence}"]) from error
 

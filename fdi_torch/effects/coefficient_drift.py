@@ -31,10 +31,10 @@ class CoefficientDrift(Effect):
         )
 
     def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
-        return flow * torch.clamp(1.0 + p["rate"] * _elapsed(local.clock.middle, p["settling"]), min=0.0)
+        return flow * torch.clamp(1.0 + p["rate"] * elapsed(local.clock.middle, p["settling"]), min=0.0)
 
 
-def _elapsed(time: torch.Tensor, settling: torch.Tensor) -> torch.Tensor:
+def elapsed(time: torch.Tensor, settling: torch.Tensor) -> torch.Tensor:
     """(1 - exp(-b t))/b, s; the series t (1 - b t/2 + (b t)^2/6) for small b t, where the difference would cancel."""
     x = settling * time
     small = x.abs() < SMALL

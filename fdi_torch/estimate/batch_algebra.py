@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 
-def row_sum(values: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch"]:
+def row_sum(values: Float[torch.Tensor, "*batch N"]) -> Float[torch.Tensor, "*batch"]:
     """Pairwise sum over the last dimension, in an order that depends only on N."""
     count, sums = values.shape[-1], values.clone()
     if count == 0:
@@ -23,19 +22,21 @@ def row_sum(values: Float[Tensor, "*batch N"]) -> Float[Tensor, "*batch"]:
     return sums[..., 0]
 
 
-def dot(a: Float[Tensor, "*batch P"], b: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch"]:
+def dot(a: Float[torch.Tensor, "*batch P"], b: Float[torch.Tensor, "*batch P"]) -> Float[torch.Tensor, "*batch"]:
     """Inner product of vectors."""
     return row_sum(a * b)
 
 
-def apply(matrix: Float[Tensor, "*#batch M P"], vector: Float[Tensor, "*#batch P"]) -> Float[Tensor, "*#batch M"]:
+def apply(
+    matrix: Float[torch.Tensor, "*#batch M P"], vector: Float[torch.Tensor, "*#batch P"]
+) -> Float[torch.Tensor, "*#batch M"]:
     """Matrix times vector."""
     return row_sum(matrix * vector[..., None, :])
 
 
 def solve_positive(
-    matrix: Float[Tensor, "*batch P P"], right: Float[Tensor, "*batch P"]
-) -> tuple[Float[Tensor, "*batch P"], Bool[Tensor, "*batch"]]:
+    matrix: Float[torch.Tensor, "*batch P P"], right: Float[torch.Tensor, "*batch P"]
+) -> tuple[Float[torch.Tensor, "*batch P"], Bool[torch.Tensor, "*batch"]]:
     """Solve matrix x = right for positive definite matrices, by Gauss-Jordan.
 
     There is no pivoting, which positive definite matrices of unit diagonal do not need. Also returns whether each

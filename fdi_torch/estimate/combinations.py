@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from statistics import NormalDist
 from typing import Any
 
-from torch import Tensor
+import torch
 
 from fdi_torch.amounts import with_error
 from fdi_torch.estimate.information import Certainty, determined_combinations
@@ -95,7 +95,7 @@ class UndeterminedGroup:
         return f"{listed(self.parameters)} {verb} not determined: the readings do not depend on {pronoun}"
 
 
-def undetermined_groups(space: ParameterSpace, theta: Tensor, sure: Certainty) -> tuple[UndeterminedGroup, ...]:
+def undetermined_groups(space: ParameterSpace, theta: torch.Tensor, sure: Certainty) -> tuple[UndeterminedGroup, ...]:
     """All groups of jointly undetermined parameters; `sure` is the certainty at theta (P,).
 
     A combination's variance is c' C c, with C the covariance in the determined subspace.

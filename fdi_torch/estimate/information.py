@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from fdi_torch.estimate.batch_algebra import row_sum
 
@@ -22,10 +21,10 @@ _SHARE = 1e-6
 
 
 def fisher_information(
-    jacobian: Float[Tensor, "*batch S C P"],
-    noise_std: Float[Tensor, "*#batch C"],
-    weight: Float[Tensor, "*#batch S C"] | None = None,
-) -> Float[Tensor, "*batch P P"]:
+    jacobian: Float[torch.Tensor, "*batch S C P"],
+    noise_std: Float[torch.Tensor, "*#batch C"],
+    weight: Float[torch.Tensor, "*#batch S C"] | None = None,
+) -> Float[torch.Tensor, "*batch P P"]:
     """Fisher information (*batch, P, P) for independent Gaussian noise: sum of J J' / sigma^2 over all readings.
 
     jacobian (*batch, S, C, P): derivatives of the readings. noise_std (*batch, C): in each reading's unit.
@@ -50,16 +49,16 @@ class Certainty:
     scale (*batch, P): parameter = scale * scaled parameter.
     """
 
-    std: Tensor
-    covariance: Tensor
-    determined: Tensor
-    null: Tensor
-    scale: Tensor
+    std: torch.Tensor
+    covariance: torch.Tensor
+    determined: torch.Tensor
+    null: torch.Tensor
+    scale: torch.Tensor
 
 
 def certainty(
-    information: Float[Tensor, "*batch P P"],
-    held: Bool[Tensor, "*batch P"] | None = None,
+    information: Float[torch.Tensor, "*batch P P"],
+    held: Bool[torch.Tensor, "*batch P"] | None = None,
 ) -> Certainty:
     """Covariance from the Fisher information (*batch, P, P), priors included: the Cramer-Rao bound at the estimate.
 
@@ -83,7 +82,7 @@ def certainty(
     return _certainty_from(covariance, null, scale, held)
 
 
-def _eigen(matrix: Tensor) -> tuple[Tensor, Tensor]:
+def _eigen(matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Eigenvalues (*batch, P) in ascending order and eigenvectors (*batch, P, P) of symmetric matrices.
 
     Decomposed one by one, each in its own memory, because the rounding of the library depends on memory alignment.
@@ -94,12 +93,14 @@ def _eigen(matrix: Tensor) -> tuple[Tensor, Tensor]:
     return values.reshape(matrix.shape[:-1]), vectors.reshape(matrix.shape)
 
 
-def _recompose(vectors: Tensor, values: Tensor) -> Tensor:
+def _recompose(vectors: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     """V diag(values) V', (*batch, P, P), summed in an order that does not depend on the batch."""
     return row_sum(vectors[..., :, None, :] * vectors[..., None, :, :] * values[..., None, None, :])
 
 
-def _certainty_from(covariance: Tensor, null: Tensor, scale: Tensor, held: Tensor | None) -> Certainty:
+def _certainty_from(
+    covariance: torch.Tensor, null: torch.Tensor, scale: torch.Tensor, held: torch.Tensor | None
+) -> Certainty:
     """Set the covariance of undetermined parameters to infinity or NaN, and that of held ones to zero."""
     undetermined = null.diagonal(dim1=-2, dim2=-1) > _SHARE
     involved = undetermined[..., :, None] | undetermined[..., None, :]
@@ -112,7 +113,9 @@ def _certainty_from(covariance: Tensor, null: Tensor, scale: Tensor, held: Tenso
     return Certainty(covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt(), covariance, determined, null, scale)
 
 
-def determined_combinations(null: Float[Tensor, "P P"], scale: Float[Tensor, " P"]) -> list[tuple[list[int], Tensor]]:
+def determined_combinations(
+    null: Float[torch.Tensor, "P P"], scale: Float[torch.Tensor, " P"]
+) -> list[tuple[list[int], torch.Tensor]]:
     """Groups of parameters that are jointly undetermined, with the linear combinations of them that are determined.
 
     null (P, P), scale (P,): from one `Certainty`. Returns for each group the indices of its m parameters and the
@@ -128,7 +131,7 @@ def determined_combinations(null: Float[Tensor, "P P"], scale: Float[Tensor, " P
     return groups
 
 
-def _groups(null: Tensor) -> list[list[int]]:
+def _groups(null: torch.Tensor) -> list[list[int]]:
     """Groups of parameters that share an undetermined direction: connected components of the projector `null`."""
     remaining = [i for i in range(len(null)) if null[i, i] > _SHARE]
     groups = []
@@ -142,7 +145,7 @@ def _groups(null: Tensor) -> list[list[int]]:
     return groups
 
 
-def _reduced(rows: Tensor) -> Tensor:
+def _reduced(rows: torch.Tensor) -> torch.Tensor:
     """Reduced row echelon form of independent rows (r, m)."""
     rows = rows.clone()
     for i in range(len(rows)):

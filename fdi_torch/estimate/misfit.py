@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -62,7 +61,7 @@ def misfit_of(rms: Mapping[str, float], recordings: Sequence[Recording], plant: 
     return Misfit(unexplained_ratio(values.new_tensor([rms[sensor.name] for sensor in plant.sensors]), values, weight))
 
 
-def unexplained_ratio(rms: Tensor, values: Tensor, weight: Tensor) -> float:
+def unexplained_ratio(rms: torch.Tensor, values: torch.Tensor, weight: torch.Tensor) -> float:
     """The ratio for residuals of root mean square rms (C,) of readings (S, C) of this weight; 0 masks a reading."""
     noise = torch.maximum(sample_noise(values, weight), least_noise(values, weight))
     ratio = torch.where((weight > 0).any(dim=0), rms / noise, 0.0)
@@ -82,7 +81,7 @@ def least_noise(values: Float[Tensor, "S C"], weight: Float[Tensor, "S C"]) -> F
     return values.new_tensor(least)
 
 
-def sample_noise(values: Float[Tensor, "S C"], weight: Float[Tensor, "S C"]) -> Float[Tensor, " C"]:
+def sample_noise(values: Float[torch.Tensor, "S C"], weight: Float[torch.Tensor, "S C"]) -> Float[torch.Tensor, " C"]:
     """Model-free estimate of the readings' noise (C,) from second differences of neighbouring samples (S, C).
 
     sigma = median |y_{s+1} - 2 y_s + y_{s-1}| / (0.6745 sqrt 6). Second differences remove a smooth signal, and the

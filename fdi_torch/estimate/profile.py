@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import Any
 
 import torch
@@ -23,7 +22,7 @@ from torch import Tensor
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.linearisation import Linearise
 from fdi_torch.estimate.refinement import CONVERGED_WITHIN, TIGHT_DECREASE
-from fdi_torch.estimate.uncertainty import Estimate, plain_value
+from fdi_torch.estimate.uncertainty import Estimate, chi_square_quantile, plain_value
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
 
@@ -106,11 +105,6 @@ class Profile(Shown):
         """Plain values for JSON; an infinite limit becomes None."""
         plain = {name: plain_value(v, name) for name, v in vars(self).items() if name not in SEPARATE}
         return plain | {"warnings": list(self.warnings)}
-
-
-def chi_square_quantile(confidence: float) -> float:
-    """Quantile of chi-square with one degree of freedom."""
-    return NormalDist().inv_cdf(0.5 + 0.5 * confidence) ** 2
 
 
 def profile_likelihood(

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
+import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from fdi_torch.estimate.combinations import Combination, undetermined_groups
 from fdi_torch.estimate.information import certainty
@@ -38,23 +38,28 @@ class Estimate:
 
     names: tuple[str, ...]
     units: tuple[str, ...]
-    value: Tensor
-    std: Tensor
-    covariance: Tensor
+    value: torch.Tensor
+    std: torch.Tensor
+    covariance: torch.Tensor
     status: str = ""
     at_bounds: Mapping[str, str] = field(default_factory=dict)
     undetermined: tuple[str, ...] = ()
     combinations: tuple[Combination, ...] = ()
-    noise_std: Tensor | None = None
+    noise_std: torch.Tensor | None = None
     reached: Mapping[str, Any] = field(default_factory=dict)
     draws: Draws | None = field(default=None, repr=False)
 
     @property
-    def correlation(self) -> Tensor:
+    def warning(self) -> str:
+        """The warning of an estimate that has not converged; empty for one that has."""
+        return convergence_warning(self.status)
+
+    @property
+    def correlation(self) -> torch.Tensor:
         """Correlation matrix (P, P); NaN in rows and columns of undetermined parameters."""
         return self.covariance / (self.std[:, None] * self.std[None, :])
 
-    def interval(self, confidence: float = 0.95) -> tuple[Tensor, Tensor]:
+    def interval(self, confidence: float = 0.95) -> tuple[torch.Tensor, torch.Tensor]:
         """Lower and upper limits (P,) of each parameter's confidence interval, from the normal distribution."""
         half_width = NormalDist().inv_cdf(0.5 + 0.5 * confidence) * self.std
         return self.value - half_width, self.value + half_width
@@ -86,11 +91,11 @@ class Estimate:
 
 def make_estimate(
     space: ParameterSpace,
-    theta: Float[Tensor, " P"],
-    information: Float[Tensor, "P P"],
+    theta: Float[torch.Tensor, " P"],
+    information: Float[torch.Tensor, "P P"],
     *,
     status: str = "",
-    noise_std: Tensor | None = None,
+    noise_std: torch.Tensor | None = None,
     reached: Mapping[str, Any] | None = None,
 ) -> Estimate:
     """Make the estimate theta (P,) with uncertainties from the Fisher information (P, P) there, priors included.
@@ -120,7 +125,7 @@ def make_estimate(
     )
 
 
-def parameters_at_bounds(space: ParameterSpace, theta: Tensor) -> dict[str, str]:
+def parameters_at_bounds(space: ParameterSpace, theta: torch.Tensor) -> dict[str, str]:
     """'low' or 'high' by name, for each parameter whose value in theta (P,) is at a bound."""
     pairs = zip(space, theta.tolist(), strict=True)
     return {
@@ -149,7 +154,7 @@ def _end(p: Parameter, value: float, share: float) -> float | None:
     return None
 
 
-def wider_than_range(space: ParameterSpace, std: Float[Tensor, " P"]) -> tuple[str, ...]:
+def wider_than_range(space: ParameterSpace, std: Float[torch.Tensor, " P"]) -> tuple[str, ...]:
     """One sentence for each parameter whose standard error (P,) is finite but larger than its range."""
     return tuple(
         f"{p.name} is hardly determined: standard error {quantity_text(error, p.unit, 3)}, more than its range from "
@@ -159,12 +164,24 @@ def wider_than_range(space: ParameterSpace, std: Float[Tensor, " P"]) -> tuple[s
     )
 
 
+def chi_square_quantile(confidence: float) -> float:
+    """Quantile of chi-square with one degree of freedom."""
+    return NormalDist().inv_cdf(0.5 + 0.5 * confidence) ** 2
+
+
+def convergence_warning(status: str) -> str:
+    """The warning of a refinement that ended with a status other than 'converged'; empty for that."""
+    if status in ("converged", ""):
+        return ""
+    return f"Not converged ({status.replace('_', ' ')}): sizes may be off by more than their standard errors"
+
+
 def plain_value(value: Any, name: str) -> Any:
     """Convert to numbers, text, lists and dicts; a number that is not finite becomes None.
 
     Raises ValueError for any other type; `name` is the path of the value for the message.
     """
-    if isinstance(value, Tensor):
+    if isinstance(value, torch.Tensor):
         value = value.tolist()
     if value is None or isinstance(value, bool | int | str):
         return value

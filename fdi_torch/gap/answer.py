@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from torch import Tensor
+import torch
 
 from fdi_torch.effects import effect
 from fdi_torch.parameters import ParameterName, by_prefix
@@ -84,7 +84,7 @@ class Answer:
     constants: Mapping[str, Any] = field(default_factory=dict)
     curves: Sequence[Mapping[str, Any]] = ()
     remarks: Sequence[str] = ()
-    arrays: Mapping[str, Tensor] = field(default_factory=dict)
+    arrays: Mapping[str, torch.Tensor] = field(default_factory=dict)
 
     @property
     def certain(self) -> list[CauseName]:

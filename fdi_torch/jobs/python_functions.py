@@ -117,7 +117,7 @@ def gap(
     valid_settings = [field.name for field in fields(Settings)]
     for name in settings:
         if name not in valid_settings:
-            raise ValueError(f"gap: {unknown('a setting', name, valid_settings)}")
+            raise ValueError(f"gap: {unknown('a setting', name, [*valid_settings, 'holdouts', 'out'])}")
     log = free_path(Path(out), "gap")
     answer = run_gap(
         log, plant, recordings_of(recordings, plant), recordings_of(holdouts, plant), Settings(**settings), tell

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from fdi_torch.estimate.fitting import Fitting, set_up, start_levels
 from fdi_torch.estimate.hybrid_settings import HybridSettings
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings
 from fdi_torch.gap.preprocess.acquisition import usable
-from fdi_torch.parameters import ParameterSpace
+from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.operating_range import bounded_by_recording
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.simulated_recording import clean_readings, with_noise
@@ -69,10 +69,19 @@ def simulate_recording(run: Run) -> Recording:
     network = build_network(replace(run.plant, tanks=tanks), placements)
     with naming_source(run.source):
         values = parameter_values(config.faults, network.constants, run.plant)
+        _expect_onsets_within(config.duration, values)
     clean = clean_readings(network, planned, values)
     seed = run.config.seed if config.seed is None else config.seed
     generator = torch.Generator().manual_seed(seed)
     return with_noise(planned, clean, noise_std(config.noise, run.plant, clean), generator, network)
+
+
+def _expect_onsets_within(duration: float, values: Mapping[str, float]) -> None:
+    """Raises ConfigError for a fault that would begin after the end, s, and thus never show."""
+    for name, onset in values.items():
+        if ParameterName.parse(name).field == "onset" and onset >= duration:
+            expected = f"less than the duration of {duration:g} s"
+            raise ConfigError([f"simulate.faults.{name}: expected {expected}, got {onset:g} s"])
 
 
 def simulated_truth(run: Run) -> dict[str, float]:

@@ -12,6 +12,7 @@ from fdi_torch.config.study_file import Study
 from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.logbook.reader import Run as LoggedRun
+from fdi_torch.names import counted
 from fdi_torch.study.cluster import run_on_cluster
 from fdi_torch.study.mode_isolation import Isolation, count_modes
 from fdi_torch.study.monte_carlo import Trial, run_blocks
@@ -40,8 +41,7 @@ class StudyResult(Shown):
 
     @property
     def headline(self) -> str:
-        settings = f"{len(self.summaries)} setting{'s' if len(self.summaries) != 1 else ''}"
-        return f"{len(self.trials)} trials in {settings}"
+        return f"{counted(len(self.trials), 'trial')} in {counted(len(self.summaries), 'setting')}"
 
     @in_its_units
     def table(self) -> Table:
@@ -88,7 +88,8 @@ def run_study(
 
 def origin_of(study: Study) -> dict[str, Any]:
     """Configuration and seed of a study, as its log records them."""
-    resolved = study.run.resolved | {"study": study.config.model_dump(mode="json")}
+    keys = study.config.model_dump(mode="json") | {"all_trials": study.plan.trials}
+    resolved = study.run.resolved | {"study": keys}
     return {"config_text": study.text, "config": resolved, "seeds": {"seed": study.plan.seed}}
 
 

@@ -57,7 +57,8 @@ class TrainResult(Shown):
     @in_its_units
     def headline(self) -> str:
         """The diagnosis in one sentence; it begins with a warning if the model does not explain the recording."""
-        return self.result.diagnosis.headline
+        warning = self.result.estimate.warning
+        return f"{warning}. {self.result.diagnosis.headline}" if warning else self.result.diagnosis.headline
 
     @in_its_units
     def table(self) -> Table:

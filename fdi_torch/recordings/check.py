@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from fdi_torch.names import counted
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.channel_finding import ChannelFinding
@@ -115,8 +116,8 @@ def _clock_findings(time: Tensor, steps: Tensor, interval: float) -> Iterator[Ch
     if len(gaps):
         longest = int(gaps[steps[gaps].argmax()])
         text = (
-            f"{len(gaps)} gaps longer than {GAP_STEPS:g} sampling intervals ({interval:g} s), the longest of "
-            f"{float(steps[longest]):g} s after {float(time[longest]):g} s"
+            f"{counted(len(gaps), 'gap')} longer than {GAP_STEPS:g} sampling intervals ({interval:g} s), the longest "
+            f"of {float(steps[longest]):g} s after {float(time[longest]):g} s"
         )
         yield ChannelFinding("gap", "t", text, {"count": len(gaps), "longest": float(steps[longest])})
     usual = steps[steps <= GAP_STEPS * interval]
@@ -149,7 +150,8 @@ def _missing_inputs(recording: Recording) -> Iterator[ChannelFinding]:
             continue
         for first, last in runs:
             start, stop = float(recording.time[first]), float(recording.time[last])
-            text = f"unknown from {start:g} s to {stop:g} s ({last - first + 1} samples): the recording is cut there"
+            samples = counted(last - first + 1, "sample")
+            text = f"unknown from {start:g} s to {stop:g} s ({samples}): the recording is cut there"
             yield ChannelFinding("unknown", name, text, {"start": start, "stop": stop})
 
 

@@ -5,6 +5,7 @@ configuration.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isnan
@@ -19,10 +20,11 @@ from fdi_torch.recordings.source import ChannelSource, ClockSource
 from fdi_torch.recordings.time_stamps import StampReader
 from fdi_torch.units import spelled
 
-TIME_NAMES = (
-    *("t", "time", "timestamp", "datetime", "date time", "date_time", "date/time", "time stamp", "utc"),
-    *("epoch", "unixtime", "zeit", "zeitstempel", "datum", "date"),
+TIME_WORDS = (
+    *("t", "time", "timestamp", "datetime", "stamp", "utc", "epoch", "unixtime"),
+    *("zeit", "zeitstempel", "uhrzeit", "local", "datum", "date"),
 )
+"""A column whose name consists of these words is one of time; the first of these words decides between several."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Bound:
 
 
 def bind_clock(path: Path, header: Sequence[str], source: ChannelSource | None) -> Bound:
-    """The column of time: the mapped one, or one of `TIME_NAMES` with a unit, or one of them that holds time stamps.
+    """The column of time: the mapped one, or else one with such a name, if possible with a unit, or of time stamps.
 
     Without a column, time is the number of rows above times the period, which is the factor.
     """
@@ -54,13 +56,21 @@ def bind_clock(path: Path, header: Sequence[str], source: ChannelSource | None) 
         return Bound("t", "t", None, source.period, "s")
     if source.column is None:
         units = {h: header_unit(h) for h in header}
-        timed = [h for h, unit in units.items() if unit and unit[0].lower() in TIME_NAMES]
-        stamped = sorted((h for h in header if h.lower() in TIME_NAMES), key=lambda h: TIME_NAMES.index(h.lower()))
+        timed = [h for h, unit in units.items() if unit and _means_time(unit[0])]
+        stamped = sorted((h for h in header if _means_time(h)), key=lambda h: min(map(TIME_WORDS.index, _words(h))))
         source = replace(source, column=(timed or stamped or ["t"])[0])
     column = _find_column(path, header, "t", source.column)
     if source.unit is None and header_unit(column) is None:
         return Bound("t", column, header.index(column), 1.0, "s", stamps=True)
     return bind(path, header, "t", source, "s")
+
+
+def _means_time(name: str) -> bool:
+    return bool(_words(name)) and set(TIME_WORDS).issuperset(_words(name))
+
+
+def _words(name: str) -> list[str]:
+    return re.findall(r"[^\W_]+", name.lower())
 
 
 def bind(path: Path, header: Sequence[str], name: str, source: ChannelSource | None, want: str | None = None) -> Bound:

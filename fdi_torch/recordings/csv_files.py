@@ -24,7 +24,7 @@ from fdi_torch.recordings.csv_binding import Bound, bind, bind_clock, columns_of
 from fdi_torch.recordings.csv_cells import Columns, parse_carefully, parse_fast
 from fdi_torch.recordings.csv_tags import read_tags
 from fdi_torch.recordings.csv_text import heading_of, open_csv
-from fdi_torch.recordings.header import header_unit
+from fdi_torch.recordings.header import names_in
 from fdi_torch.recordings.sheets import Sheet, in_order, informative_rows, merge_sheets
 from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource, file_sha256
 from fdi_torch.recordings.time_stamps import StampReader, from_zone, offset_of_zone
@@ -70,7 +70,11 @@ def read_csv_files(
     A channel is taken from the first file whose `columns` name it, or else from the first with it in its header.
     """
     names_by_file = _assign_to_files(files, (*inputs, *outputs))
-    parts = [_read(file, names) for file, names in zip(files, names_by_file, strict=True) if names]
+    parts = [
+        _read_tagged(file, names) if file.tags else _read_rows(file, names)
+        for file, names in zip(files, names_by_file, strict=True)
+        if names
+    ]
     sources = {
         name: f.columns[name]
         for f, names in zip(files, names_by_file, strict=True)
@@ -108,22 +112,12 @@ def _assign_to_files(files: Sequence[FileSource], names: Sequence[str]) -> list[
     them.
     """
     names_by_file: list[list[str]] = [[] for _ in files]
-    headers = [
-        _named_in(read_header(file.path, file.header, file.sheet)) if len(files) > 1 else set() for file in files
-    ]
+    headers = [names_in(read_header(file.path, file.header, file.sheet)) if len(files) > 1 else set() for file in files]
     for name in names:
         mapped = [k for k, file in enumerate(files) if name in file.columns]
         present = [k for k, header in enumerate(headers) if name in header]
         names_by_file[(mapped or present or [0])[0]].append(name)
     return names_by_file
-
-
-def _named_in(header: Sequence[str]) -> set[str]:
-    return {*header, *(split[0] for column in header if (split := header_unit(column)))}
-
-
-def _read(file: FileSource, names: Sequence[str]) -> Read:
-    return _read_tagged(file, names) if file.tags else _read_rows(file, names)
 
 
 def _read_rows(file: FileSource, names: Sequence[str]) -> Read:

@@ -10,7 +10,7 @@ import re
 import zlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -28,11 +28,15 @@ _FOREIGN = {
 
 @dataclass(frozen=True)
 class Heading:
-    """Column names, the delimiter, and the number of lines up to and including the header."""
+    """Column names, the delimiter, and the number of lines up to and including the header.
+
+    date: position of a column of dates that the file has beside one of times of day; here both are one column.
+    """
 
     names: tuple[str, ...]
     delimiter: str
     lines: int
+    date: int | None = None
 
 
 def open_csv(path: Path, sheet: str | None = None) -> TextIO | TableText:
@@ -173,17 +177,47 @@ def _with_units(
     path: Path, names: list[str], delimiter: str, number: int, remaining: Iterator[str]
 ) -> tuple[Heading, Iterator[str]]:
     """The heading, with the units of a second row if it is one; and the remaining lines."""
-    next_line = next(remaining, None)
-    if next_line is None:
-        return Heading(tuple(names), delimiter, number), remaining
-    units = _cells(path, next_line, delimiter, number)
-    bare = len(units) == len(names) and all(
-        not unit or not header_unit(n) for n, unit in zip(names, units, strict=True)
+    first = next(remaining, None)
+    cells = [] if first is None else _cells(path, first, delimiter, number)
+    bare = len(cells) == len(names) and all(
+        not unit or not header_unit(n) for n, unit in zip(names, cells, strict=True)
     )
-    if bare and any(units) and all(not unit or _is_unit(unit) for unit in units):
-        named = tuple(f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True))
-        return Heading(named, delimiter, number + 1), remaining
-    return Heading(tuple(names), delimiter, number), chain([next_line], remaining)
+    if bare and any(cells) and all(not unit or _is_unit(unit) for unit in cells):
+        names = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, cells, strict=True)]
+        number, first = number + 1, next(remaining, None)
+        cells = [] if first is None else _cells(path, first, delimiter, number)
+    date = next((k for k, pair in enumerate(pairwise(cells)) if _is_date_and_time(*pair)), None)
+    if date is not None and date + 1 < len(names):
+        names[date : date + 2] = [f"{names[date]} {names[date + 1]}"]
+    heading = Heading(tuple(names), delimiter, number, date)
+    return heading, joined(remaining if first is None else chain([first], remaining), heading)
+
+
+# A cell with a date in a workbook has a time, too.
+_DATE = re.compile(r"(\d{1,4}[./-]\d{1,2}[./-]\d{1,4})(?:[T ]00:00:00)?", re.ASCII)
+_TIME_OF_DAY = re.compile(r"\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d+)?)?(?: ?[AaPp][Mm])?", re.ASCII)
+
+
+def _is_date_and_time(date: str, time: str) -> bool:
+    return bool(_DATE.fullmatch(date) and _TIME_OF_DAY.fullmatch(time))
+
+
+def joined(lines: Iterable[str], heading: Heading) -> Iterator[str]:
+    """The lines of a file with its dates and times of day, if they are two columns, as one column of time stamps."""
+    if heading.date is None:
+        yield from lines
+        return
+    for line in lines:
+        cells = line.split(heading.delimiter)
+        if len(cells) < heading.date + 2:
+            yield line
+            continue
+        before, (date, time, *after) = cells[: heading.date], cells[heading.date :]
+        ending = time[len(time.rstrip("\r\n")) :]
+        bare = [cell.strip().strip('"') for cell in (date, time)]
+        match = _DATE.fullmatch(bare[0])
+        stamp = f"{match[1] if match else bare[0]} {bare[1]}".strip() + ending
+        yield heading.delimiter.join([*before, stamp, *after])
 
 
 def _cells(path: Path, line: str, delimiter: str, above: int) -> list[str]:

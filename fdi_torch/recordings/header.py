@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 from fdi_torch.quantities import si_unit_of
@@ -25,6 +26,11 @@ def header_unit(header: str) -> tuple[str, str] | None:
             continue
         return name, unit
     return None
+
+
+def names_in(header: Sequence[str]) -> set[str]:
+    """What a channel may be called: whole headers, and names of headers with a unit."""
+    return {*header, *(split[0] for column in header if (split := header_unit(column)))}
 
 
 def _bracketed(header: str) -> tuple[str, str] | None:

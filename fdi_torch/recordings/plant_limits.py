@@ -53,7 +53,7 @@ def _level_findings(
     elif bool(near.any()):
         start, stop, count = float(time[near][0]), float(time[near][-1]), int(near.sum())
         text = (
-            f"within {RIM_MARGIN:.0%} of the rim of {sensor.tank} ({_level(rim)}) in {count} samples between "
+            f"within {100 * RIM_MARGIN:.0f} % of the rim of {sensor.tank} ({_level(rim)}) in {count} samples between "
             f"{start:g} s and {stop:g} s: water may overflow there"
         )
         yield ChannelFinding("rim", sensor.column, text, {"rim": rim, "start": start, "stop": stop, "count": count})

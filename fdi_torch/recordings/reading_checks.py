@@ -83,10 +83,8 @@ def _quantised(name: str, values: Tensor, unit: str) -> Iterator[ChannelFinding]
     same = float((torch.diff(values) == 0).double().mean())
     step = resolution(values)
     if same > COARSE_SHARE:
-        text = (
-            f"moves in steps of {_shown(step, unit)} and stays on one for {same:.0%} of the samples: rounded coarsely"
-        )
-        yield ChannelFinding("quantised", name, text, {"step": step, "share": same})
+        moves = f"moves in steps of {_shown(step, unit)} and stays on one for {100 * same:.0f} % of the samples"
+        yield ChannelFinding("quantised", name, f"{moves}: rounded coarsely", {"step": step, "share": same})
 
 
 def _shown(value: Tensor | float, unit: str) -> str:

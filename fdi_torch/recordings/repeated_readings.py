@@ -17,7 +17,6 @@ import math
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 BY_CHANCE = 1e-3
 """Probability of a false detection in a recording of a sound sensor."""
@@ -38,15 +37,14 @@ class Scatter:
         return math.erf(self.step / (2.0 * math.sqrt(2.0) * self.noise)) if self.noise > 0.0 else 1.0
 
 
-def resolution(values: Tensor) -> float:
+def resolution(values: torch.Tensor) -> float:
     """The smallest difference of two distinct values (n,), apart from rounding in the file; 0 for fewer than two."""
-    distinct = values.unique()
-    steps = torch.diff(distinct)
-    steps = steps[steps > 1e-9 * distinct[1:].abs()]
+    steps = torch.diff(values.unique())
+    steps = steps[steps > 1e-9 * float(values.abs().max())] if len(steps) else steps
     return float(steps.min()) if len(steps) else 0.0
 
 
-def scatter(values: Tensor) -> Scatter:
+def scatter(values: torch.Tensor) -> Scatter:
     """Noise and quantization step of changing readings (n,).
 
     Second differences of white noise quantized in steps q have the variance 6 (s^2 + q^2 / 12); those of the level are
@@ -59,7 +57,7 @@ def scatter(values: Tensor) -> Scatter:
     return Scatter(math.sqrt(total**2 - step**2 / 12.0) if total > step else 0.0, step)
 
 
-def stuck_runs(values: Tensor, usual: Scatter | None = None) -> list[tuple[int, int]]:
+def stuck_runs(values: torch.Tensor, usual: Scatter | None = None) -> list[tuple[int, int]]:
     """Runs of equal readings among values (n,) that are too long for the sensor's noise: the first sample of each run,
     and the first sample after it.
 
@@ -84,7 +82,7 @@ def stuck_runs(values: Tensor, usual: Scatter | None = None) -> list[tuple[int, 
     return list(zip(starts[is_stuck].tolist(), ends[is_stuck].tolist(), strict=True))
 
 
-def _longest(values: Tensor, sound: Tensor, usual: Scatter | None) -> float:
+def _longest(values: torch.Tensor, sound: torch.Tensor, usual: Scatter | None) -> float:
     """The longest run that chance explains, from the sound readings or the usual scatter."""
     if usual is not None:
         repeat_probability = usual.repeat_probability

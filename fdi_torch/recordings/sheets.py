@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fdi_torch.names import counted
 from fdi_torch.recording import Hold
 
 LONG_AGO = 1e8  # s; larger times are seconds since 1970
@@ -56,7 +57,7 @@ def in_order(
     notes = []
     repeated = (np.diff(seconds) == 0.0) & _equal(values[1:], values[:-1]).all(axis=1)
     if repeated.any():
-        notes.append(f"{_rows(repeated.sum())} repeating the one before left out")
+        notes.append(f"{counted(int(repeated.sum()), 'row')} repeating the one before left out")
     numbers = (first + np.arange(len(seconds)) if rows is None else rows)[np.append(True, ~repeated)]
     seconds, values = seconds[np.append(True, ~repeated)], values[np.append(True, ~repeated)]
     decreasing = np.flatnonzero(np.diff(seconds) <= 0)
@@ -66,19 +67,17 @@ def in_order(
         drop = int(decreasing[0])
         before, after = seconds[drop : drop + 2] - (seconds[0] if seconds[0] > LONG_AGO else 0.0)
         fix = "correct the clock, or let rows be sorted: columns: {t: {sort: true}}"
+        if (np.diff(seconds) >= 0).all():
+            fix = "keep the last row of each time by columns: {t: {sort: true}}, or count rows: {t: {period: 50 ms}}"
         fix = summer if summer and abs(before - after - HOUR) < NEARLY else fix
         raise ValueError(
             f"{place.format(numbers[drop + 1])}: expected time that increases, got {after:g} s after {before:g} s "
-            f"({_rows(len(decreasing), 'such ')}); {fix}"
+            f"({counted(len(decreasing), 'such row')}); {fix}"
         )
     out_of_order = int((np.diff(seconds) < 0).sum())
     times, merged = _merged(seconds, values)
     notes.append(f"rows sorted by time: {out_of_order} came late, {len(seconds) - len(times)} had the time of another")
     return Ordered(times, merged, notes)
-
-
-def _rows(count: int, such: str = "") -> str:
-    return f"one {such}row" if count == 1 else f"{count} {such}rows"
 
 
 def _equal(a: np.ndarray, b: np.ndarray) -> np.ndarray:

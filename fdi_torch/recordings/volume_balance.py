@@ -50,7 +50,8 @@ class Volumes:
         NaN for a tank of whose balance the recording determines nothing.
         """
         terms = torch.stack([self.stored, self.metered, self.by_laws], dim=-1)
-        return torch.tensor([_log_evidence(tank) for tank in terms.unbind(1)])
+        rounding = math.sqrt(torch.finfo(terms.dtype).eps) * float(terms.nan_to_num().abs().max())
+        return torch.tensor([_log_evidence(tank, rounding) for tank in terms.unbind(1)])
 
 
 def volumes_along(plant: PlantDescription, recording: Recording) -> Volumes:
@@ -99,8 +100,10 @@ def _levels(network: TankNetwork, recording: Recording, values: PlaceValues) -> 
     return list(levels.values())
 
 
-def _log_evidence(terms: Tensor) -> float:
+def _log_evidence(terms: Tensor, rounding: float) -> float:
     """Log likelihood of the stored volumes of a tank, given its `terms` (intervals, 3): stored, metered, by laws.
+
+    rounding: half of the digits of the largest volume of all tanks, m^3.
 
     The prior of b is the multivariate Cauchy distribution of centre 1 and scale DEVIATION, a mixture of normal ones of
     variance v; the tank is UNRELATED if b = 0. With b in the directions of the eigenvectors of its information, whose
@@ -115,7 +118,7 @@ def _log_evidence(terms: Tensor) -> float:
     if not length:
         return math.nan
     sums = terms[: GROUPS * SUMS * length].reshape(GROUPS, SUMS, length, 3).sum(dim=2)
-    information, directions, off = _regression(sums)
+    information, directions, off = _regression(sums, rounding)
     if not bool((information > 0.0).any()):
         return math.nan
     variance = DEVIATION**2 * torch.logspace(-2, 16, 73).to(off)
@@ -127,8 +130,12 @@ def _log_evidence(terms: Tensor) -> float:
     return float(torch.logaddexp(related + math.log1p(-UNRELATED), unrelated + math.log(UNRELATED)))
 
 
-def _regression(sums: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Eigenvalues (2) and eigenvectors (2, 2) of the information of b, and b - 1 (2), by sums (GROUPS, SUMS, 3)."""
+def _regression(sums: Tensor, rounding: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Eigenvalues (2) and eigenvectors (2, 2) of the information of b, and b - 1 (2), by sums (GROUPS, SUMS, 3).
+
+    In steady state without noise, the sums differ by rounding only, and their scatter is no measure of their errors;
+    each counts as uncertain by `rounding`, m^3, at least.
+    """
     flows, excess = sums[..., 1:], sums[..., 0] - sums[..., 1] - sums[..., 2]
     rms = flows.square().mean(dim=(0, 1)).sqrt()
     size = torch.where(rms > 0.0, rms, 1.0)
@@ -136,9 +143,10 @@ def _regression(sums: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     product = torch.einsum("gni,gnj->ij", scaled, scaled)
     off = _inverse(product) @ torch.einsum("gni,gn->i", scaled, excess)
     scores = torch.einsum("gni,gn->gi", scaled, excess - scaled @ off)
-    information = product @ _inverse(scores.T @ scores * GROUPS / (GROUPS - 2)) @ product
-    eigenvalues, eigenvectors = torch.linalg.eigh(size[:, None] * information * size)
-    return eigenvalues.clamp(min=0.0), eigenvectors, off / size
+    variance = scores.T @ scores * GROUPS / (GROUPS - 2) + rounding**2 * product
+    eigenvalues, eigenvectors = torch.linalg.eigh(size[:, None] * (product @ _inverse(variance) @ product) * size)
+    exact = eigenvalues > 2.0 * torch.finfo(sums.dtype).eps * eigenvalues[-1]
+    return torch.where(exact, eigenvalues, 0.0), eigenvectors, off / size
 
 
 def _inverse(matrix: Tensor) -> Tensor:

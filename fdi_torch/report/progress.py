@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from fdi_torch.names import counted
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
 from fdi_torch.report.predictions import predicted
@@ -30,16 +32,23 @@ def progress_of(material: Material) -> Progress:
         last = generations[-1]
         evaluations, limit = last.get("evaluations"), material.about("config").get("estimate.search.evaluations", "")
         text = f"search: generation {last.get('generation')}, cost {_number(last.get('best_cost'))}"
-        if isinstance(evaluations, int) and limit.isascii() and limit.isdigit() and int(limit) > 0:
-            return Progress(f"{text}, {evaluations} of at most {limit} simulations", min(evaluations / int(limit), 1.0))
-        return Progress(text)
+        share = _share(evaluations, limit)
+        return Progress(text if share is None else f"{text}, {evaluations} of at most {limit} simulations", share)
     trials = material.counts.get("/study/trial", 0)
     if trials:
-        return Progress(f"{trials} trial{'s' if trials != 1 else ''} done")
+        total = material.about("config").get("study.all_trials", "")
+        share = _share(trials, total)
+        return Progress(f"{counted(trials, 'trial')} done" if share is None else f"{trials} of {total} trials", share)
     if material.kind == "monitor" and material.recordings and len(material.recordings[0].time):
         return Progress(f"monitored until {number(float(material.recordings[0].time[-1]), 6)} s")
     said = material.of("/log")
     return Progress(str(said[-1].get("message", "")) if said else "started")
+
+
+def _share(done: Any, total: str) -> float | None:
+    """The share of a number that a log states; None if it states none."""
+    known = isinstance(done, int) and total.isascii() and total.isdigit() and int(total) > 0
+    return min(done / int(total), 1.0) if known else None
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,9 @@ from fdi_torch.amounts import parameter_words
 from fdi_torch.clock import clock_text
 from fdi_torch.estimate.combinations import Combination
 from fdi_torch.estimate.misfit import UNRELIABLE, Misfit
+from fdi_torch.estimate.uncertainty import convergence_warning
 from fdi_torch.gap.verdict_words import verdict_sentence
+from fdi_torch.names import counted
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
@@ -55,12 +57,15 @@ def headline(material: Material) -> str:
 
 
 def unreliable_words(material: Material) -> str:
-    """The warning of an estimate whose model does not explain its recording; logs before 2026-11 lack its ratio."""
+    """The warning of an estimate that has not converged or whose model does not explain its recording; logs before
+    2026-11 lack its ratio.
+    """
     result = material.about("result")
-    if result.get("explained") != "false":
-        return ""
-    ratio = result.get("unexplained_ratio", "null")
-    return f"{UNRELIABLE if ratio == 'null' else Misfit(float(ratio)).warning}. "
+    warnings = [convergence_warning(result.get("status", "")) if material.kind == "train" else ""]
+    if result.get("explained") == "false":
+        ratio = result.get("unexplained_ratio", "null")
+        warnings.append(UNRELIABLE if ratio == "null" else Misfit(float(ratio)).warning)
+    return "".join(f"{warning}. " for warning in warnings if warning)
 
 
 def fault_words(material: Material) -> str:
@@ -125,7 +130,7 @@ def alarm_words(material: Material) -> str:
         return "No alarm"
     channels = _listed(list(dict.fromkeys(str(m["channel"]) for m in alarms if m.get("channel"))))
     first = f"the first at {number(float(alarms[0]['t']), 6)} s"
-    return f"{len(alarms)} alarm{'s' if len(alarms) > 1 else ''}, {first}{': ' + channels if channels else ''}"
+    return f"{counted(len(alarms), 'alarm')}, {first}{': ' + channels if channels else ''}"
 
 
 def benchmark_words(material: Material) -> str:
@@ -152,8 +157,7 @@ def study_words(material: Material) -> str:
     trials, settings = material.counts.get("/study/trial", 0), material.of("/study/summary")
     if not trials and not settings:
         return ""
-    text = f"{trials} trial{'s' if trials != 1 else ''}"
-    text += f" in {len(settings)} setting{'s' if len(settings) != 1 else ''}" if settings else ""
+    text = counted(trials, "trial") + (f" in {counted(len(settings), 'setting')}" if settings else "")
     estimator = next((name for name in ESTIMATORS if any(f"{name}.failures" in m for m in settings)), "")
     ratios = [
         float(v)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from urllib.parse import urlencode
 
+from fdi_torch.names import counted
 from fdi_torch.report.html import Markup, clean, folded, join, table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
@@ -47,7 +48,7 @@ def address(path: str, **values: str | Sequence[str]) -> str:
 def list_page(folder: str, entries: Sequence[Entry], kinds: Sequence[str], query: Query, total: int) -> str:
     """The list of logs with a filter; ticked logs are compared."""
     title = f"Logs in {clean(folder)}"
-    shown = f"{len(entries)} of {total} logs" if len(entries) != total else f"{total} log{'s' if total != 1 else ''}"
+    shown = f"{len(entries)} of {total} logs" if len(entries) != total else counted(total, "log")
     content = [tag("h1", title), tag("h2", shown), tag("section", _filter(kinds, query), _choice(entries, query))]
     if not total:
         hint = "Jobs write their logs into the folder logs; fdi train --out DIR names another one."

@@ -82,6 +82,13 @@ def test_curves_align_by_generation_not_by_time(tmp_path: Path) -> None:
     np.testing.assert_array_equal(costs, [[2, 1.5, np.nan, np.nan], [2, 1.5, 1 + 1 / 3, 1.25]])
 
 
+def test_of_several_messages_at_one_point_the_last_counts(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "a.mcap", "monitor", **FIXED) as log:
+        for value in (1.0, 2.0):
+            log.write("/observer/residual", {"h1": value}, 5.0)
+    assert align([tmp_path / "a.mcap"], "/observer/residual", "h1")[1].tolist() == [[2.0]]
+
+
 def test_residuals_align_by_plant_time(tmp_path: Path) -> None:
     for name, times in (("a", (0.0, 2.0)), ("b", (1.0, 2.0))):
         with RunLog(tmp_path / f"{name}.mcap", "monitor", **FIXED) as log:

@@ -10,25 +10,16 @@ from __future__ import annotations
 import argparse
 import math
 
+from fdi_torch.blind.kind_meanings import KIND_MEANINGS
+
 RIGS = ("cascaded_tanks", "quadruple_tank", "three_tank")
 
 STEP, SUMMARY = "validate", "blind benchmark of the gap diagnosis on hidden rigs"
 LONG = True
-EXAMPLES = """
-kinds of cases:
-  single    one effect of usual size              pair      two effects
-  weak      one effect of a fifth of that size    messy     one full effect and three weak ones
-  coloured  correlated noise                      poor      inputs with little excitation
-  null      no discrepancy                        twins     one of several nearly collinear effects
-  unknown   a law outside the library: the right answer is `unknown` at its location
-  left_out  an effect that the diagnosis is not given (--leave-out)
-  dnull     no discrepancy, but random disturbance flows into the tanks
-  dsingle   the same with one effect              dloop     the same without one, a level controlled
-on random networks of tanks (--plant network):
-  site      one or two effects                    law       a law outside the library
-  hidden    a third of the levels is unmeasured   mixed     one effect, and such a law elsewhere
-  loop      a level is controlled                 null, dnull, dsingle as above
-
+_KINDS = "".join(f"  {kind:<10}{meaning}\n" for kind, meaning in KIND_MEANINGS.items())
+EXAMPLES = f"""
+kinds of cases (on random networks also null, dnull and dsingle):
+{_KINDS}
 --out contains rows.jsonl (one line per answer), scores.json, scores.md and challenge.mcap (for `fdi report`).
 The workers of a --cluster need access to that folder.
 

@@ -7,6 +7,7 @@ import argparse
 from fdi_torch.cli.options import add_config, add_keys
 
 STEP, SUMMARY = "describe", "examine a plant and a recording before any fit"
+QUICK = True
 EXAMPLES = """
 examples:
   fdi check --plant rig.yaml                       the plant alone

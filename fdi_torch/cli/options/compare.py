@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 STEP, SUMMARY = "look", "compare runs: settings, data and results"
+QUICK = True
 EXAMPLES = """
 examples:
   fdi compare logs/before.mcap logs/after.mcap

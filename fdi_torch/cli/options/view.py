@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 
 STEP, SUMMARY = "look", "show the logs of a folder as local pages: list, compare, follow running jobs"
+QUICK = True
 EXAMPLES = """
 examples:
   fdi view                                         the logs in ./logs

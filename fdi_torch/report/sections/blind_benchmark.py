@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from fdi_torch.blind.kind_meanings import KIND_MEANINGS
 from fdi_torch.blind.score import Row
 from fdi_torch.blind.score_tables import OWN, Sheet, misses, sheets
 from fdi_torch.blind.scored_rows import Scores, group_of, tables
@@ -45,15 +46,17 @@ def scores_section(material: Material) -> Section | None:
     words = (
         "The rigs use other equations than the library, and their causes stayed sealed until every answer was "
         "in. Lines and brackets are 95 % intervals. Calibration: orange is the mean stated probability of the best "
-        "explanation, blue the share in which it was true. Times: a point is a case, blue the median. "
-        "`fdi challenge --help` describes the kinds of cases."
+        "explanation, blue the share in which it was true. Times: a point is a case, blue the median."
     )
-    blocks: list[Markup | str | list[Picture]] = [words]
+    kinds = [
+        [kind.replace("_", " "), KIND_MEANINGS.get(kind, "")] for kind in dict.fromkeys(row["kind"] for row in rows)
+    ]
+    blocks: list[Markup | str | list[Picture]] = [words, table(["kind of case", "what it is"], kinds, left=2)]
     for k, (group, by) in enumerate(tables(rows).items()):
         own = [row for row in rows if row["by"] == OWN and group_of(row) == group]
-        names, *more = sheets(by)
+        first, *more = sheets(by)
         blocks += [tag("h4", f"{group}, {len(own)} cases"), _pictures(by, own, f"challenge_{k + 1}")]
-        blocks += [_shown(names), folded("Further scores, baselines, and effect by effect", *map(_titled, more))]
+        blocks += [_shown(first), folded("Further scores, baselines, and effect by effect", *map(_titled, more))]
     return Section("Right answers", blocks)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.estimate.profile import chi_square_quantile
+from fdi_torch.estimate.uncertainty import chi_square_quantile
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material, Payload

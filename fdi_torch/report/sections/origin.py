@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from fdi_torch.names import counted
 from fdi_torch.report.html import folded, pairs, table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
@@ -41,16 +42,14 @@ def health_section(material: Material) -> Section | None:
     inspection = material.inspection
     problems = [*inspection.health.problems, *material.trouble]
     state = tag("span", "damaged", class_="bad") if problems else tag("span", "intact", class_="good")
-    chunks = "chunk" if inspection.health.chunks == 1 else "chunks"
-    on = "1 topic" if len(inspection.topics) == 1 else f"{len(inspection.topics)} topics"
-    counted = f"{inspection.messages} messages on {on} in {inspection.health.chunks} {chunks}, {inspection.size} bytes"
-    topics = inspection.topics.values()
+    topics, chunks = inspection.topics.values(), counted(inspection.health.chunks, "chunk")
+    content = f"{counted(inspection.messages, 'message')} on {counted(len(topics), 'topic')} in {chunks}"
     rows = [[info.topic, str(info.messages), number(info.first), number(info.last)] for info in topics]
     messages = [_log_message(message) for message in material.of("/log")]
     return Section(
         "Integrity of the log",
         [
-            tag("p", "The file is ", state, f": {counted}."),
+            tag("p", "The file is ", state, f": {content}, {inspection.size} bytes."),
             *([tag("ul", *(tag("li", problem) for problem in problems))] if problems else []),
             *([inspection.advice] if inspection.advice else []),
             *([folded(f"Log messages ({len(messages)})", tag("ul", *messages))] if messages else []),

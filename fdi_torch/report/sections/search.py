@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fdi_torch.names import counted
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import axis, number, shown_unit
@@ -49,8 +50,7 @@ def refinement_section(material: Material) -> Section | None:
         lines.append(Line(f"start {lane + 1}", np.arange(len(start)), column(start, "cost"), colour))
     chart = Chart("Cost", "iteration", "cost", lines, log=True)
     lowest = float(np.nanmin(column(events, "cost")))
-    starts = f"{len(lanes)} start{'s' if len(lanes) > 1 else ''}"
-    words = f"{len(events)} iterations from {starts}; lowest cost {number(lowest, 6)}."
+    words = f"{counted(len(events), 'iteration')} from {counted(len(lanes), 'start')}; lowest cost {number(lowest, 6)}."
     return Section("Refinement", [words, [signals("refinement_cost", chart)]])
 
 

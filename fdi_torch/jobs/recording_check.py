@@ -1,0 +1,45 @@
+"""The check of a recording that `fdi check` shows: each channel, and what a diagnosis would refuse or mask."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from fdi_torch.config.loaded_recordings import known_segments_of, read_recording
+from fdi_torch.config.recording_config import RecordingConfig
+from fdi_torch.gap.preprocess.acquisition import examined
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+from fdi_torch.recordings.channel_finding import ChannelFinding
+from fdi_torch.recordings.check import RecordingCheck, check_recording
+
+
+def checked(config: RecordingConfig, plant: PlantDescription, base: Path) -> tuple[Recording, RecordingCheck]:
+    """A recording and its check: readings beyond the tanks first, as they make the rest meaningless, then refused or
+    masked channels.
+    """
+    whole = read_recording(config, plant, base)
+    check = check_recording(whole, plant)
+    examinations = [examined(plant, part) for part in whole.known_segments()]
+    problems = [_slip(", ".join(e.fault.channels), e.fault.text) for e in examinations if e.fault]
+    problems += [
+        ChannelFinding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop})
+        for e in examinations
+        for s in e.stuck
+    ]
+    refused = {channel for e in examinations if e.fault for channel in e.fault.channels}
+    doubts = [f for f in check.findings if not (f.kind == "undersampled" and f.channel in refused)]
+    beyond = [f for f in doubts if f.kind == "range"]
+    return whole, replace(check, findings=(*beyond, *problems, *(f for f in doubts if f not in beyond)))
+
+
+def _slip(channels: str, text: str) -> ChannelFinding:
+    return ChannelFinding("slip", channels, text.removeprefix(f"{channels}: "))
+
+
+def usable_spans(recording: Recording, config: RecordingConfig, plant: PlantDescription) -> str:
+    """The segments with all inputs known, as '0 to 40 s, 50 to 90 s'; empty if that is the whole recording."""
+    segments = [part.recording for part in known_segments_of(recording, config, plant)]
+    if len(segments) == 1 and len(segments[0]) == len(recording):
+        return ""
+    return ", ".join(f"{part.time[0]:g} to {part.time[-1]:g} s" for part in segments)
