@@ -68,7 +68,7 @@ def unexplained_ratio(rms: torch.Tensor, values: torch.Tensor, weight: torch.Ten
     return max(0.0, *ratio.nan_to_num(nan=math.inf, posinf=math.inf).tolist())
 
 
-def least_noise(values: Float[Tensor, "S C"], weight: Float[Tensor, "S C"]) -> Float[Tensor, " C"]:
+def least_noise(values: Float[torch.Tensor, "S C"], weight: Float[torch.Tensor, "S C"]) -> Float[torch.Tensor, " C"]:
     """The least noise (C,) of such readings: of rounding, and the error of simulated readings.
 
     Rounding in steps of q adds q^2 / 12 to the variance of the readings, which second differences of a slow level do
