@@ -113,7 +113,7 @@ def test_a_date_beside_a_time_of_day_is_followed_and_takes_a_format(tmp_path: Pa
     with path.open("a") as file:
         file.write("50,3/30/2026,12:01:00 AM,12\n50,3/30/2026\n")
     seconds, _, readings, troubles = growing.new()
-    assert (seconds.tolist(), readings.tolist()) == ([61.0], [[0.12]]) and "expected 3 cells" in troubles[0]
+    assert (seconds.tolist(), readings.tolist()) == ([61.0], [[0.12]]) and "expected 3 cells" in troubles[0][1]
 
 
 def test_a_last_line_without_its_last_cell_is_left_out(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.effects import build_network, placements_for
+from fdi_torch.estimate.misfit import EXACT
 from fdi_torch.gap.answer import adopted
 from fdi_torch.gap.channel_noise import (
     Noise,
@@ -18,7 +19,8 @@ from fdi_torch.gap.channel_noise import (
     quantization_step,
     with_rounding,
 )
-from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.dataset import data_set_of
+from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
 from fdi_torch.gap.identifiability import planned_identifiability
 from fdi_torch.gap.library import STANDARD, canonical, library_of
 from fdi_torch.gap.screening import Pairs
@@ -80,6 +82,12 @@ def test_level_and_correlation_of_noise_are_estimated_despite_a_slow_misfit(ar: 
     assert found.std.tolist() == pytest.approx([0.002] * 3, rel=0.15 if ar else 0.04)
     assert found.ar.tolist() == pytest.approx([ar] * 3, abs=0.04)
     assert found.mean_of == 0
+
+
+def test_a_recording_without_noise_tells_no_more_than_the_simulation() -> None:
+    recording = recorded({"P13.discharge_coefficient": 0.61}, 5, samples=300, std=0.0)
+    fitter = recalibrate(data_set_of(nominal_plant(), (), recording, 1.0))[0]
+    assert bool((fitter.noise.std >= 0.999 * EXACT * recording.outputs.amax(dim=0)).all())
 
 
 def test_whitened_noise_is_white_and_of_unit_variance_also_across_masked_samples() -> None:

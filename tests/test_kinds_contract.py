@@ -366,7 +366,7 @@ def test_gap_names_its_most_usual_fault(kind: type[FlowComponent], tmp_path: Pat
     nominal = network.constants[f"X.{effect}.{size}"].nominal
     space = ParameterSpace([network.constants[f"X.{effect}.{size}"]])
     recording = inputs_of(plant)
-    engine = ReferenceEngine(network, space, lay_out(recording, plant.channels(), SAMPLE))
+    engine = ReferenceEngine(network, space, lay_out(recording, plant.channels(), 0.05 * SAMPLE))
     readings = engine.readings(torch.tensor([nominal - 0.2 if nominal else 0.2], dtype=torch.float64))
     noise = 5e-4 * torch.randn(readings.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     recording = replace(recording, outputs=readings + noise, mask=None)

@@ -26,8 +26,8 @@ from fdi_torch.simulate.experiment import divided
 
 ROUNDS = 4
 """Most divisions by errors of the plant; the error of a root at zero head falls slower than with the square."""
-MOST_ADDED = 20_000
-"""Steps by which a recording grows at most, so that time and memory stay bounded; it then keeps larger errors."""
+MOST_DIVISION, MOST_ADDED = 8, 20_000
+"""A recording grows at most by this factor, and by this number of steps; it then keeps larger errors."""
 
 
 def with_accurate_steps(data: DataSet) -> DataSet:
@@ -43,7 +43,7 @@ def _accurate(network: TankNetwork, part: RecordingPart) -> RecordingPart:
     least = least_noise(recording.outputs[:, order].nan_to_num(), recording.mask[:, order])
     noise = torch.maximum(sample_noise(part.readings.nan_to_num(), part.mask), least)
     errors = errors_by_readings(part, noise)
-    most = len(errors) + MOST_ADDED
+    most = min(MOST_DIVISION * len(errors), len(errors) + MOST_ADDED)
     part = _divided(part, torch.where(errors > 1.0, errors, 0.0), most)  # noise alone makes errors of 0.19
     for _ in range(ROUNDS):
         before, part = part, _divided(part, errors_by_plant(network, part, noise), most)

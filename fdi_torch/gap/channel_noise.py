@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
@@ -60,6 +60,10 @@ class Noise:
     @property
     def std(self) -> Tensor:
         return self.innovation * torch.sqrt(self.energy)
+
+    def at_least(self, std: Tensor) -> Noise:
+        """The noise with standard deviations of at least std (C,)."""
+        return replace(self, innovation=torch.maximum(self.innovation, std / torch.sqrt(self.energy)))
 
     @property
     def lag_one(self) -> Tensor:

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import torch
 
+from fdi_torch.estimate.misfit import EXACT
 from fdi_torch.gap.answer import UNKNOWN, Answer, CauseName, Verdict
 from fdi_torch.gap.answer_assembly import build_answer
 from fdi_torch.gap.candidate import Candidate, Fit
@@ -129,7 +130,9 @@ def recalibrate(data: DataSet) -> tuple[Fitter, Fit, list[float]]:
     for c, values in enumerate(map(data.recorded, range(channels))):
         of_one_reading = float(noise.std[c]) * math.sqrt(len(values) / int(data.mask[:, c].sum()))
         quantization_steps.append(quantization_step(values, of_one_reading))
-    noise = estimate_noise(residual, data.mask, quantization_steps, data.rows)
+    # A recording without noise tells no more than the simulation, whose readings err a little.
+    exact = EXACT * torch.where(data.mask, data.readings, 0.0).abs().amax(dim=0)
+    noise = estimate_noise(residual, data.mask, quantization_steps, data.rows).at_least(exact)
     noise = noise_before_clipping(noise, data, null.linearised.readings[0])
     fitter = Fitter(with_noise_limits(data, null, noise), noise)
     return fitter, fitter.fit(Candidate(), null), quantization_steps
