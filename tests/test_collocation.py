@@ -165,3 +165,17 @@ def test_levels_between_nodes_lie_on_the_line_through_them() -> None:
     line = 0.1 + 0.02 * experiment.nodes
     assert len(experiment.nodes) < len(experiment.sample_times)
     assert torch.allclose(SampleGrid(experiment).of(line), 0.1 + 0.02 * experiment.sample_times)
+
+
+def test_a_trajectory_does_not_depend_on_the_other_lanes() -> None:
+    """One lane starts at its solution, so that it takes fewer corrections than the other."""
+    network = build_network(three_tank(start=(0.5, 0.3, 0.4)), [])
+    space = ParameterSpace([network.constants["P13.discharge_coefficient"]])
+    theta = torch.tensor([[0.6], [0.5]], dtype=torch.float64)
+    engine = Collocation(network, space, lay_out(stepped(), network.description.channels(), 1.0))
+    guess = engine.constant_guess(theta)
+    guess[0] = engine.converge(theta[:1], guess[:1]).levels[0]
+    both = engine.converge(theta, guess)
+    for lane in (0, 1):
+        alone = engine.converge(theta[lane : lane + 1], guess[lane : lane + 1])
+        assert torch.equal(alone.readings[0], both.readings[lane])

@@ -79,10 +79,8 @@ class Collocation:
         middle = 0.5 * (path[..., :-1] + path[..., 1:])
         values = self.network.bind(self.space, theta.unsqueeze(-2))
         rates, by_level, by_theta = self._rate_slopes(middle, theta, slopes=True)
-        step = self.experiment.steps
-        start, start_slopes = self._start(theta, values)
         corrected, slopes, transition, gain, defect = newton_step(
-            step, path, rates, by_level, by_theta, start, start_slopes
+            self.experiment.steps, path, rates, by_level, by_theta, *self._start(theta, values)
         )
         look = self._output_map.look(corrected, values, self._columns(theta))
         return Linearised(
@@ -109,13 +107,15 @@ class Collocation:
 
     def converge(self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L nodes n"]) -> Linearised:
         """Newton steps at fixed theta from `levels`, m, until they converge; segment by segment where they do not."""
+        levels, left = self._path(theta, levels).movedim(2, 1), torch.arange(len(theta))
         for _ in range(ROUNDS - 1):
-            levels, defect = self.corrected(theta, levels)
-            if float(defect.max()) < CONVERGED * self._length:
+            corrected, defect = self.corrected(theta[left], levels[left])
+            levels = levels.index_copy(0, left, corrected)
+            left = left[~(defect < CONVERGED * self._length)]
+            if not len(left):
                 break
         else:
-            lost = (~(defect < CONVERGED * self._length)).nonzero().flatten()
-            levels = levels.index_copy(0, lost, self.converge_in_segments(theta[lost]))
+            levels = levels.index_copy(0, left, self.converge_in_segments(theta[left]))
         return self.linearise(theta, levels)
 
     def converge_in_segments(self, theta: Float[Tensor, "L P"]) -> Float[Tensor, "L nodes n"]:
@@ -161,9 +161,8 @@ class Collocation:
             level, step = path[:, tank], self.experiment.steps
             inverse = 1.0 / (1.0 - 0.5 * step * by_level[:, tank, tank])
             misfit = step * rates[:, tank] - torch.diff(level)
-            zero = level.new_zeros(len(level), 1, 1)
             transition, forcing = (2.0 * inverse - 1.0)[:, None, None], (inverse * misfit)[:, None, None]
-            correction = scan_in_time(transition, forcing, zero)[:, 0, 0]
+            correction = scan_in_time(transition, forcing, level.new_zeros(len(level), 1, 1))[:, 0, 0]
             levels[..., tank] += correction
             if float(correction.abs().max()) < ONE_CONVERGED * self._length:
                 break
