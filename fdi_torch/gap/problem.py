@@ -223,6 +223,7 @@ def _laid_out(
     recordings: Recording | Sequence[Recording],
     step: float | None,
 ) -> DataSet:
+    """The data set in steps of `step` s, which is kept if given; by default in accurate ones."""
     each = [recordings] if isinstance(recordings, Recording) else recordings
     data = data_set_of(plant, nominal_effects, each, step or _step(plant, each), averaged=True)
     return with_accurate_steps(data) if step is None else data
