@@ -70,7 +70,7 @@ def recorded(
     space = ParameterSpace(network.constants[n] for n in names)
     engine = Collocation(network, space, lay_out(blank, plant.channels(), 1.0))
     theta = space.vector(values).unsqueeze(0)
-    readings = engine.converge(theta, engine.constant_guess(theta)).readings[0]
+    readings = engine.converge(theta).readings[0]
     return replace(blank, outputs=readings + noise(samples, ar, std, seed + 1), mask=None)  # type: ignore[arg-type]
 
 

@@ -60,7 +60,7 @@ def recorded(values: dict[str, float], voltage: torch.Tensor) -> Recording:
     space = ParameterSpace(network.constants[n] for n in values)
     engine = Collocation(network, space, lay_out(blank, PLANT.channels(), 4.0))
     theta = space.vector(values).unsqueeze(0)
-    readings = engine.converge(theta, engine.constant_guess(theta)).readings[0]
+    readings = engine.converge(theta).readings[0]
     noise = 0.015 * torch.randn(readings.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     return replace(blank, outputs=readings + noise, mask=None)  # type: ignore[arg-type]
 

@@ -57,8 +57,8 @@ def test_the_best_of_many_starts_is_found_by_one_descent_of_the_whole_problem(
 def test_a_start_with_other_values_of_the_shared_parameters_is_kept(sound: tuple[Fitter, Fit]) -> None:
     fitter, null = sound
     constant = null.space.names[0]
-    starts = [Start((SIZE,), {SIZE: size}, null.linearised.levels) for size in (0.1, 0.2)]
-    apart = Start((SIZE,), {SIZE: 0.3, constant: 1.01 * null.values[constant]}, null.linearised.levels)
+    starts = [Start((SIZE,), {SIZE: size}) for size in (0.1, 0.2)]
+    apart = Start((SIZE,), {SIZE: 0.3, constant: 1.01 * null.values[constant]})
     engine = fitter.engine(Candidate((LEAK,)), [SIZE], [SIZE])
     found = likeliest_starts(fitter, null, engine, [*starts, apart], torch.inf)
     assert len(found) == 2 and found[1] is apart

@@ -46,7 +46,7 @@ def run(seed: int, samples: int, effects: dict[str, float], offset: float = 0.0)
     engine = Fitter(data, Noise(torch.ones(3), torch.zeros(3))).engine(Candidate(tuple(placements)), list(effects))
     start = {"T1.start_level": 10 * CM, "T2.start_level": 20 * CM, "T3.start_level": 30 * CM}
     theta = engine.space.vector(start | effects).unsqueeze(0)
-    clean = engine.converge(theta, engine.constant_guess(theta)).readings[0]
+    clean = engine.converge(theta).readings[0]
     noise = 5e-4 * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
     outputs = clean + noise + torch.tensor([offset, 0.0, 0.0], dtype=torch.float64)
     return replace(recording, outputs=outputs, mask=torch.ones_like(outputs, dtype=torch.bool))
@@ -64,10 +64,10 @@ def test_each_recording_is_simulated_as_if_it_were_alone() -> None:
         for k in range(3)
     }
     theta = engine.space.vector(starts | {"P13.discharge_coefficient": 0.55}).unsqueeze(0)
-    joint = engine.converge(theta, engine.constant_guess(theta))
+    joint = engine.converge(theta)
     for k, (recording, rows) in enumerate(zip(recordings, data.rows, strict=True)):
         alone = _alone(believed, recording)
-        linearised = alone.converge(t := _own_theta(alone, k), alone.constant_guess(t))
+        linearised = alone.converge(_own_theta(alone, k))
         torch.testing.assert_close(joint.readings[:, rows], linearised.readings, rtol=0.0, atol=1e-9)
         columns = [engine.space.index(n if not k or "start" not in n else f"{n}@{k}") for n in alone.space.names]
         torch.testing.assert_close(joint.jacobian[:, rows][..., columns], linearised.jacobian, rtol=1e-6, atol=1e-9)

@@ -97,9 +97,7 @@ def errors_by_plant(network: TankNetwork, part: RecordingPart, noise: Float[Tens
     space = ParameterSpace(network.constants[f"{t.name}.start_level"] for t in plant.tanks)
     theta = space.vector(part.first_levels(plant)).unsqueeze(0)
     fine = Collocation(network, space, halves, by=())
-    measured = replace(part, experiment=halves).measured_levels(plant)
-    start = torch.where(measured.isfinite(), measured, fine.constant_guess(theta)[..., : len(plant.tanks)])
-    levels = fine.converge(theta, start).levels[:, ::2]
+    levels = fine.trajectories(theta)[:, ::2]
     coarse = Collocation(network, space, whole, by=())
     slope = torch.diff(levels, dim=1) / whole.steps.unsqueeze(1)
     misfit = coarse.rates(0.5 * (levels[:, 1:] + levels[:, :-1]), theta) - slope

@@ -23,11 +23,10 @@ from fdi_torch.gap.channel_noise import Noise, low_frequency_excess
 from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.gap.start_choice import Start, likeliest_starts, vector_of
-from fdi_torch.gap.trajectory_problem import CAP, FAR, DescentResult, TrajectoryProblem, descend
+from fdi_torch.gap.trajectory_problem import CAP, DescentResult, TrajectoryProblem, descend
 from fdi_torch.parameters import ParameterSpace, common_name, name_in_recording
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.scales import length_scale
 from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.joint_collocation import JointCollocation
 from fdi_torch.simulate.linearised import Linearised
@@ -38,7 +37,6 @@ class Fitter:
 
     def __init__(self, data: DataSet, noise: Noise, whitening: Recomputed[KalmanWhitening] | None = None) -> None:
         self.data, self.noise, self._whitening = data, noise, whitening
-        self.far = FAR * length_scale(data.plant)
 
     @property
     def whitening(self) -> KalmanWhitening | None:
@@ -97,7 +95,7 @@ class Fitter:
 
     def _starts(self, candidate: Candidate, base: Fit | None, target: float) -> list[Start]:
         """The starts of a candidate; of those about the base, only the one with the best prospects."""
-        starts = [Start(tuple(sorted(s)), s, base.linearised.levels if base else None) for s in candidate.starts]
+        starts = [Start(tuple(sorted(s)), s) for s in candidate.starts]
         free = sorted({name for start in starts for name in start.free})
         if base is None or all(name in base.space for name in free):
             return starts
@@ -116,10 +114,7 @@ class Fitter:
         engine = self.engine(candidate, free)
         initial = base.values if base else self.first_levels()
         theta = torch.stack([vector_of(engine.space, {**initial, **s.values}) for s in starts])
-        # The effects' states may be other ones than in the base.
-        guesses = [s.levels[..., : len(self.data.plant.tanks)] for s in starts if s.levels is not None]
-        levels = torch.cat(guesses) if guesses else self.first_trajectory(engine, theta)
-        descents = self.descend(engine, theta, levels, target, cap)
+        descents = self.descend(engine, theta, target, cap)
         best = int(torch.nan_to_num(descents.cost, nan=torch.inf).argmin())
         lane = slice(best, best + 1)
         linearised = descents.linearised.lanes(torch.tensor([best]))
@@ -133,13 +128,6 @@ class Fitter:
             bool(descents.converged[best]),
         )
 
-    def first_trajectory(self, engine: Collocation | JointCollocation, theta: Tensor) -> Tensor:
-        """The model's levels (L, K+1, n) at theta (L, P), found from the levels that the sensors show."""
-        constant = engine.constant_guess(theta)
-        measured = torch.cat([part.measured_levels(self.data.plant) for part in self.data.parts])
-        levels = constant[..., : measured.shape[-1]]
-        return engine.converge(theta, torch.where(measured.isfinite(), measured, levels)).levels
-
     def first_levels(self) -> dict[str, float]:
         """Initial levels from the mean of the first readings, m, by name."""
         each = [part.first_levels(self.data.plant) for part in self.data.parts]
@@ -149,12 +137,11 @@ class Fitter:
         self,
         engine: Collocation | JointCollocation,
         theta: Tensor,
-        levels: Tensor,
         target: float = math.inf,
         cap: int = CAP,
     ) -> DescentResult:
-        """Least squares from theta (L, P), with guesses of the trajectories, levels (L, K+1, n)."""
-        return descend(TrajectoryProblem(self, engine, levels), theta, int(self.data.mask.sum()), target, cap)
+        """Least squares from theta (L, P)."""
+        return descend(TrajectoryProblem(self, engine), theta, int(self.data.mask.sum()), target, cap)
 
     def normal(
         self, space: ParameterSpace, theta: Tensor, residual: Tensor, jacobian: Tensor, scale: Tensor

@@ -77,6 +77,6 @@ def influence(fitter: Fitter, fit: Fit, effects: Collection[CauseName]) -> float
     others = [p for p in fit.candidate.placements if (p.effect.name, p.location) not in effects]
     engine = fitter.engine(Candidate(tuple(others)), list(fit.values_of(others)))
     theta = vector_of(engine.space, fit.values)
-    reduced = engine.converge(theta.unsqueeze(0), fit.linearised.levels[..., : len(fitter.data.plant.tanks)])
+    reduced = engine.converge(theta.unsqueeze(0))
     change = fit.linearised.readings[0] - reduced.readings[0]
     return unexplained_norm(fitter, engine.space, theta, reduced.jacobian[0], change)

@@ -36,18 +36,6 @@ class RecordingPart:
     readings: Tensor
     mask: Tensor
 
-    def measured_levels(self, plant: PlantDescription) -> Tensor:
-        """Measured levels at the ends of the steps, (K+1, tanks) m; NaN for a tank without a sensor."""
-        nodes, names = self.experiment.nodes, [t.name for t in plant.tanks]
-        measured = nodes.new_full((len(nodes), len(names)), math.nan)
-        for i, sensor in enumerate(plant.sensors):
-            tank, valid = names.index(sensor.tank), self.mask[:, i]
-            if bool(valid.any()):
-                level = (self.readings[valid, i] - sensor.offset) / sensor.gain
-                level = level.clamp(0.0, plant.tanks[tank].height)
-                measured[:, tank] = interpolate(nodes, self.experiment.sample_times[valid], level)
-        return measured
-
     def first_levels(self, plant: PlantDescription) -> dict[str, float]:
         """Initial levels of the tanks with sensors from the mean of the first readings, m, by name."""
         levels = {}

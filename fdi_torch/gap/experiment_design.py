@@ -139,10 +139,7 @@ def _planned_run(planned_fitter: Fitter, fit: Fit) -> tuple[Tensor, Tensor, Tens
     engine = planned_fitter.engine(fit.candidate, list(fit.effect_values))
     values = {n: v for n, v in fit.values.items() if n in engine.space}
     theta = engine.space.vector(values).unsqueeze(0)
-    linearised, tanks = (
-        engine.converge(theta, engine.constant_guess(theta)),
-        len(planned_fitter.data.plant.tanks),
-    )
+    linearised, tanks = engine.converge(theta), len(planned_fitter.data.plant.tanks)
     columns = [engine.space.index(n) for n in _in_one_run(fit)]
     return linearised.readings[0], linearised.jacobian[0][..., columns], linearised.levels[0, :, :tanks]
 

@@ -84,9 +84,7 @@ def run_reference_models(
     data: DataSet, noise: Noise, models: Mapping[str, Model], quantization_steps: Sequence[float]
 ) -> HeldOut:
     """Free runs of all models by name, "augmented" among them. quantization_steps (C,): 0 for channels without one."""
-    runs, levels = {}, None
-    for name, model in models.items():
-        runs[name], levels = free_run(data, noise, model, levels)
+    runs = {name: free_run(data, noise, model) for name, model in models.items()}
     residuals = (data.readings - runs[m] for m in ("augmented", "recalibrated") if m in runs)
     nearest = min(residuals, key=lambda r: float(torch.where(data.mask, r * r, 0.0).sum()))
     fast = estimate_noise(nearest, data.mask, quantization_steps)
@@ -107,11 +105,8 @@ def closure(holdouts: Sequence[HeldOut]) -> Closure:
     return Closure(pooled, sensors, *_closed(holdouts))
 
 
-def free_run(data: DataSet, noise: Noise, model: Model, guess: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Readings (S, C) and levels (1, K+1, tanks) of a free run, with initial levels from the first samples.
-
-    guess (1, K+1, tanks): levels from which the trajectory starts.
-    """
+def free_run(data: DataSet, noise: Noise, model: Model) -> Tensor:
+    """Readings (S, C) of a free run, with initial levels from the first samples."""
     values = transferable_values(model.values or {})
     fitter = Fitter(replace(data, mask=_first(data.mask)), noise)
     network = fitter.engine(Candidate(model.placements), [n for n in values if is_effect_parameter(n)]).network
@@ -122,13 +117,8 @@ def free_run(data: DataSet, noise: Noise, model: Model, guess: Tensor | None = N
     starts = [f"{t.name}.start_level" for t in data.plant.tanks]
     engine = Collocation(network, ParameterSpace(network.constants[n] for n in starts), data.experiment)
     theta = engine.space.vector(fitter.first_levels()).unsqueeze(0)
-    if guess is None:  # all readings serve as a first guess of the trajectory only
-        levels = Fitter(data, noise).first_trajectory(engine, theta)
-    else:
-        levels = engine.converge(theta, guess).levels
-    start = fitter.descend(engine, theta, levels)
-    converged = engine.converge(start.theta, start.linearised.levels)
-    return converged.readings[0], converged.levels
+    start = fitter.descend(engine, theta)
+    return engine.read(engine.trajectories(start.theta), start.theta)[0]
 
 
 def transferable_values(values: Mapping[str, float]) -> dict[str, float]:

@@ -115,7 +115,7 @@ def _noise_free(
     white = Noise(std, torch.zeros_like(std))
     engine = Fitter(data, white).engine(Candidate(), ())
     theta = engine.space.nominal().unsqueeze(0)
-    readings = engine.converge(theta, engine.constant_guess(theta)).readings[0]
+    readings = engine.converge(theta).readings[0]
     return Fitter(replace(data, readings=readings, recording=replace(planned, outputs=readings)), white)
 
 

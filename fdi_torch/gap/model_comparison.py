@@ -140,7 +140,7 @@ def prediction_arrays(result: DiagnosisResult, holdouts: Sequence[HeldOut]) -> d
     for k, rows in enumerate(fitter.data.rows):
         data = fitter.data.alone(k)
         predicted = {
-            "nominal": free_run(data, fitter.noise, Model())[0],
+            "nominal": free_run(data, fitter.noise, Model()),
             "recalibrated": result.null.linearised.readings[0, rows],
             "augmented": result.best.linearised.readings[0, rows],
         }

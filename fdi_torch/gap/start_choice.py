@@ -20,7 +20,7 @@ from torch import Tensor
 
 from fdi_torch.estimate.linear_parameters import decomposed
 from fdi_torch.gap.candidate import Fit
-from fdi_torch.gap.trajectory_problem import NEARLY, Objective, TrajectoryProblem, corrected_trajectories, descend
+from fdi_torch.gap.trajectory_problem import Objective, TrajectoryProblem, descend
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.joint_collocation import JointCollocation
@@ -32,12 +32,10 @@ SHARES = (1.0, 0.5, 0.25, 0.0)  # of the change of the linear parameters, which 
 
 @dataclass(frozen=True)
 class Start:
-    """free: names of the effects' parameters that are fitted. values: of these, and of any others. levels (1, K+1, n),
-    m: guess of the trajectory."""
+    """free: names of the effects' parameters that are fitted. values: of these, and of any others."""
 
     free: tuple[str, ...]
     values: Mapping[str, float]
-    levels: Tensor | None = None
 
 
 def vector_of(space: ParameterSpace, values: Mapping[str, float]) -> Tensor:
@@ -75,10 +73,7 @@ def likeliest_starts(
     fixed = torch.tensor([[n not in s.free for n in engine.by] for s in about])
     own = theta[:, varied]
     box = torch.where(fixed, own, low[varied]), torch.where(fixed, own, high[varied])
-    tanks = len(engine.network.description.tanks)  # the effects' states may be other ones than in the base
-    levels, slopes = base.linearised.levels[..., :tanks], base.linearised.slopes[..., :tanks, in_base]
-    problem = TrajectoryProblem(projected, reduced, levels.expand(len(about), -1, -1))
-    end = descend(problem, own, len(projected.basis), target, decrement=NEAR, box=box)
+    end = descend(TrajectoryProblem(projected, reduced), own, len(projected.basis), target, decrement=NEAR, box=box)
     best = int(end.cost.nan_to_num(nan=torch.inf).argmin())
     change = projected.change(objective.residual(end.linearised.readings[best : best + 1])) * scale[of_shared]
     shares = torch.tensor(SHARES, dtype=theta.dtype)
@@ -86,13 +81,11 @@ def likeliest_starts(
     tried[:, varied] = end.theta[best]
     tried[:, of_shared] += shares.unsqueeze(1) * change
     tried = torch.minimum(torch.maximum(tried, low), high)
-    guesses = end.linearised.levels[best].repeat(len(SHARES), 1, 1)
-    guesses[..., :tanks] += shares[:, None, None] * (slopes @ change)
-    found, defect = corrected_trajectories(engine, tried, guesses, objective.far)
-    cost = objective.chi_square(engine.space, tried, objective.residual(engine.read(found, tried)))
-    likeliest = int(torch.where(defect <= NEARLY * objective.far, cost, torch.inf).argmin())
+    readings = engine.read(engine.trajectories(tried), tried)
+    cost = objective.chi_square(engine.space, tried, objective.residual(readings))
+    likeliest = int(cost.nan_to_num(nan=torch.inf).argmin())
     values = dict(zip(engine.space.names, tried[likeliest].tolist(), strict=True))
-    return [Start(about[best].free, values, found[likeliest : likeliest + 1]), *others]
+    return [Start(about[best].free, values), *others]
 
 
 @dataclass(frozen=True)
@@ -115,10 +108,6 @@ class _Projected:
         rows = len(basis) - len(which)
         pull = -(deviation @ basis[rows:])
         return _Projected(objective, basis[:rows], factor, pull, float(deviation.square().sum()))
-
-    @property
-    def far(self) -> float:
-        return self.objective.far
 
     def box(self, space: ParameterSpace) -> tuple[Tensor, Tensor, Tensor]:
         return self.objective.box(space)
@@ -180,11 +169,8 @@ class _Varied:
     def linearise(self, theta: Tensor, levels: Tensor) -> Linearised:
         return self.engine.linearise(self._full(theta), levels)
 
-    def corrected(self, theta: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]:
-        return self.engine.corrected(self._full(theta), levels)
-
-    def converge_in_segments(self, theta: Tensor) -> Tensor:
-        return self.engine.converge_in_segments(self._full(theta))
+    def trajectories(self, theta: Tensor, guess: Tensor | None = None) -> Tensor:
+        return self.engine.trajectories(self._full(theta), guess)
 
     def read(self, levels: Tensor, theta: Tensor) -> Tensor:
         return self.engine.read(levels, self._full(theta))

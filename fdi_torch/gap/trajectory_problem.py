@@ -1,13 +1,9 @@
-"""Least squares over parameters and trajectories: the problem that Levenberg-Marquardt solves.
-
-The collocation engine improves a trajectory by one Newton step per evaluation. The costs of two points can therefore be
-compared only where both trajectories satisfy the model: a step whose trajectory does not converge is rejected.
-"""
+"""Least squares over the parameters of a simulated plant: the problem that Levenberg-Marquardt solves."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Protocol
 
 import torch
@@ -24,22 +20,12 @@ DECREMENT = 0.01
 CAP = 200  # evaluations, a guard against descents without an end
 # A start is given up if it is so many chi-square units behind and gains less than a quarter of that in a step.
 BEHIND, SHARE = 30.0, 0.25
-CORRECTIONS = 6  # most Newton steps after the parameters moved a trajectory
-FAR = 1e-3  # largest defect of a converged trajectory, in units of the plant's length scale
-NEARLY = 10.0  # in units of FAR: a defect that one correction removes
-LOST, STALLED = 100.0, 0.9  # a defect above LOST * FAR that one correction reduces by less than 10 % has diverged
 
 
 class Objective(Protocol):
-    """Chi-square of a data set, with the priors of the parameters; `candidate_fit.Fitter` is one.
-
-    far: largest defect (m) of a trajectory that counts as converged.
-    """
+    """Chi-square of a data set, with the priors of the parameters; `candidate_fit.Fitter` is one."""
 
     def __hash__(self) -> int: ...
-
-    @property
-    def far(self) -> float: ...
 
     def box(self, space: ParameterSpace) -> tuple[Tensor, Tensor, Tensor]: ...
 
@@ -77,18 +63,16 @@ class FittedTrajectory:
 
 @dataclass(frozen=True)
 class TrialTrajectory:
-    """A trajectory without derivatives: cost (L,), infinite if it did not converge; levels (L, K+1, n), readings
-    (L, S, C); allowed (L,): the largest defect, in m, with which it counts as converged."""
+    """A trajectory without derivatives: cost (L,), levels (L, K+1, n), readings (L, S, C)."""
 
     cost: Tensor
     levels: Tensor
     readings: Tensor
-    allowed: Tensor
 
     def __getitem__(self, keep: Tensor) -> TrialTrajectory:
         if are_all_lanes(keep, len(self.cost)):
             return self
-        return TrialTrajectory(self.cost[keep], self.levels[keep], self.readings[keep], self.allowed[keep])
+        return TrialTrajectory(self.cost[keep], self.levels[keep], self.readings[keep])
 
     def replaced(self, which: Tensor, new: TrialTrajectory) -> TrialTrajectory:
         """A copy in which the k-th lane of `new` replaces lane `which[k]` (int64)."""
@@ -103,9 +87,7 @@ class Engine(Protocol):
 
     def linearise(self, theta: Tensor, levels: Tensor) -> Linearised: ...
 
-    def corrected(self, theta: Tensor, levels: Tensor) -> tuple[Tensor, Tensor]: ...
-
-    def converge_in_segments(self, theta: Tensor) -> Tensor: ...
+    def trajectories(self, theta: Tensor, guess: Tensor | None = None) -> Tensor: ...
 
     def read(self, levels: Tensor, theta: Tensor) -> Tensor: ...
 
@@ -113,27 +95,24 @@ class Engine(Protocol):
 class TrajectoryProblem:
     """Half of chi-square as a least-squares problem, in which every point keeps its linearised trajectory."""
 
-    def __init__(self, objective: Objective, engine: Engine, levels: Tensor) -> None:
-        self.objective, self.engine, self.levels = objective, engine, levels
+    def __init__(self, objective: Objective, engine: Engine) -> None:
+        self.objective, self.engine = objective, engine
         self.box = objective.box(engine.space)
 
     def linearise(self, theta: Tensor, lanes: Tensor) -> Linearisation:
         """The model at the starts theta (L, P)."""
-        linearised = self.engine.linearise(theta, self.levels[lanes])
-        return self._model(theta, _correct(self.engine, theta, linearised, self.objective.far))
+        return self._model(theta, self.engine.linearise(theta, self.engine.trajectories(theta)))
 
     def attempt(
         self, theta: Tensor, known: Linearisation, step: Tensor, near: TrialTrajectory | None = None
     ) -> TrialTrajectory:
         """The trajectories at theta, a `step` away from `known` or from `near`."""
-        linearised, far = _fitted(known).linearised, self.objective.far
+        linearised = _fitted(known).linearised
         guess = (near or linearised).levels + _along(linearised.slopes, step)
-        levels, defect = corrected_trajectories(self.engine, theta, guess, far)
+        levels = self.engine.trajectories(theta, guess)
         readings = self.engine.read(levels, theta)
         cost = 0.5 * self.objective.chi_square(self.engine.space, theta, self.objective.residual(readings))
-        allowed = linearised.defect.clamp(min=far)
-        cost = torch.where(defect <= allowed.clamp(min=NEARLY * far), cost, torch.inf)
-        return TrialTrajectory(cost, levels, readings, allowed)
+        return TrialTrajectory(cost, levels, readings)
 
     def bend(self, known: Linearisation, trial: TrialTrajectory, step: Tensor) -> Tensor:
         """J'c (L, P) for the second-order change c of the whitened readings along the step; priors are linear."""
@@ -143,10 +122,8 @@ class TrajectoryProblem:
         return (here.jacobian.flatten(1, 2).mT @ bend.flatten(1).unsqueeze(-1)).squeeze(-1)
 
     def model(self, theta: Tensor, trial: TrialTrajectory) -> Linearisation:
-        """The model at a trial. The cost is infinite if the trajectory has not converged."""
-        moved = self.engine.linearise(theta, trial.levels)
-        model = self._model(theta, moved)
-        return replace(model, cost=torch.where(moved.defect <= trial.allowed, model.cost, torch.inf))
+        """The model at a trial."""
+        return self._model(theta, self.engine.linearise(theta, trial.levels))
 
     def _model(self, theta: Tensor, linearised: Linearised) -> Linearisation:
         scale = self.box[2]
@@ -202,46 +179,3 @@ def _along(slopes: Tensor, step: Tensor) -> Tensor:
     for by, change in zip(slopes.unbind(-1), step.unbind(-1), strict=True):
         total.addcmul_(by, change[:, None, None])
     return total
-
-
-def corrected_trajectories(engine: Engine, theta: Tensor, guess: Tensor, far: float) -> tuple[Tensor, Tensor]:
-    """Trajectories (L, K+1, n) after Newton steps from a guess while these converge, and their last defects (L,), m."""
-    levels, lanes = guess, torch.arange(len(theta))
-    defect = torch.full((len(theta),), torch.inf, dtype=guess.dtype)
-    for _ in range(CORRECTIONS):
-        before = defect[lanes]
-        path, moved = engine.corrected(theta[lanes], levels[lanes])
-        better = moved < before
-        levels = levels.index_copy(0, lanes[better], path[better])
-        defect = defect.index_copy(0, lanes[better], moved[better])
-        lanes = lanes[better & (moved > NEARLY * far) & ~_diverged(moved, before, far)]
-        if not len(lanes):
-            break
-    return levels, defect
-
-
-def _correct(
-    engine: Engine,
-    theta: Tensor,
-    linearised: Linearised,
-    far: float,
-) -> Linearised:
-    """Correct the lanes whose defect is too large until they converge, if need be segment by segment."""
-    lost = torch.zeros_like(linearised.defect, dtype=torch.bool)
-    for _ in range(CORRECTIONS):
-        lanes = (~lost & (linearised.defect > far)).nonzero().flatten()
-        if not len(lanes):
-            break
-        before = linearised.defect
-        linearised = linearised.replaced(lanes, engine.linearise(theta[lanes], linearised.levels[lanes]))
-        lost = lost | _diverged(linearised.defect, before, far)
-    lanes = (~(linearised.defect <= NEARLY * far)).nonzero().flatten()
-    if len(lanes):
-        levels = engine.converge_in_segments(theta[lanes])
-        linearised = linearised.replaced(lanes, engine.linearise(theta[lanes], levels))
-    return linearised
-
-
-def _diverged(defect: Tensor, before: Tensor, far: float) -> Tensor:
-    """Lanes (L,) with a large defect that a correction did not reduce."""
-    return ~((defect < LOST * far) | (defect < STALLED * before))

@@ -43,6 +43,16 @@ class _Registers:
         return self.count - 1
 
 
+@dataclass(frozen=True)
+class NewtonControl:
+    """tolerance: largest correction, m, at which Newton's method has converged. rounds: most corrections of a block of
+    steps. guessed: whether the path is a guess of the trajectory."""
+
+    tolerance: float
+    rounds: int
+    guessed: bool
+
+
 class ArrayProgram:
     """The values of some nodes of a graph on arrays in time.
 
@@ -59,12 +69,50 @@ class ArrayProgram:
 
     def run(self, inputs: Mapping[Place, Tensor], into: Sequence[Tensor], lanes: int, steps: int) -> None:
         """Write each output into its array (lanes, steps). inputs: by kind and index."""
-        scalars = [self._scalar(i, inputs, into[0]) for i in self._scalars]
-        arrays = [inputs[self._place(i)].expand(lanes, steps) for i in self._arrays]
+        scalars, arrays = self._leaves(inputs, into[0], lanes, steps)
         library = _library() if all(is_plain(x) for x in (*scalars, *arrays, *into)) else None
         if library is None:
             return self._by_torch(scalars, arrays, into)
-        return self._by_interpreter(library, scalars, arrays, into)
+        program = self._program(scalars, arrays, into)
+        library.run_on_arrays(ctypes.c_int64(lanes), ctypes.c_int64(steps), ctypes.byref(program))
+
+    def solve_trajectories(
+        self,
+        inputs: Mapping[Place, Tensor],
+        middle: Tensor,
+        into: Sequence[Tensor],
+        slopes: Sequence[tuple[int, int]],
+        span: Tensor,
+        path: Tensor,
+        control: NewtonControl,
+    ) -> bool:
+        """Solve trajectories path (L, n, K+1) from their first states by the implicit midpoint rule, in place.
+
+        The inputs contain views of middle (n, K), the states in the middle of each step, expanded over the lanes. The
+        outputs, into which the program writes, are rows of one array, likewise expanded: the n rates, and then their
+        slopes by (rate, state). span (K,): lengths of the steps, s. Returns False without a compiler.
+        """
+        (lanes, n, _), steps, library = path.shape, len(span), _library()
+        if library is None:
+            return False
+        program = self._program(*self._leaves(inputs, path, lanes, steps), into)
+        entries = torch.tensor(slopes, dtype=torch.int64).reshape(-1, 2).T.contiguous()
+        addresses = [x.data_ptr() for x in (*entries, span, into[0], into[n], middle, path)]
+        trajectory = _Trajectory(lanes, n, steps, len(slopes), *addresses)
+        library.solve_trajectories(
+            ctypes.byref(program),
+            ctypes.byref(trajectory),
+            ctypes.c_int64(control.guessed),
+            ctypes.c_double(control.tolerance),
+            ctypes.c_int64(control.rounds),
+        )
+        return True
+
+    def _leaves(
+        self, inputs: Mapping[Place, Tensor], like: Tensor, lanes: int, steps: int
+    ) -> tuple[list[Tensor], list[Tensor]]:
+        scalars = [self._scalar(i, inputs, like) for i in self._scalars]
+        return scalars, [inputs[self._place(i)].expand(lanes, steps) for i in self._arrays]
 
     def _place(self, i: int) -> Place:
         return self._graph.nodes[i].kind, self._graph.nodes[i].index
@@ -86,23 +134,21 @@ class ArrayProgram:
         for node_index, array in zip(self._outputs, into, strict=True):
             array.copy_(values[node_index])
 
-    def _by_interpreter(
-        self, library: ctypes.CDLL, scalars: Sequence[Tensor], arrays: Sequence[Tensor], into: Sequence[Tensor]
-    ) -> None:
+    def _program(self, scalars: Sequence[Tensor], arrays: Sequence[Tensor], into: Sequence[Tensor]) -> _Program:
         code, (lanes, steps) = self._code, into[0].shape
         together = torch.cat([s.expand(lanes).unsqueeze(-1) for s in scalars], dim=-1) if scalars else into[0][:, :0]
         rows = [a if a.stride(-1) == 1 or steps == 1 else a.contiguous() for a in arrays]
-        library.run_on_arrays(
-            ctypes.c_int64(lanes),
-            ctypes.c_int64(steps),
-            ctypes.c_int64(code.registers),
-            ctypes.byref(_Scalars(len(scalars), len(scalars), together.data_ptr(), code.scalar_registers.data_ptr())),
-            ctypes.byref(_arrays(rows, code.array_registers)),
-            ctypes.byref(_Code(len(code.fixed), code.fixed.data_ptr())),
-            ctypes.byref(_Code(len(code.varying), code.varying.data_ptr())),
-            ctypes.c_void_p(code.stores.data_ptr()),
-            ctypes.byref(_arrays([into[k] for k in code.order], code.output_registers)),
+        program = _Program(
+            code.registers,
+            _Scalars(len(scalars), len(scalars), together.data_ptr(), code.scalar_registers.data_ptr()),
+            _arrays(rows, code.array_registers),
+            _Code(len(code.fixed), code.fixed.data_ptr()),
+            _Code(len(code.varying), code.varying.data_ptr()),
+            code.stores.data_ptr(),
+            _arrays([into[k] for k in code.order], code.output_registers),
         )
+        program.kept = together, rows  # their memory
+        return program
 
     @cached_property
     def _code(self) -> _Instructions:
@@ -206,6 +252,29 @@ class _Code(ctypes.Structure):
     _fields_ = (("count", ctypes.c_int64), ("instructions", ctypes.c_void_p))
 
 
+class _Program(ctypes.Structure):
+    """`Program` of array_program.hpp."""
+
+    _fields_ = (
+        ("registers", ctypes.c_int64),
+        ("scalars", _Scalars),
+        ("inputs", _Arrays),
+        ("fixed", _Code),
+        ("varying", _Code),
+        ("stores", ctypes.c_void_p),
+        ("outputs", _Arrays),
+    )
+    kept: object
+
+
+class _Trajectory(ctypes.Structure):
+    """`Trajectory` of array_program.hpp."""
+
+    _fields_ = tuple((name, ctypes.c_int64) for name in ("lanes", "n", "steps", "count")) + tuple(
+        (name, ctypes.c_void_p) for name in ("rows", "columns", "span", "rates", "slopes", "middle", "path")
+    )
+
+
 def _arrays(rows: Sequence[Tensor], registers: Tensor) -> _Arrays:
     """Pointers to rows (L, K) of contiguous steps."""
     count = len(rows)
@@ -219,7 +288,7 @@ def _library() -> ctypes.CDLL | None:
     loops = _SKELETON.read_text(encoding="utf-8").replace("//@OPERATIONS@", "\n".join(_cases()))
     source = f"#define BLOCK {BLOCK}\n#define LANES BLOCK\n{primitives('double')}\n{loops}"
     try:
-        return load_library(source, "run_on_arrays")
+        return load_library(source, "run_on_arrays", "solve_trajectories")
     except BuildError:
         return None
 

@@ -1,10 +1,10 @@
-"""Collocation: the implicit midpoint rule over all time steps at once, linearised and solved by a scan in time.
+"""Collocation: trajectories by the implicit midpoint rule, and their derivatives about a whole trajectory at once.
 
     h_{k+1} = h_k + dt f((h_k + h_{k+1}) / 2, u_k, theta)
 
-One call evaluates the right-hand side of all steps and its slopes, from one trace of the equations. Newton's correction
-of the trajectory and the sensitivities to theta then obey one linear recurrence. A Gauss-Newton fit can therefore
-correct parameters and trajectory together (Bock, 1987) at the cost of one evaluation per iteration. Local error of the
+A trajectory is solved by Newton's method on blocks of steps, from a nearby trajectory if there is one. About it, one
+call evaluates the right-hand side of all steps and its slopes, from one trace of the equations; the sensitivities to
+theta obey a linear recurrence. Local error of the
 rule: dt^2 h'''/24 per second; below 1e-3 cm for 1 s steps on the three-tank plant.
 
 Internally time is the last dimension; the documented shapes are those of arguments and results. L lanes (parameter
@@ -25,6 +25,7 @@ from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.scales import length_scale
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.actuation import Actuation, with_parameters
+from fdi_torch.simulate.array_program import NewtonControl
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.midpoint import newton_correction, newton_step
@@ -37,8 +38,7 @@ from fdi_torch.simulate.traced_rates import traced_rates
 # of one tank.
 CONVERGED, ONE_CONVERGED = 1e-7, 1e-5
 ONE_ROUNDS = 8  # most corrections of one tank
-ROUNDS = 12  # most corrections of a whole trajectory, or of one segment
-SEGMENT = 64  # steps of a segment that is converged by itself
+ROUNDS = 12  # most corrections of a block of steps
 
 
 class Collocation:
@@ -105,50 +105,33 @@ class Collocation:
         corrected, defect = newton_correction(self.experiment.steps, path, rates, by_level, start)
         return corrected.movedim(2, 1), defect
 
-    def converge(self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L nodes n"]) -> Linearised:
-        """Newton steps at fixed theta from `levels`, m, until they converge; segment by segment where they do not."""
-        levels, left = self._path(theta, levels).movedim(2, 1), torch.arange(len(theta))
-        for _ in range(ROUNDS - 1):
-            corrected, defect = self.corrected(theta[left], levels[left])
-            levels = levels.index_copy(0, left, corrected)
-            left = left[~(defect < CONVERGED * self._length)]
-            if not len(left):
+    def converge(self, theta: Float[Tensor, "L P"]) -> Linearised:
+        """The trajectories at theta, with derivatives."""
+        return self.linearise(theta, self.trajectories(theta))
+
+    def trajectories(
+        self, theta: Float[Tensor, "L P"], guess: Float[Tensor, "L nodes n"] | None = None
+    ) -> Float[Tensor, "L nodes n"]:
+        """The trajectories at theta, m, solved block after block of steps; no lane depends on another one."""
+        values, tolerance = self.network.bind(self.space, theta.unsqueeze(-2)), CONVERGED * self._length
+        start = self._start(theta, values, slopes=False)[0]
+        constant = start.unsqueeze(1).expand(-1, len(self.experiment.nodes), -1)
+        path = self._path(theta, constant if guess is None else guess).clone()
+        path[..., 0] = start
+        rates, commands = traced_rates(self.network, self.space.names), self._commands(values, [], len(theta))[0]
+        control = NewtonControl(tolerance, ROUNDS, guess is not None)
+        if rates.solve(path, commands, theta, self.network.nominal, self._actuation.clock, control):
+            return path.movedim(1, 2)
+        return torch.cat([self._by_torch(*lane, tolerance) for lane in zip(theta.split(1), path.split(1), strict=True)])
+
+    def _by_torch(self, theta: Tensor, path: Tensor, tolerance: float) -> Tensor:
+        """One trajectory by corrections of all steps at once; they move the time of a kink by few steps each."""
+        levels = path.movedim(1, 2)
+        for _ in range(ROUNDS * levels.shape[1]):
+            levels, defect = self.corrected(theta, levels)
+            if float(defect) < tolerance:
                 break
-        else:
-            levels = levels.index_copy(0, left, self.converge_in_segments(theta[left]))
-        return self.linearise(theta, levels)
-
-    def converge_in_segments(self, theta: Float[Tensor, "L P"]) -> Float[Tensor, "L nodes n"]:
-        """Trajectories, m, by Newton steps on one segment of time after the other, each from the end of the last.
-
-        Newton steps on a whole trajectory that reaches a rim or a floor move the time of the kink by few steps at a
-        time, because the slopes on the other side of it hold until then. A segment that does not converge is halved.
-        """
-        if len(theta) > 1:  # each lane by itself: the length of its segments does not depend on the others
-            return torch.cat([self.converge_in_segments(lane) for lane in theta.split(1)])
-        path = self._path(theta, self.constant_guess(theta))
-        first, length, last = 0, SEGMENT, path.shape[-1] - 1
-        while first < last:
-            part = slice(first, min(first + length, last))
-            piece, converged = self._converged_segment(theta, path[..., first], part)
-            if not converged and length > 1:
-                length = length // 2
-                continue
-            path[..., first : part.stop + 1] = piece
-            first, length = part.stop, min(2 * length, SEGMENT)
-        return path.movedim(1, 2)
-
-    def _converged_segment(self, theta: Tensor, start: Tensor, part: slice) -> tuple[Tensor, bool]:
-        """The trajectories (L, n, k+1) in the k steps of a segment from their states (L, n) at its start, and whether
-        Newton's method converged."""
-        piece = start.unsqueeze(-1).expand(-1, -1, part.stop - part.start + 1).contiguous()
-        for _ in range(ROUNDS):
-            middle = 0.5 * (piece[..., :-1] + piece[..., 1:])
-            rates, by_level, _ = self._rate_slopes(middle, theta, part=part)
-            piece, defect = newton_correction(self.experiment.steps[part], piece, rates, by_level, start)
-            if float(defect.max()) < CONVERGED * self._length:
-                return piece, True
-        return piece, False
+        return levels
 
     def simulate_tank(
         self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L nodes tanks"], tank: int
@@ -185,11 +168,6 @@ class Collocation:
         """The sensors linearised at given levels, m."""
         values = self.network.bind(self.space, theta.unsqueeze(-2))
         return self._output_map.look(levels.movedim(1, 2), values, self._columns(theta))
-
-    def constant_guess(self, theta: Float[Tensor, "L P"]) -> Float[Tensor, "L nodes n"]:
-        """Trajectories that stay at their start, m."""
-        start, _ = self._start(theta, self.network.bind(self.space, theta.unsqueeze(-2)), slopes=False)
-        return start.unsqueeze(1).expand(-1, len(self.experiment.nodes), -1).clone()
 
     def _columns(self, theta: Tensor) -> list[Tensor]:
         """The parameters other than start levels, each (L, 1)."""
@@ -255,12 +233,10 @@ class Collocation:
             moves[column] = q
         return look.along(slopes, moves)
 
-    def _rate_slopes(
-        self, middle: Tensor, theta: Tensor, slopes: bool = False, part: slice = slice(None)
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _rate_slopes(self, middle: Tensor, theta: Tensor, slopes: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         """Rates (L, n, K) at mid-step levels (L, n, K), their slopes by level (L, n, n, K) and by theta (L, n, P, K).
 
-        slopes: whether to differentiate by theta; otherwise P is 0. part: the steps of `middle`.
+        slopes: whether to differentiate by theta; otherwise P is 0.
         """
         reaches_rim = bool((middle[:, : len(self._rims)] >= middle.new_tensor(self._rims).unsqueeze(-1)).any())
         network = self.network if reaches_rim else self._without_overflow
@@ -268,10 +244,10 @@ class Collocation:
         commands, command_slopes, columns = self._commands(values, moving, len(theta))
         found = traced_rates(network, self.space.names)(
             middle,
-            [command[:, part] for command in commands],
+            commands,
             theta,
             network.nominal,
-            self._actuation.clock.part(part),
+            self._actuation.clock,
             driven=[i for i, slopes in enumerate(command_slopes) if slopes is not None],
             moved=self._moved if slopes else [],
         )
@@ -282,7 +258,7 @@ class Collocation:
             course = command_slopes[d]
             assert course is not None
             for q, column in enumerate(columns):
-                by_theta[:, i, self._moving[column]] += slope * course[:, q, part]
+                by_theta[:, i, self._moving[column]] += slope * course[:, q]
         return found.rates, found.by_state, by_theta
 
     def _commands(

@@ -46,23 +46,18 @@ class JointCollocation:
         pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
         return self._joined([part.linearise(columns, piece) for part, columns, piece in pieces])
 
-    def corrected(
-        self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L N m"]
-    ) -> tuple[Float[Tensor, "L N n"], Float[Tensor, " L"]]:
-        """The levels and the defect of `linearise`, without derivatives."""
-        pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
-        corrected = [part.corrected(columns, piece) for part, columns, piece in pieces]
-        return torch.cat([c[0] for c in corrected], dim=1), torch.stack([c[1] for c in corrected]).amax(dim=0)
-
-    def converge(self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L N n"]) -> Linearised:
-        """Newton steps at fixed theta from levels (L, N, tanks), m, until every recording has converged."""
-        pieces = zip(self.parts, self._own(theta), self._split(levels), strict=True)
-        return self._joined([part.converge(columns, piece) for part, columns, piece in pieces])
-
-    def converge_in_segments(self, theta: Float[Tensor, "L P"]) -> Float[Tensor, "L N n"]:
-        """Trajectories, m, by Newton steps on one segment of time after the other."""
+    def converge(self, theta: Float[Tensor, "L P"]) -> Linearised:
+        """The trajectories at theta, with derivatives."""
         pairs = zip(self.parts, self._own(theta), strict=True)
-        return torch.cat([part.converge_in_segments(columns) for part, columns in pairs], dim=1)
+        return self._joined([part.converge(columns) for part, columns in pairs])
+
+    def trajectories(
+        self, theta: Float[Tensor, "L P"], guess: Float[Tensor, "L N n"] | None = None
+    ) -> Float[Tensor, "L N n"]:
+        """The trajectories at theta, m."""
+        guesses = [None] * len(self.parts) if guess is None else self._split(guess)
+        pieces = zip(self.parts, self._own(theta), guesses, strict=True)
+        return torch.cat([part.trajectories(columns, piece) for part, columns, piece in pieces], dim=1)
 
     def simulate_tank(
         self, theta: Float[Tensor, "L P"], levels: Float[Tensor, "L N tanks"], tank: int
@@ -94,11 +89,6 @@ class JointCollocation:
             (part, columns, Linearised(levels, nothing, nothing, nothing, t, g, near.defect, nothing))
             for part, columns, levels, t, g in pieces
         ]
-
-    def constant_guess(self, theta: Float[Tensor, "L P"]) -> Float[Tensor, "L N n"]:
-        """Trajectories that stay at their start levels, (L, N, tanks)."""
-        pairs = zip(self.parts, self._own(theta), strict=True)
-        return torch.cat([part.constant_guess(columns) for part, columns in pairs], dim=1)
 
     def _own(self, theta: Tensor) -> list[Tensor]:
         return [theta[..., columns] for columns in self._columns]

@@ -12,8 +12,9 @@ from torch import Tensor
 from fdi_torch.parameters import by_prefix
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.signals import Clock
-from fdi_torch.simulate.array_program import ArrayProgram
+from fdi_torch.simulate.array_program import ArrayProgram, NewtonControl
 from fdi_torch.simulate.expression import Graph, Varies
+from fdi_torch.simulate.section import Place
 from fdi_torch.simulate.tracer import Tracer
 
 Entry = tuple[int, int]
@@ -73,20 +74,43 @@ class TracedRates:
         """
         lanes, n, steps = state.shape
         slopes = self._slopes(frozenset(driven), frozenset(moved))
+        rates, by_state = state.new_empty(lanes, n, steps), state.new_zeros(lanes, n, n, steps)
+        others = state.new_empty(len(slopes.by_command) + len(slopes.by_parameter), lanes, steps).unbind()
+        into = [*rates.unbind(1), *(by_state[:, i, j] for i, j in slopes.by_state), *others]
+        slopes.program.run(self._inputs(state, commands, theta, nominal, clock), into, lanes, steps)
+        count = len(slopes.by_command)
+        by_command = dict(zip(slopes.by_command, others[:count], strict=True))
+        return RateSlopes(rates, by_state, by_command, dict(zip(slopes.by_parameter, others[count:], strict=True)))
+
+    def solve(
+        self,
+        path: Float[Tensor, "L n K+1"],
+        commands: Sequence[Float[Tensor, "#L K"]],
+        theta: Float[Tensor, "L P"],
+        nominal: Float[Tensor, " constants"],
+        clock: Clock,
+        control: NewtonControl,
+    ) -> bool:
+        """Solve trajectories from their first states by the implicit midpoint rule, in place; False without a
+        compiler."""
+        (lanes, n, _), steps, slopes = path.shape, len(clock.step), self._slopes(frozenset(), frozenset())
+        middle, into = path.new_empty(n, steps), path.new_empty(n + len(slopes.by_state), steps)
+        inputs = self._inputs(middle.expand(lanes, -1, -1), commands, theta, nominal, clock)
+        outputs = into.unsqueeze(1).expand(-1, lanes, -1).unbind()
+        spans = clock.step.contiguous()
+        return slopes.program.solve_trajectories(inputs, middle, outputs, slopes.by_state, spans, path, control)
+
+    def _inputs(
+        self, state: Tensor, commands: Sequence[Tensor], theta: Tensor, nominal: Tensor, clock: Clock
+    ) -> dict[Place, Tensor]:
         inputs = {("state", i): x for i, x in enumerate(state.unbind(1))}
         inputs |= {("command", i): x for i, x in enumerate(commands)}
         inputs |= {("theta", i): x for i, x in enumerate(theta.unbind(-1))}
         inputs |= {("nominal", i): x for i, x in enumerate(nominal.to(state).unsqueeze(-1).unbind())}
         inputs |= {("lifted", i): x for i, x in enumerate(state.new_tensor(self._graph.lifted).unsqueeze(-1).unbind())}
         inputs |= {("clock", 0): clock.start.unsqueeze(0), ("clock", 1): clock.step.unsqueeze(0)}
-        inputs["resolution", 0] = clock.resolution.expand(steps).unsqueeze(0)
-        rates, by_state = state.new_empty(lanes, n, steps), state.new_zeros(lanes, n, n, steps)
-        others = state.new_empty(len(slopes.by_command) + len(slopes.by_parameter), lanes, steps).unbind()
-        into = [*rates.unbind(1), *(by_state[:, i, j] for i, j in slopes.by_state), *others]
-        slopes.program.run(inputs, into, lanes, steps)
-        count = len(slopes.by_command)
-        by_command = dict(zip(slopes.by_command, others[:count], strict=True))
-        return RateSlopes(rates, by_state, by_command, dict(zip(slopes.by_parameter, others[count:], strict=True)))
+        inputs["resolution", 0] = clock.resolution.expand(state.shape[-1]).unsqueeze(0)
+        return inputs
 
     def _slopes(self, driven: frozenset[int], moved: frozenset[int]) -> _Slopes:
         key = driven, moved

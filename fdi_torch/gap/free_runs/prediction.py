@@ -125,8 +125,8 @@ def _run(data: DataSet, start_samples: int, skipped: int) -> Prediction:
         raise ValueError(f"{source}: expected readings among the first {start_samples} samples, got none")
     std = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     fitter = Fitter(replace(data, mask=early), Noise(1e-2 * std, torch.zeros_like(std)))
-    engine, theta, levels = _start_from_segment(fitter, skipped) if skipped else _start_from_samples(fitter, data)
-    run = engine.converge(theta, levels)
+    engine, theta = _start_from_segment(fitter, skipped) if skipped else _start_from_samples(fitter)
+    run = engine.converge(theta)
     readings = run.readings[0]
     residuals = torch.where(data.mask, data.readings - readings, torch.zeros_like(readings))
     rmse = torch.sqrt((residuals[skipped:] ** 2).sum(dim=0) / data.mask[skipped:].sum(dim=0))
@@ -142,22 +142,18 @@ def _run(data: DataSet, start_samples: int, skipped: int) -> Prediction:
     )
 
 
-Start = tuple[Collocation, Tensor, Tensor]
-"""The engine, parameters (1, P) and a guess of the levels (1, K+1, tanks)."""
-
-
-def _start_from_samples(fitter: Fitter, data: DataSet) -> Start:
-    """Initial levels and varying constants from the readings that the fitter sees."""
+def _start_from_samples(fitter: Fitter) -> tuple[Collocation, Tensor]:
+    """The engine, and its parameters (1, P): initial levels and varying constants from the readings that the fitter
+    sees."""
     plant = fitter.data.plant
     engine = _engine(fitter, (), [*(f"{t.name}.start_level" for t in plant.tanks), *plant.varying])
     theta = torch.stack([engine.space.vector(start) for start in _starts(plant, fitter.first_levels())])
-    levels = Fitter(data, fitter.noise).first_trajectory(engine, theta)
-    ends = fitter.descend(engine, theta, levels)
+    ends = fitter.descend(engine, theta)
     best = int(torch.nan_to_num(ends.cost, nan=torch.inf).argmin())
-    return engine, ends.theta[best : best + 1], ends.linearised.levels[best : best + 1]
+    return engine, ends.theta[best : best + 1]
 
 
-def _start_from_segment(fitter: Fitter, samples: int) -> Start:
+def _start_from_segment(fitter: Fitter, samples: int) -> tuple[Collocation, Tensor]:
     """The same from the first samples as an initial segment with unknown inflows."""
     data = fitter.data
     plant = replace(data.plant, tolerances={n: data.plant.tolerances[n] for n in data.plant.varying})
@@ -165,8 +161,7 @@ def _start_from_segment(fitter: Fitter, samples: int) -> Start:
     segment = data_set_of(plant, data.nominal_effects, first, step)
     state = estimate_initial_state(segment, _starts(plant, fitter.first_levels()), fitter.noise)
     engine = _engine(fitter, state.placements, list(state.values))
-    theta = engine.space.vector(state.values).unsqueeze(0)
-    return engine, theta, engine.constant_guess(theta)
+    return engine, engine.space.vector(state.values).unsqueeze(0)
 
 
 def _engine(fitter: Fitter, placements: Sequence[Placement], names: Sequence[str]) -> Collocation:

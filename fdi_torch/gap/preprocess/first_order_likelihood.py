@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.preprocess.blockwise_likelihood import ROUNDS, BlockedRecording, BlockwiseFit, prior_chi_square
-from fdi_torch.gap.trajectory_problem import corrected_trajectories
 
 
 class FirstOrderLikelihood:
@@ -61,5 +60,4 @@ class FirstOrderLikelihood:
             return fit.linearised.readings[0]
         theta, fitter = fit.theta.unsqueeze(0), self.base.fitter.of(corrected.data)
         engine = fitter.engine(fit.candidate, ())
-        levels, _ = corrected_trajectories(engine, theta, fit.linearised.levels, fitter.far)
-        return engine.read(levels, theta)[0]
+        return engine.read(engine.trajectories(theta, fit.linearised.levels), theta)[0]
