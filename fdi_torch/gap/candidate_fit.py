@@ -9,7 +9,7 @@ fitted together with the parameters (`trajectory_problem.py`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -80,17 +80,19 @@ class Fitter:
         base: Fit | None = None,
         target: float = math.inf,
         cap: int = CAP,
+        held: Collection[str] = (),
     ) -> Fit:
         """Fit all starts of a candidate and return the best. Nuisance parameters and trajectory start from `base`.
 
-        target: cost of the competitor; starts that approach it too slowly are given up. cap: most evaluations.
+        target: cost of the competitor; starts that approach it too slowly are given up. cap: most evaluations. held:
+        parameters that keep their initial values.
         """
         by_free: dict[tuple[str, ...], list[Start]] = {}
         for start in self._starts(candidate, base, target):
             by_free.setdefault(start.free, []).append(start)
         fits: list[Fit] = []
         for free, starts in by_free.items():
-            fits.append(self._fit(candidate, free, starts, base, min([target, *(f.cost for f in fits)]), cap))
+            fits.append(self._fit(candidate, free, starts, base, min([target, *(f.cost for f in fits)]), cap, held))
         return min(fits, key=lambda f: f.cost)
 
     def _starts(self, candidate: Candidate, base: Fit | None, target: float) -> list[Start]:
@@ -110,11 +112,12 @@ class Fitter:
         base: Fit | None,
         target: float,
         cap: int,
+        held: Collection[str],
     ) -> Fit:
         engine = self.engine(candidate, free)
         initial = base.values if base else self.first_levels()
         theta = torch.stack([vector_of(engine.space, {**initial, **s.values}) for s in starts])
-        descents = self.descend(engine, theta, target, cap)
+        descents = self.descend(engine, theta, target, cap, held)
         best = int(torch.nan_to_num(descents.cost, nan=torch.inf).argmin())
         lane = slice(best, best + 1)
         linearised = descents.linearised.lanes(torch.tensor([best]))
@@ -139,9 +142,13 @@ class Fitter:
         theta: Tensor,
         target: float = math.inf,
         cap: int = CAP,
+        held: Collection[str] = (),
     ) -> DescentResult:
-        """Least squares from theta (L, P)."""
-        return descend(TrajectoryProblem(self, engine), theta, int(self.data.mask.sum()), target, cap)
+        """Least squares from theta (L, P). held: parameters that keep their values."""
+        problem, fixed = TrajectoryProblem(self, engine), torch.tensor([n in held for n in engine.space.names])
+        low, high, _ = problem.box
+        box = torch.where(fixed, theta, low), torch.where(fixed, theta, high)
+        return descend(problem, theta, int(self.data.mask.sum()), target, cap, box=box)
 
     def normal(
         self, space: ParameterSpace, theta: Tensor, residual: Tensor, jacobian: Tensor, scale: Tensor

@@ -15,6 +15,7 @@ from dataclasses import replace
 import torch
 
 from fdi_torch.estimate.evidence import ODDS, RARE, log_law_error, log_odds_of_law
+from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.cause_hypothesis import (
@@ -32,9 +33,10 @@ from fdi_torch.gap.localization.localized_discrepancy import (
     log_likelihood,
     unexplained_norm,
 )
-from fdi_torch.gap.marginal_likelihood import log_prior, occam, with_disturbances
+from fdi_torch.gap.marginal_likelihood import log_prior, log_width, occam, with_disturbances
 from fdi_torch.gap.screening import Option
 from fdi_torch.gap.structure_search import SearchResult
+from fdi_torch.plant.description import PlantDescription
 
 
 class HypothesisSearch:
@@ -50,6 +52,10 @@ class HypothesisSearch:
         self._evaluated: dict[tuple[int, str], list[CauseHypothesis]] = {}
         self._at_all_places: set[int] = set()
 
+    @property
+    def plant(self) -> PlantDescription:
+        return self.pool.fitter.data.plant
+
     def search(self, result: SearchResult, named: Sequence[CauseHypothesis]) -> list[CauseHypothesis]:
         """All hypotheses that were examined. named: those without a discrepancy."""
         hypotheses = list(named)
@@ -63,7 +69,8 @@ class HypothesisSearch:
             trials += [*alone, *self._climbed(likeliest(alone))]
         hypotheses += self._after_fits_at_unknowns(trials, likeliest(hypotheses).weight)
         least = likeliest(hypotheses).weight + math.log(RARE)
-        return hypotheses + [law for h in hypotheses if h.weight > least for law in self._with_inexact_laws(h)]
+        hypotheses += [law for h in hypotheses if h.weight > least for law in self._with_inexact_laws(h)]
+        return hypotheses + [fewer for h in hypotheses if h.weight > least for fewer in self._without_small_effects(h)]
 
     def alone(self, explanation: RankedExplanation, best: float) -> CauseHypothesis:
         """An explanation without a discrepancy, linearised about the levels that it predicts, where discrepancies are:
@@ -100,8 +107,8 @@ class HypothesisSearch:
         """An explanation with a discrepancy at one place, which may be the error of the law of an effect there."""
         causes = causes_in_order(explanation.fit)
         # A random flow into a tank may stand for the error of any flow there.
-        plant, flow = self.pool.fitter.data.plant, at.noise.apart is not None
-        effects = [c for c in causes if c[1] == at.location or (flow and at.location in tanks_of(c[1], plant))]
+        flow = at.noise.apart is not None
+        effects = [c for c in causes if c[1] == at.location or (flow and at.location in tanks_of(c[1], self.plant))]
         weight = explanation.log_weight + at.gain
         if not effects:
             return [CauseHypothesis(explanation, causes, weight + self._log_odds, at)]
@@ -246,6 +253,31 @@ class HypothesisSearch:
                 law = CauseHypothesis(reduced, others, weight, h.discrepancy, h.inexact)
                 explained += [law, *self._with_inexact_laws(law)]
         return explained
+
+    def _without_small_effects(
+        self, h: CauseHypothesis, left_out: frozenset[CauseName] = frozenset()
+    ) -> list[CauseHypothesis]:
+        """The hypothesis without some of its effects, by the posterior over the prior density of their sizes at zero.
+
+        This ratio is the Bayes factor for the hypothesis without an effect (Dickey, 1971). Beside a discrepancy, a fit
+        without the effect may end in a local maximum instead. left_out: effects that `h` lacks.
+        """
+        fewer: list[CauseHypothesis] = []
+        if (at := h.discrepancy) is None:
+            return fewer
+        for p in at.fit.candidate.placements:
+            cause, name = (p.effect.name, p.location), p.full_name(p.effect.parameters(p.location, self.plant)[0].name)
+            if cause in h.causes and p.location != at.location and name in at.fit.space:
+                i = at.fit.space.index(name)
+                std = float(at.estimate.std[i])
+                z = (float(at.estimate.values[i]) - at.fit.space.parameters[i].nominal) / std
+                ratio = log_width(self.pool.fitter, at.fit.space, i) - math.log(std) - 0.5 * z * z
+                key, without = h.explanation.key - left_out, left_out | {cause}
+                odds = log_prior(key - {cause}, self.pool.choices) - log_prior(key, self.pool.choices)
+                others = tuple(c for c in h.causes if c != cause)
+                reduced = replace(h, causes=others, weight=h.weight + ratio + odds)
+                fewer += [reduced, *self._without_small_effects(reduced, without)]
+        return fewer
 
 
 def _shares(log_odds: Sequence[float]) -> list[float]:

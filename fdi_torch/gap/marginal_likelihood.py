@@ -167,7 +167,7 @@ def occam(fitter: Fitter, space: ParameterSpace, theta: Tensor, jacobian: Tensor
     scale = fitter.box(space)[2]
     j = (jacobian * scale).flatten(0, 1)
     weight = torch.nan_to_num(scale / space.std(theta), posinf=0.0)
-    widths = torch.tensor([_log_width(fitter, space, i) for i in range(len(space))], dtype=torch.float64)
+    widths = torch.tensor([log_width(fitter, space, i) for i in range(len(space))], dtype=torch.float64)
     return -0.5 * log_det(j.T @ j + torch.diag(weight**2)) + float((torch.log(scale) - widths).sum())
 
 
@@ -177,7 +177,7 @@ def log_prior(causes: Iterable[CauseName], choices: int) -> float:
     return prior_of_set(len(causes), len({place for _, place in causes}), choices)
 
 
-def _log_width(fitter: Fitter, space: ParameterSpace, i: int) -> float:
+def log_width(fitter: Fitter, space: ParameterSpace, i: int) -> float:
     """Log width of a parameter's prior over sqrt(2 pi), in the parameter's unit."""
     p = space.parameters[i]
     if math.isfinite(p.std):

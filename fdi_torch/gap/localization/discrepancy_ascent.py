@@ -13,7 +13,12 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_columns import Discrepancy
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.fine_positions import CONVERGED, Positions, with_best_frequency
-from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy, log_likelihood, unexplained_norm
+from fdi_torch.gap.localization.localized_discrepancy import (
+    Estimate,
+    LocalizedDiscrepancy,
+    log_likelihood,
+    unexplained_norm,
+)
 from fdi_torch.gap.localization.single_regressor_gain import largest_influence
 from fdi_torch.gap.localization.sparse_regression import SparseFit, column_costs
 from fdi_torch.gap.localization.whitened_discrepancy import WhitenedDiscrepancy
@@ -57,6 +62,7 @@ class EvaluatedDiscrepancy:
     def localized(self, fitter: Fitter) -> LocalizedDiscrepancy:
         """The result. fitter: that of the explanation, whose sensor noise is the unit of the size."""
         explained, at, used, fit = self.explained, self.discrepancy, self.regressed.used, self.regression.fit
+        precision = self.regressed.precision[used]
         size = unexplained_norm(fitter, fit.space, fit.theta, fit.linearised.jacobian[0], explained)
         return LocalizedDiscrepancy(
             self.location,
@@ -69,6 +75,7 @@ class EvaluatedDiscrepancy:
             at.frequency,
             fit,
             self.noise,
+            Estimate.beside(self.under, fit, at.linearised, at.columns[used], precision),
         )
 
 
@@ -125,9 +132,7 @@ class Ascent:
                 best = max(best, self._with_finer_frequency(best), key=gain_of)
             if best.gain < SHARE * (needed - best.gain):
                 break
-            # An effect at the place keeps its parameters: the discrepancy is then the error of its law.
-            if all(p.location != best.location for p in self.fit.candidate.placements):
-                best = max(best, self._refitted(best), key=gain_of)
+            best = max(best, self._refitted(best), key=gain_of)
             if best.gain - before < max(CONVERGED, SHARE * (needed - best.gain)):
                 break
         return best
@@ -165,8 +170,13 @@ class Ascent:
         return self.evaluate(current.regression, at, current.location, likely, current.regressed.precision)
 
     def _refitted(self, current: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
-        """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew."""
+        """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew.
+
+        An effect at the place keeps its parameters: the discrepancy is the error of its law.
+        """
         data, fit = self.fitter.data, current.regression.fit
         corrected = replace(data, readings=data.readings - current.explained)
-        new = current.under.of(corrected).fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit)
+        held = fit.values_of([p for p in fit.candidate.placements if p.location == current.location])
+        candidate = Candidate(fit.candidate.placements, (fit.effect_values,))
+        new = current.under.of(corrected).fit(candidate, fit, held=held)
         return self.about(new, current.explained, current.noise, current.location, current.discrepancy.frequency)

@@ -19,6 +19,25 @@ from fdi_torch.simulate.linearised import Linearised
 
 
 @dataclass(frozen=True)
+class Estimate:
+    """Most likely values (P,) of a fit's parameters, and their standard errors (P,)."""
+
+    values: Tensor
+    std: Tensor
+
+    @staticmethod
+    def beside(under: Fitter, fit: Fit, linearised: Linearised, columns: Tensor, precision: Tensor) -> Estimate:
+        """To first order, beside coefficients of columns (S, C, M) with normal priors of this precision (M,)."""
+        residual, jacobian = (x[0] for x in under.white(linearised))
+        scale, pull, off = under.priors(fit.space, fit.theta)
+        rows = torch.cat([jacobian * scale, under.whiten(columns)], dim=-1).flatten(0, 1)
+        basis, factor = decomposed(rows, torch.cat([pull, precision.sqrt()]))
+        inverse = torch.linalg.solve_triangular(factor, torch.eye(len(factor)).to(factor), upper=True)[: len(scale)]
+        right = torch.cat([residual.flatten(), -off, torch.zeros_like(precision)])
+        return Estimate(fit.theta + scale * (inverse @ (basis.T @ right)), scale * inverse.norm(dim=1))
+
+
+@dataclass(frozen=True)
 class LocalizedDiscrepancy:
     """A discrepancy at one component, in addition to a fit.
 
@@ -26,7 +45,7 @@ class LocalizedDiscrepancy:
     by this number of parameters. explained: its influence on the readings (S, C); none of a random process.
     predicted (S, C): the readings with it; None of a random process. size: norm of the part of it that no parameter of
     the fit explains, in units of the sensor noise. frequency: of its sinusoids, Hz, if any. fit, noise: the fit
-    refitted, and the most likely disturbance noise, with the discrepancy.
+    refitted, and the most likely disturbance noise, with the discrepancy. estimate: of the fit's parameters beside it.
     """
 
     location: str
@@ -39,6 +58,7 @@ class LocalizedDiscrepancy:
     frequency: float | None
     fit: Fit
     noise: StateNoise
+    estimate: Estimate
 
     @property
     def periods(self) -> tuple[float, ...]:

@@ -18,9 +18,11 @@ import torch
 from fdi_torch.estimate.evidence import RARE
 from fdi_torch.estimate.kalman import SCATTER, StateNoise, Wander
 from fdi_torch.estimate.state_noise import CORRELATION_TIMES, LOG_BOUND
+from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.localized_discrepancy import (
+    Estimate,
     LocalizedDiscrepancy,
     is_rounding_error,
     log_evidence,
@@ -51,8 +53,9 @@ def random_flows(
 
     def evaluate(apart: StateNoise) -> LocalizedDiscrepancy:
         gain = log_evidence(fitter, fit, apart, linearised) - base - cost
-        size = _moved(with_disturbances(fitter, fit, apart, linearised), linearised)
-        return LocalizedDiscrepancy(tank, gain, gain + cost, 1, nothing, None, size, None, fit, apart)
+        under = with_disturbances(fitter, fit, apart, linearised)
+        size, estimate = _moved(under, linearised), _estimate(under, fit, linearised)
+        return LocalizedDiscrepancy(tank, gain, gain + cost, 1, nothing, None, size, None, fit, apart, estimate)
 
     return [_most_likely(regression, linearised, evaluate, replace(noise, apart=largest), needed)]
 
@@ -76,6 +79,11 @@ def _most_likely(
     return max(first, climbed, key=lambda d: d.gain)
 
 
+def _estimate(under: Fitter, fit: Fit, linearised: Linearised) -> Estimate:
+    nothing = linearised.readings.new_zeros(*linearised.readings.shape[1:], 0)
+    return Estimate.beside(under, fit, linearised, nothing, nothing.new_zeros(0))
+
+
 def _moved(fitter: Fitter, linearised: Linearised) -> float:
     """Norm of the change of the readings by the disturbances, in units of the sensor noise."""
     whitening, plant = fitter.whitening, fitter.data.plant
@@ -95,10 +103,12 @@ def drifting_sensors(
     def evaluate(noise: StateNoise) -> LocalizedDiscrepancy:
         assert noise.wander is not None
         sensor = fitter.data.plant.sensors[noise.wander.channel].name
-        gain = log_evidence(fitter, fit, noise, regression.at(sensor)[1]) - base
+        linearised = regression.at(sensor)[1]
+        gain = log_evidence(fitter, fit, noise, linearised) - base
         cost = _drift_cost(fitter, noise.wander)
         nothing, size = torch.zeros_like(fitter.data.readings), _drift_size(fitter, noise.wander)
-        return LocalizedDiscrepancy(sensor, gain - cost, gain, 2, nothing, None, size, None, fit, noise)
+        estimate = _estimate(with_disturbances(fitter, fit, noise, linearised), fit, linearised)
+        return LocalizedDiscrepancy(sensor, gain - cost, gain, 2, nothing, None, size, None, fit, noise, estimate)
 
     starts = [
         _initial_drift(fitter, regression.at(p)[1], nearly_without_disturbances(noise), channel)

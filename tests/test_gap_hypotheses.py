@@ -1,0 +1,80 @@
+"""Hypotheses with a discrepancy: without effects that they do not need, and with parameters that fit beside it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.effects import effect
+from fdi_torch.gap.candidate import Candidate, Fit
+from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.cause_hypothesis import CauseHypothesis, causes_in_order
+from fdi_torch.gap.diagnose import recalibrate
+from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
+from fdi_torch.gap.hypothesis_search import HypothesisSearch
+from fdi_torch.gap.localization.localized_discrepancy import Estimate, LocalizedDiscrepancy
+from fdi_torch.gap.marginal_likelihood import log_evidence
+from fdi_torch.gap.problem import PLAIN, problem_of
+from fdi_torch.plant.effect import Placement
+from tests.rigs import random_steps
+from tests.test_gap_convergence import recorded
+
+THREE_TANK = load_plant("three_tank")
+GAIN, BIAS = Placement(effect("sensor_gain"), "h1"), Placement(effect("sensor_bias"), "h3")
+CHOICES = 60
+
+
+def hypothesis_of(fitter: Fitter, fit: Fit) -> CauseHypothesis:
+    """A fit beside a discrepancy at a pipe that explains nothing."""
+    nothing = fitter.data.readings.new_zeros(*fitter.data.readings.shape, 0)
+    estimate = Estimate.beside(fitter, fit, fit.linearised, nothing, nothing.new_zeros(0))
+    discrepancy = SimpleNamespace(location="P13", fit=fit, estimate=estimate)
+    evidence = log_evidence(fitter, fit, CHOICES)
+    explanation = SimpleNamespace(fit=fit, key=fit.key, log_evidence=evidence)
+    return CauseHypothesis(
+        cast(RankedExplanation, explanation),
+        causes_in_order(fit),
+        evidence,
+        cast(LocalizedDiscrepancy, discrepancy),
+    )
+
+
+@pytest.fixture(scope="module")
+def sound() -> tuple[Fitter, Fit]:
+    recording = recorded(THREE_TANK, random_steps(THREE_TANK, 600.0), {}, seed=0)
+    return recalibrate(problem_of(THREE_TANK, [recording], [], PLAIN).data)[:2]
+
+
+def test_the_density_ratio_at_zero_is_the_ratio_of_evidences(sound: tuple[Fitter, Fit]) -> None:
+    """Effects of no size on a sound rig, each alone, and both."""
+    fitter, null = sound
+    both = fitter.fit(Candidate((GAIN, BIAS), ({"h1.sensor_gain.factor": 1.01, "h3.sensor_bias.bias": 1e-3},)), null)
+    pool = cast(ExplanationPool, SimpleNamespace(fitter=fitter, choices=CHOICES))
+    h = hypothesis_of(fitter, both)
+    fewer = {r.causes: r.weight for r in HypothesisSearch(pool, (), ("P13",))._without_small_effects(h)}
+    for placements in [(GAIN,), (BIAS,), ()]:
+        start = {k: v for k, v in both.effect_values.items() if any(k.startswith(p.prefix) for p in placements)}
+        fit = fitter.fit(Candidate(placements, (start,)), null)
+        expected = log_evidence(fitter, fit, CHOICES)
+        assert fewer[causes_in_order(fit)] == pytest.approx(expected, abs=0.2)
+        assert expected > h.weight + 3.0
+
+
+def test_an_effect_that_the_readings_need_is_not_left_out() -> None:
+    recording = recorded(THREE_TANK, random_steps(THREE_TANK, 600.0), {"h1.sensor_gain.factor": 1.05}, seed=0)
+    fitter, null, _ = recalibrate(problem_of(THREE_TANK, [recording], [], PLAIN).data)
+    h = hypothesis_of(fitter, fitter.fit(Candidate((GAIN,), ({"h1.sensor_gain.factor": 1.01},)), null))
+    pool = cast(ExplanationPool, SimpleNamespace(fitter=fitter, choices=CHOICES))
+    assert all(r.weight < h.weight - 20.0 for r in HypothesisSearch(pool, (), ("P13",))._without_small_effects(h))
+
+
+def test_held_parameters_keep_their_values_and_the_others_are_fitted(sound: tuple[Fitter, Fit]) -> None:
+    fitter, null = sound
+    name = "h1.sensor_gain.factor"
+    held = fitter.fit(Candidate((GAIN,), ({name: 1.05},)), null, held=(name,))
+    assert held.values[name] == 1.05 and held.converged
+    moved = [n for n in null.space.names if abs(held.values[n] - null.values[n]) > 1e-3 * abs(null.values[n])]
+    assert moved and held.cost > null.cost + 10.0
