@@ -19,6 +19,7 @@ from fdi_torch.blind.case_drafts import plans
 from fdi_torch.blind.cases import Case
 from fdi_torch.blind.plants import three_tank
 from fdi_torch.blind.score import by_effect, judge, summary, utility
+from fdi_torch.blind.score_tables import OWN, misses
 from fdi_torch.blind.scored_rows import joined, reliability, tables, write_rows
 from fdi_torch.blind.sealed_files import manifest, open_key, read_plant, read_recording, write_cases
 from fdi_torch.blind.sizes import size_errors, sizes
@@ -251,6 +252,13 @@ def test_something_unknown_beside_a_cause_is_no_pair_of_effect_and_place() -> No
         for causes in ([LAG, unknown], [LAG])
     )
     assert judged("single", [LAG], with_it)["utility"] == judged("single", [LAG], without)["utility"] == 1.0
+
+
+def test_a_wrong_answer_is_listed_with_the_law_of_its_unknown() -> None:
+    truth = [LAG, {"effect": "unknown", "location": "P13", "really": "siphon"}]
+    about = {"by": OWN, "rig": "three_tank", "seed": 1, "case": "case1"}
+    (row,) = misses([judged("mixed", truth, named(LEAK)) | about]).rows
+    assert "siphon at P13" in row[4] and "pump_lag at Q1" in row[4]
 
 
 def test_unknown_counts_at_its_place_only() -> None:

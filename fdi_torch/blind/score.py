@@ -65,6 +65,7 @@ def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> 
         "kind": kind,
         "truth": true,
         "effect": truth["causes"][0].get("really", true[0][0]) if true else "none",
+        "law": next((c["really"] for c in truth["causes"] if "really" in c), None),
         "verdict": verdict,
         "causes": causes,
         "set_size": len(sets),

@@ -105,7 +105,8 @@ def listed(causes: Iterable[Sequence[str]]) -> str:
 
 def _truth(row: Row) -> str:
     """True causes; laws outside the library by their own name."""
-    return listed((row["effect"] if e == "unknown" else e, p) for e, p in row["truth"]) or "nothing"
+    law = row.get("law") or row["effect"]  # older logs have the latter only
+    return listed((law if e == "unknown" else e, p) for e, p in row["truth"]) or "nothing"
 
 
 def markdown(scores: Tables, rows: Sequence[Row]) -> str:
