@@ -40,6 +40,7 @@ from fdi_torch.monitor.observer_gain import hand_gain
 from fdi_torch.monitor.samples import ClockState, Samples, samples_of_recording, split_at_gaps, usual_interval
 from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.parameters import ParameterName, ParameterSpace
+from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.equilibrium import equilibrium
@@ -70,21 +71,29 @@ def constant_parts(truth: Truth, samples: int) -> Iterator[tuple[Tensor, int, in
 
 
 def recorded(
-    truth: Truth, samples: int, network=NETWORK, space: ParameterSpace = SPACE, std: Tensor | float = STD, seed: int = 0
-) -> Samples:  # type: ignore[no-untyped-def]
-    """One run whose parameters follow `truth` (s -> values of the space)."""
+    truth: Truth,
+    samples: int,
+    network: TankNetwork = NETWORK,
+    space: ParameterSpace = SPACE,
+    std: Tensor | float = STD,
+    seed: int = 0,
+    inputs: Tensor = INPUTS,
+) -> Samples:
+    """One run whose parameters follow `truth` (s -> values of the space). inputs: (2,) or (samples, 2)."""
+    inputs = inputs.expand(samples, 2)
     starts = [f"{tank.name}.start_level" for tank in PLANT.tanks]
     whole = ParameterSpace(network.constants[name] for name in [*space.names, *starts])
     levels, clean = REST, torch.empty(samples, 3, dtype=torch.float64)
     for theta, first, last in constant_parts(truth, samples):
-        time = torch.arange(max(first - 1, 0), last, dtype=torch.float64)
-        experiment = lay_out(blank_recording(PLANT, INPUTS.expand(len(time), 2), time), PLANT.channels(), 1.0)
+        begin = max(first - 1, 0)
+        time = torch.arange(begin, last, dtype=torch.float64)
+        experiment = lay_out(blank_recording(PLANT, inputs[begin:last], time), PLANT.channels(), 1.0)
         engine, values = CompiledEngine(network, whole, experiment), torch.cat([theta, levels])
         clean[first:last] = engine.readings(values)[first - last :]
         levels = engine.levels(values)[-1]
     generator = torch.Generator().manual_seed(seed)
     noisy = clean + std * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
-    return Samples(torch.arange(samples, dtype=torch.float64), INPUTS.expand(samples, 2), noisy)
+    return Samples(torch.arange(samples, dtype=torch.float64), inputs, noisy)
 
 
 def from_rest(samples: Samples) -> ObserverWindow:
