@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 import torch
+from scipy.stats import poisson
 from torch import Tensor
 
 from fdi_torch.config.plant_file import load_plant
@@ -147,6 +149,21 @@ def test_the_stated_error_of_sums_is_that_of_many_calibrations() -> None:
         deviations.append(0.5 * torch.log(blocks.square().mean(0) / 20.0) / noise.whitening.error_of_sums(20))
     # 36 values, three of which are of one calibration.
     assert 0.7 < float(torch.stack(deviations).square().mean().sqrt()) < 1.4
+
+
+def test_the_start_tells_how_many_false_alarms_are_possible_if_one_is_expected() -> None:
+    """If the noise is known, 0 to 3 by the Poisson distribution; if 600 samples determine it, more."""
+    noise, _ = learn_noise(NETWORK, disturbed(15.0, 600))
+    known = replace(noise.whitening, samples=10**9, slow_error=torch.zeros(3, dtype=torch.float64), flows=None)
+    most = []
+    for whitening in (known, noise.whitening):
+        detector = make_detector("cusum", 20_000.0, 1.0, 3, torch.Generator().manual_seed(0), learnt=whitening)
+        text = false_alarm_rate_text(replace(noise, whitening=whitening), detector, 20_000.0)
+        found = re.search(r"expect one false alarm in 20000 s \(95 %: 0 to (\d+)\)", text)
+        assert found is not None
+        most.append(int(found[1]))
+    assert most[0] == poisson.ppf(0.975, 1.0)
+    assert most[1] > most[0]
 
 
 def test_without_a_compiler_the_start_tells_what_is_not_modelled(monkeypatch: pytest.MonkeyPatch) -> None:
