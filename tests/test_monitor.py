@@ -151,6 +151,22 @@ def test_a_fault_is_detected_isolated_and_sized_with_its_onset(name: str, size: 
     assert abs(found.onset - 199.5) < 0.5 + 4 * found.onset_std
 
 
+def test_a_leak_is_told_with_the_flow_that_it_has_now() -> None:
+    """0.05 times C_d A sqrt(2 g h) of pipe P13, to which a leak of T3 refers."""
+    samples = recorded(step_to("T3.leak.size", 0.05, 200.0), 320)
+    state, events = followed(monitor(), samples)
+    pipe = next(pipe for pipe in PLANT.pipes if pipe.name == "P13")
+    full = pipe.discharge_coefficient * pipe.area * (2.0 * PLANT.gravity) ** 0.5
+    found = next(event for event in events if event.kind == "isolated")
+    level = float(samples.readings[int(found.time) - 5 : int(found.time) + 5, 2].mean())
+    [size] = found.explanations[0].sizes
+    assert size.flow == pytest.approx(size.size * full * level**0.5, rel=2e-3)
+    assert f", {1e6 * size.flow:.3g} cm^3/s now), since" in found.text
+    assert found.to_dict()["explanations"][0]["sizes"][0]["flow"] == size.flow
+    [summary] = monitor().close(state)
+    assert " cm^3/s now)" in summary.text
+
+
 @pytest.mark.parametrize("period", [(1, 2, 1), (1, 1, 10)])
 def test_sensors_may_have_different_rates_and_never_be_read_together(period: tuple[int, ...]) -> None:
     """Half the readings: standard errors are larger by their square root, no more and no less."""

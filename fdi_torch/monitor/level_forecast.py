@@ -1,4 +1,4 @@
-"""Forecast of overflow and dry tanks if nothing changes, by Monte Carlo simulation from the monitor's present state.
+"""Forecast of overflow and dry tanks if the inputs keep their recent mean, by Monte Carlo simulation.
 
 The draws are spread over the explanations in proportion to their probability, with sizes drawn from their standard
 deviations, and start from the levels that each explanation implies. The inputs keep their recent average, faults that
