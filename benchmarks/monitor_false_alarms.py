@@ -86,6 +86,7 @@ def main() -> None:
     parser.add_argument("--calibrations", type=int, default=4, help="of each kind, loop and learning time")
     parser.add_argument("--lasts", type=float, default=40000.0, help="test after learning, s")
     parser.add_argument("--every", type=float, default=20000.0)
+    parser.add_argument("--correlation", type=float, default=0.0, help="of neighbouring values of the sensors' noise")
     parser.add_argument("--cases", type=Path, help="folder of practice data")
     a = parser.parse_args()
     if a.cases is not None:
@@ -94,7 +95,17 @@ def main() -> None:
     plant = load_plant("three_tank")
     cells = [(k, closed, learn) for k in KINDS for closed in (True, False) for learn in LEARN]
     cases = [
-        Case("", 0.0, k, learn, math.inf, learn + a.lasts, closed, 100000 * a.seed + 100 * i + j)
+        Case(
+            "",
+            0.0,
+            k,
+            learn,
+            math.inf,
+            learn + a.lasts,
+            closed,
+            100000 * a.seed + 100 * i + j,
+            correlation=a.correlation,
+        )
         for i, (k, closed, learn) in enumerate(cells)
         for j in range(a.calibrations)
     ]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.signal import lfilter
 
 from fdi_torch.blind.control import Controller, LevelControl
 from fdi_torch.blind.deviation import Array
@@ -42,6 +43,7 @@ class Case:
     """One recording. fault: a key of SIZES, empty for none. ramp: duration of its growth, s; 0 if abrupt. learn: s.
 
     share: of the usual size. pumps: flows asked for after the learning part, m^3/s, instead of the usual commands.
+    correlation: of neighbouring values of the sensors' noise.
     """
 
     fault: str
@@ -54,6 +56,7 @@ class Case:
     seed: int
     share: float = 1.0
     pumps: tuple[float, float] | None = None
+    correlation: float = 0.0
 
     @property
     def name(self) -> str:
@@ -76,7 +79,9 @@ def recordings(cases: Sequence[Case], step: float = STEP) -> list[tuple[Recordin
     sensors, drives = [], []
     for case, rng in zip(cases, draws, strict=True):
         samples = int(case.lasts) + 1
-        error = NOISE * rng.normal(size=(samples, 3)) + _sensor_fault(case, "sensor_bias", samples)
+        shocks = (1.0 - case.correlation**2) ** 0.5 * rng.normal(size=(samples, 3))
+        noise = NOISE * lfilter([1.0], [1.0, -case.correlation], shocks, axis=0)
+        error = noise + _sensor_fault(case, "sensor_bias", samples)
         sensors.append((1.0 + _sensor_fault(case, "sensor_gain", samples), error))
         drives.append(_drive(case, rng, samples, *sensors[-1]))
     runs = simulate(rigs, drives, step)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 import torch
+from scipy.signal import lfilter
+from scipy.stats import poisson
 from torch import Tensor
 
 from fdi_torch.config.plant_file import load_plant
@@ -86,17 +89,24 @@ def test_sums_of_the_white_residual_spread_like_those_of_white_noise(correlation
     assert spread_of_sums(white).tolist() == pytest.approx([1.0] * 3, abs=4.0 * math.hypot(0.11, 0.06))
 
 
-def test_correlated_noise_of_sensors_is_not_taken_for_random_flows() -> None:
-    """AR(1) noise of 0.7. As flows, it would leave sums whose spread is a third of that of white noise."""
-    still, keep = disturbed(None, 3 * LEARN), 0.7
-    shocks = math.sqrt(1.0 - keep**2) * (still.readings - disturbed_levels()[-1])
-    noise = torch.zeros_like(shocks)
-    for k in range(1, len(noise)):
-        noise[k] = keep * noise[k - 1] + shocks[k]
-    samples = replace(still, readings=disturbed_levels()[-1] + noise)
+@pytest.mark.parametrize("correlation_time", [None, 1.0, 150.0])
+def test_correlated_noise_of_sensors_is_not_taken_for_random_flows(correlation_time: float | None) -> None:
+    """AR(1) noise of 0.7, alone or beside flows. As flows, it would leave sums whose spread is a third of that of white
+    noise; as part of an autoregression beside slow flows, sums with twice the spread.
+    """
+    whole, keep = disturbed(correlation_time, 3 * LEARN), 0.7
+    lane = -1 if correlation_time is None else CORRELATION_TIMES.index(correlation_time)
+    levels = disturbed_levels()[lane, : 3 * LEARN]
+    shocks = math.sqrt(1.0 - keep**2) * (whole.readings - levels)
+    noise = torch.from_numpy(lfilter([1.0], [1.0, -keep], shocks.numpy(), axis=0))
+    samples = replace(whole, readings=levels + noise)
     learnt, _ = learn_noise(NETWORK, samples.segment(0, LEARN))
-    white = learnt.whitening(Observer(NETWORK, learnt.gain).run(samples).steady_residual)[LEARN:]
-    assert learnt.whitening.flows is None
+    white, flows = (
+        learnt.whitening(Observer(NETWORK, learnt.gain).run(samples).steady_residual)[LEARN:],
+        learnt.whitening.flows,
+    )
+    assert flows is not None and flows.correlation == keep
+    assert flows.reading_std.tolist() == pytest.approx([STD] * 3, rel=0.1)
     assert white.std(dim=0).tolist() == pytest.approx([1.0] * 3, abs=0.1)
     assert spread_of_sums(white).tolist() == pytest.approx([1.0] * 3, abs=4.0 * math.hypot(0.11, 0.06))
 
@@ -149,6 +159,21 @@ def test_the_stated_error_of_sums_is_that_of_many_calibrations() -> None:
     assert 0.7 < float(torch.stack(deviations).square().mean().sqrt()) < 1.4
 
 
+def test_the_start_tells_how_many_false_alarms_are_possible_if_one_is_expected() -> None:
+    """If the noise is known, 0 to 3 by the Poisson distribution; if 600 samples determine it, more."""
+    noise, _ = learn_noise(NETWORK, disturbed(15.0, 600))
+    known = replace(noise.whitening, samples=10**9, slow_error=torch.zeros(3, dtype=torch.float64), flows=None)
+    most = []
+    for whitening in (known, noise.whitening):
+        detector = make_detector("cusum", 20_000.0, 1.0, 3, torch.Generator().manual_seed(0), learnt=whitening)
+        text = false_alarm_rate_text(replace(noise, whitening=whitening), detector, 20_000.0)
+        found = re.search(r"expect one false alarm in 20000 s \(95 %: 0 to (\d+)\)", text)
+        assert found is not None
+        most.append(int(found[1]))
+    assert most[0] == poisson.ppf(0.975, 1.0)
+    assert most[1] > most[0]
+
+
 def test_without_a_compiler_the_start_tells_what_is_not_modelled(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = disturbed(15.0, 600)
 
@@ -177,10 +202,11 @@ def test_innovations_do_not_depend_on_the_gain_of_the_observer() -> None:
     assert float((whites[0] - whites[1]).square().mean().sqrt()) < 0.02 * float(whites[0].square().mean().sqrt())
 
 
-def test_filtering_in_parts_gives_the_same_innovations_to_the_last_bit() -> None:
+@pytest.mark.parametrize("correlation", [0.0, 0.7])
+def test_filtering_in_parts_gives_the_same_innovations_to_the_last_bit(correlation: float) -> None:
     noise, seen = learn_noise(NETWORK, disturbed(15.0, 600))
-    residual, flows = seen.steady_residual, noise.whitening.flows
-    assert flows is not None
+    assert noise.whitening.flows is not None
+    residual, flows = seen.steady_residual, replace(noise.whitening.flows, correlation=correlation)
     residual[50, 1] = torch.nan
     whole, path = flows(residual)
     first, memory = flows(residual[:70])
@@ -202,6 +228,8 @@ def test_shocks_that_add_up_over_samples_have_the_covariance_of_the_recursion() 
     flows = learn_noise(NETWORK, disturbed(15.0, 400))[0].whitening.flows
     assert flows is not None
     transition, total = torch.eye(6, dtype=torch.float64), torch.zeros(6, 6, dtype=torch.float64)
+    correlated = replace(flows, correlation=0.7)
+    assert all(torch.equal(a, b) for a, b in zip(flows.over(5), correlated.over(5), strict=True))
     for count in range(1, 8):
         transition = flows.transition @ transition
         total = flows.transition @ total @ flows.transition.mT + torch.diag(flows.process_std**2)

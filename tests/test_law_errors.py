@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch import Tensor
 
 from fdi_torch.estimate.evidence import ODDS
 from fdi_torch.monitor.law_errors import SIZE_ERROR, LawErrors
 from fdi_torch.parameters import ParameterSpace
-from tests.test_monitor import NETWORK, SPACE, followed, monitor, recorded
+from tests.test_monitor import INPUTS, NETWORK, SPACE, followed, monitor, recorded
 
 DTYPE = torch.float64
 
@@ -57,3 +58,36 @@ def test_the_detector_gets_residuals_without_the_error_of_a_known_law() -> None:
 def test_a_detector_beside_no_known_fault_gets_the_white_residuals() -> None:
     state, _ = followed(monitor(), recorded(lambda t: SPACE.nominal(), 100))
     assert torch.equal(state.white, state.tested)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("bias", [0.0, 5e-3])
+def test_the_end_of_a_fault_shows_as_soon_as_its_pump_runs_again_even_if_another_fault_came_meanwhile(
+    bias: float, seed: int
+) -> None:
+    """Pump Q2 delivers 80 % until 400 s, and rests from 300 to 460 s."""
+    inputs = INPUTS.repeat(520, 1)
+    inputs[300:460, 1] = 0.0
+
+    def truth(time: float) -> Tensor:
+        gain = 0.8 if 100.0 <= time < 400.0 else 1.0
+        return SPACE.vector({"Q2.pump_gain.factor": gain, "h3.sensor_bias.bias": bias if time >= 340.0 else 0.0})
+
+    _, events = followed(monitor(), recorded(truth, 520, seed=seed, inputs=inputs))
+    assert any(event.kind == "alarm" and 460.0 < event.time <= 470.0 for event in events)
+    ended = next(event for event in events if event.kind == "recovered")
+    assert ended.alarm == 1 and ended.time <= 510.0
+    assert ended.onset is not None and ended.onset_std is not None
+    assert abs(ended.onset - 400.0) <= 3.0**0.5 * ended.onset_std, "it ended while the pump rested"
+
+
+@pytest.mark.parametrize("known", ["", "T1.leak.size"])
+def test_a_fault_is_detected_as_soon_beside_a_known_one_as_alone(known: str) -> None:
+    """5 mm are five standard deviations of the noise."""
+
+    def truth(time: float) -> Tensor:
+        leak = {known: 0.1} if known and time >= 100.0 else {}
+        return SPACE.vector({**leak, "h3.sensor_bias.bias": 5e-3 if time >= 340.0 else 0.0})
+
+    _, events = followed(monitor(), recorded(truth, 400))
+    assert next(event.time for event in events if event.kind == "alarm" and event.time > 320.0) <= 344.0

@@ -40,6 +40,7 @@ from fdi_torch.monitor.observer_gain import hand_gain
 from fdi_torch.monitor.samples import ClockState, Samples, samples_of_recording, split_at_gaps, usual_interval
 from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.parameters import ParameterName, ParameterSpace
+from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.equilibrium import equilibrium
@@ -70,21 +71,29 @@ def constant_parts(truth: Truth, samples: int) -> Iterator[tuple[Tensor, int, in
 
 
 def recorded(
-    truth: Truth, samples: int, network=NETWORK, space: ParameterSpace = SPACE, std: Tensor | float = STD, seed: int = 0
-) -> Samples:  # type: ignore[no-untyped-def]
-    """One run whose parameters follow `truth` (s -> values of the space)."""
+    truth: Truth,
+    samples: int,
+    network: TankNetwork = NETWORK,
+    space: ParameterSpace = SPACE,
+    std: Tensor | float = STD,
+    seed: int = 0,
+    inputs: Tensor = INPUTS,
+) -> Samples:
+    """One run whose parameters follow `truth` (s -> values of the space). inputs: (2,) or (samples, 2)."""
+    inputs = inputs.expand(samples, 2)
     starts = [f"{tank.name}.start_level" for tank in PLANT.tanks]
     whole = ParameterSpace(network.constants[name] for name in [*space.names, *starts])
     levels, clean = REST, torch.empty(samples, 3, dtype=torch.float64)
     for theta, first, last in constant_parts(truth, samples):
-        time = torch.arange(max(first - 1, 0), last, dtype=torch.float64)
-        experiment = lay_out(blank_recording(PLANT, INPUTS.expand(len(time), 2), time), PLANT.channels(), 1.0)
+        begin = max(first - 1, 0)
+        time = torch.arange(begin, last, dtype=torch.float64)
+        experiment = lay_out(blank_recording(PLANT, inputs[begin:last], time), PLANT.channels(), 1.0)
         engine, values = CompiledEngine(network, whole, experiment), torch.cat([theta, levels])
         clean[first:last] = engine.readings(values)[first - last :]
         levels = engine.levels(values)[-1]
     generator = torch.Generator().manual_seed(seed)
     noisy = clean + std * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
-    return Samples(torch.arange(samples, dtype=torch.float64), INPUTS.expand(samples, 2), noisy)
+    return Samples(torch.arange(samples, dtype=torch.float64), inputs, noisy)
 
 
 def from_rest(samples: Samples) -> ObserverWindow:
@@ -140,6 +149,22 @@ def test_a_fault_is_detected_isolated_and_sized_with_its_onset(name: str, size: 
     assert found.onset is not None and found.onset_std is not None
     assert abs(found.sizes[0] - size) < 4 * found.stds[0]
     assert abs(found.onset - 199.5) < 0.5 + 4 * found.onset_std
+
+
+def test_a_leak_is_told_with_the_flow_that_it_has_now() -> None:
+    """0.05 times C_d A sqrt(2 g h) of pipe P13, to which a leak of T3 refers."""
+    samples = recorded(step_to("T3.leak.size", 0.05, 200.0), 320)
+    state, events = followed(monitor(), samples)
+    pipe = next(pipe for pipe in PLANT.pipes if pipe.name == "P13")
+    full = pipe.discharge_coefficient * pipe.area * (2.0 * PLANT.gravity) ** 0.5
+    found = next(event for event in events if event.kind == "isolated")
+    level = float(samples.readings[int(found.time) - 5 : int(found.time) + 5, 2].mean())
+    [size] = found.explanations[0].sizes
+    assert size.flow == pytest.approx(size.size * full * level**0.5, rel=2e-3)
+    assert f", {1e6 * size.flow:.3g} cm^3/s now), since" in found.text
+    assert found.to_dict()["explanations"][0]["sizes"][0]["flow"] == size.flow
+    [summary] = monitor().close(state)
+    assert " cm^3/s now)" in summary.text
 
 
 @pytest.mark.parametrize("period", [(1, 2, 1), (1, 1, 10)])

@@ -19,8 +19,7 @@ from fdi_torch.effects import build_network, full_name, placements_for
 from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.monitor.monitor_setup import with_shapes
 from fdi_torch.monitor.monte_carlo.detection_plan import DetectionPlan
-from fdi_torch.monitor.monte_carlo.estimator_comparison import ESTIMATOR_NAMES
-from fdi_torch.monitor.monte_carlo.estimator_comparison_plan import EstimatorComparisonPlan
+from fdi_torch.monitor.monte_carlo.estimator_comparison import ESTIMATOR_NAMES, EstimatorComparisonPlan
 from fdi_torch.monitor.monte_carlo.false_alarm_plan import FalseAlarmPlan
 from fdi_torch.monitor.monte_carlo.isolation_plan import IsolationPlan
 from fdi_torch.monitor.monte_carlo.level_control import moving_commands, moving_set_points

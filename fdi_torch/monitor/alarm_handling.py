@@ -85,8 +85,10 @@ class AlarmHandler:
         if change is not None and self.explainer.is_current(state, change):
             fits = self.explainer.of_change(state, change)
             if fits[0].fits and fits[0].hypothesis.columns:
-                state = state.with_alarm(state.alarm(change.number).raised_again(state.now))
-                return self._revise(state, change, "revised", fits, announce=False)
+                again = state.with_alarm(state.alarm(change.number).raised_again(state.now))
+                revised, events = self._revise(again, change, "revised", fits, announce=False)
+                if self._is_quiet(revised):
+                    return revised, events
         resized = size_change(self.observer, state, self.explainer.search_start(state, state.now), self.faults)
         if resized is not None:
             moved = adopt_sizes(self.observer, state, resized)
@@ -109,7 +111,9 @@ class AlarmHandler:
             # The previous change may have been explained wrongly: one change that explains both alarms is preferred.
             fits = self.explainer.of_change(state, change)
             if fits[0].fits and fits[0].hypothesis.columns:
-                return self._same_change(state, change, fits)
+                counted, events = self._same_change(state, change, fits)
+                if self._is_quiet(counted):
+                    return counted, events
         return self._isolate(state)
 
     def retire(
@@ -119,6 +123,15 @@ class AlarmHandler:
         retired = state.alarm(number).with_state(State.RETIRED)
         state = replace(state, pending=None, detector_memory=None).with_alarm(retired)
         return state, self.writer.retired(state, retired, reason, announced)
+
+    def _is_quiet(self, state: MonitorState) -> bool:
+        """Whether the detector, run again from the latest change on, stays within its threshold now.
+
+        The misfit of a long window is no such test: its noise hides a deviation of a few seconds.
+        """
+        count = max(int((state.samples.time > state.valid_since).sum()), 1)
+        statistic, _ = self.detector.update(residuals_to_test(state, count, self.reach), None)
+        return float(statistic[-1]) <= self.detector.threshold
 
     def _sensor_shares(self, state: MonitorState) -> tuple[tuple[str, float], ...]:
         """The share of each sensor in the detector's statistic."""
@@ -155,8 +168,6 @@ class AlarmHandler:
         alarm = state.alarm(state.pending.number)
         state, event = self.retire(state, alarm.number, f"it counts with alarm {change.number}", announced=False)
         state = state.with_alarm(state.alarm(change.number).raised_again(alarm.last))
-        if not fits[0].hypothesis.columns:
-            return replace(state, pending=None), [event]
         revised, events = self._revise(state, change, "isolated", fits)
         return revised, [event, *events]
 
@@ -249,7 +260,8 @@ class AlarmHandler:
             lambda c: effect_of_value(self.observer, window, change.before, change.hypothesis, c, healthy[c])[0],
         )
         ends = possible_ends(self.observer, state, change, self.settings.lookback)
-        state = with_hidden(self.observer, state, change, change.best.onset if ends is None else ends[0])
+        earliest_end = change.best.onset if ends is None else ends[0]
+        state = with_hidden(self.observer, state, change, earliest_end, self.settings.confirm)
         state, events = end_recovered(self.writer, state, change, reported, ends)
         present = [c for c in best.hypothesis.sizes if c not in back]
         if not present:

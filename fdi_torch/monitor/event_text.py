@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 
 from fdi_torch.amounts import estimate_words, parameter_words
+from fdi_torch.estimate.diagnosis import fault_flow
 from fdi_torch.monitor.alarm_state import Alarm
 from fdi_torch.monitor.events import (
     Event,
@@ -26,6 +27,7 @@ from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, HiddenFault, MonitorState
 from fdi_torch.monitor.observer_bank import ObserverBank
 from fdi_torch.parameters import ParameterName
+from fdi_torch.plant.effect import Stage
 
 FORECAST_WINDOWS = 4.0  # horizon of the level forecast, in longest windows
 
@@ -130,7 +132,7 @@ class EventWriter:
             self._event(
                 state,
                 "followed",
-                self._tracks_text((explanation := self._tracks_explanation([t]),), [t]),
+                self._tracks_text((explanation := self._tracks_explanation(state, [t]),), [t]),
                 state.alarm(t.number),
                 explanations=(explanation,),
                 announced=t in announced,
@@ -147,7 +149,7 @@ class EventWriter:
         explanations: tuple[Explanation, ...] = ()
         if tracks:
             likeliest, *rivals = alarm.explanations
-            explanations = (self._tracks_explanation(tracks, likeliest.mass), *rivals)
+            explanations = (self._tracks_explanation(state, tracks, likeliest.mass), *rivals)
             faults = self._tracks_text(explanations, tracks)
         if alarm.count > 1:
             times = f"raised {alarm.count} times, {alarm.first:g} s to {alarm.last:g} s"
@@ -167,7 +169,7 @@ class EventWriter:
                 continue
             grows = change is not None and h.incipient and c in h.sizes and now > fit.onset
             rate = (size - float(change.before[c])) / (now - fit.onset) if grows and change else None
-            sizes.append(size_of(p, size, std, rate))
+            sizes.append(self._size(state, c, size, std, rate))
         if not sizes:
             return Explanation(fit.probability, ())
         ended = tuple(self.space.names[c] for c in h.recovered if c not in hidden)
@@ -192,9 +194,21 @@ class EventWriter:
             urgencies += [matter.urgency] if matter and large and matter.urgency else []
         return ", ".join(dict.fromkeys(urgencies)), any(announced)
 
-    def _tracks_explanation(self, tracks: Sequence[FaultTrack], mass: float = 1.0) -> Explanation:
+    def _size(self, state: MonitorState, column: int, size: float, std: float, rate: float | None) -> Size:
+        """A parameter's estimate; of a fault that adds a flow, such as a leak, with the flow at the present levels."""
+        p, network = self.space.parameters[column], self.observer.network
+        shown, prefix = size_of(p, size, std, rate), ParameterName.parse(p.name).prefix
+        adds_flow = any(x.prefix == prefix and x.effect.stage is Stage.BALANCE for x in network.placements)
+        if shown.at_end or p.unit == "m^3/s" or not adds_flow:
+            return shown
+        value = state.believed.clone()
+        value[column] = size
+        levels, inputs = state.state[-1, : len(network.description.tanks)], state.samples.inputs[-1].nan_to_num()
+        return replace(shown, flow=fault_flow(network, self.space, value, column, levels, inputs)[0])
+
+    def _tracks_explanation(self, state: MonitorState, tracks: Sequence[FaultTrack], mass: float = 1.0) -> Explanation:
         """The present sizes of known faults as one explanation, with the onset of the first."""
-        sizes = tuple(size_of(self.space.parameters[t.column], *t.last[1:], t.rate) for t in tracks)
+        sizes = tuple(self._size(state, t.column, *t.last[1:], t.rate) for t in tracks)
         first = min(tracks, key=lambda t: t.onset)
         return Explanation(mass, sizes, first.onset, first.onset_std, any(s.rate is not None for s in sizes))
 

@@ -12,7 +12,7 @@ from fdi_torch.clock import clock_text
 from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.monitor.alarm_state import State
 from fdi_torch.parameters import Parameter, ParameterName
-from fdi_torch.quantities import display_unit, significant
+from fdi_torch.quantities import display_unit, quantity_text, significant
 
 Kind = Literal[
     "watching",
@@ -38,7 +38,8 @@ class Size:
     practical unit.
 
     at_end: whether the estimate reached an end of its range. Then `size` is that end, the true value lies there or
-    beyond, and std is infinite. rate: growth of an incipient fault, in `unit` per s.
+    beyond, and std is infinite. rate: growth of an incipient fault, in `unit` per s. flow: of a fault that adds
+    one, such as a leak, at the present levels, m^3/s; otherwise None.
     """
 
     name: str
@@ -48,6 +49,12 @@ class Size:
     shown: str
     at_end: bool = False
     rate: float | None = None
+    flow: float | None = None
+
+    @property
+    def amounts(self) -> tuple[str, ...]:
+        """'size 0.300 ± 0.020', '12.1 cm^3/s now'."""
+        return (self.shown,) if self.flow is None else (self.shown, f"{quantity_text(self.flow, 'm^3/s', 3)} now")
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,7 @@ class Explanation:
 
     @property
     def text(self) -> str:
-        return self._in_words(lambda sizes: sized_words(sizes[0].name, [s.shown for s in sizes]))
+        return self._in_words(lambda sizes: sized_words(sizes[0].name, [a for s in sizes for a in s.amounts]))
 
     @property
     def causes(self) -> str:
@@ -92,7 +99,9 @@ class Explanation:
 
 @dataclass(frozen=True)
 class Limit:
-    """Forecast of when a tank overflows or runs dry if nothing changes.
+    """Forecast of when a tank overflows or runs dry if the inputs keep the mean of the last `lookback` s.
+
+    No controller is simulated: one that reacts to the fault changes the time.
 
     time: median, s from the event; low, high: 90 % interval, infinite if it may never happen. chance: probability that
     it happens at all.
@@ -109,7 +118,7 @@ class Limit:
     def text(self) -> str:
         median, low = significant(self.time, 3), significant(self.low, 3)
         high = f"{significant(self.high, 3)} s" if math.isfinite(self.high) else "never"
-        return f"{self.tank} {self.what} in {median} s (90 %: {low} s to {high}) if nothing changes"
+        return f"{self.tank} {self.what} in {median} s (90 %: {low} s to {high}) if the inputs keep their recent mean"
 
 
 @dataclass(frozen=True)

@@ -85,18 +85,19 @@ def fault_warnings(
 
 
 def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -> str:
-    """Text: the expected time between false alarms, how short it may be, and how long a fault-free part it needs.
+    """Text: the expected time between false alarms, the 95 % interval of their number in it, and how long a fault-free
+    part would determine their rate within a factor of RATE_FACTOR (95 %).
 
-    The mean is over the posterior of the noise, of which a small share may determine it. Needed is the fault-free time
-    that determines the rate within a factor of RATE_FACTOR (95 %).
+    No interval of the rate: a small share of the posterior of the noise may determine its mean, which then lies
+    outside.
     """
     design = detector.design
     seconds = noise.whitening.samples * design.interval
     needed = seconds * design.learning_factor(RATE_FACTOR)
-    shortest = float(f"{1.0 / design.quantile(0.95):.2g}")
+    fewest, most = (design.count_quantile(every, p) for p in (0.025, 0.975))
     text = (
         f"the noise is learnt from {seconds:.4g} s of {needed:.4g} s needed; expect one false alarm in {every:.5g} s "
-        f"on average, with 95 % confidence at most one in {shortest:g} s"
+        f"(95 %: {fewest} to {most})"
     )
     if noise.whitening.flows is None:
         text += ", if no random flow is slow: to model these, install a C++ compiler or the extra fdi_torch[compiler]"

@@ -2,14 +2,13 @@
 //
 //     nu_t = r_t - H s_t,    s_{t+1} = F (s_t + K_t nu_t) - F_x L_t r_t
 //
-// s: expected error of the observer's prediction (N levels), then the flow disturbances (N), dimension D. A missing
-// residual (NaN) corrects nothing and gives a missing innovation. Compile-time sizes: N tanks, C sensors.
+// s: expected error of the observer's prediction (N levels), the flow disturbances (N), and the noise of the sensors (C)
+// if that is correlated. A missing residual (NaN) corrects nothing and gives a missing innovation. Compile-time sizes: N
+// tanks, C sensors, D elements of s.
 #include <cmath>
 #include <cstdint>
 
-constexpr int D = 2 * N;
-
-// f (D, D), h (C, N); k (S, D, C); l (S, N, C); r, nu (L, S, C); s (L, D) at the start; path (L, S, D): s after each
+// f (D, D), h (C, D); k (S, D, C); l (S, N, C); r, nu (L, S, C); s (L, D) at the start; path (L, S, D): s after each
 // sample.
 extern "C" void flow_filter(int64_t lanes, int64_t samples, const double* f, const double* h, const double* k,
                             const double* l, const double* r, const double* s, double* nu, double* path) {
@@ -22,7 +21,7 @@ extern "C" void flow_filter(int64_t lanes, int64_t samples, const double* f, con
             for (int c = 0; c < C; ++c) {
                 double error = r[at * C + c];
                 const double residual = error;
-                for (int i = 0; i < N; ++i) error -= h[c * N + i] * state[i];
+                for (int i = 0; i < D; ++i) error -= h[c * D + i] * state[i];
                 nu[at * C + c] = error;
                 if (std::isnan(error)) continue;
                 for (int i = 0; i < D; ++i) corrected[i] += k[(t * D + i) * C + c] * error;

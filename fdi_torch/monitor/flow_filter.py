@@ -1,12 +1,14 @@
 """Random flows into the tanks in the monitor's residual: their estimate, and the Kalman filter that takes them out.
 
-The noise model is that of the gap diagnosis (estimate/state_noise.py): flows w with a correlation time, white
-measurement noise. About the plant linearised at the operating point, the error x of the observer's prediction obeys
+The noise model is that of the gap diagnosis (estimate/state_noise.py): flows w with a correlation time, measurement
+noise v that is white or correlated from sample to sample. About the plant linearised at the operating point, the error
+x of the observer's prediction obeys
 
-    x_{k+1} = A (x_k - L_k r_k) + B w_k,    w_{k+1} = a w_k + q_k,    r_k = C x_k + v_k,
+    x_{k+1} = A (x_k - L_k r_k) + B w_k,    w_{k+1} = a w_k + q_k,    v_{k+1} = c v_k + p_k,    r_k = C x_k + v_k,
 
-with the observer's gain L and residual r. The Kalman filter for (x, w) turns r into innovations that are white whatever
-the gain L is. Flows are in metres per sample: what each adds to its tank's level in one sampling interval.
+with the observer's gain L and residual r. The Kalman filter for (x, w), and for v if c > 0, turns r into innovations
+that are white whatever the gain L is. Flows are in metres per sample: what each adds to its tank's level in one
+sampling interval.
 """
 
 from __future__ import annotations
@@ -22,12 +24,14 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.kalman import SCATTER, Propagation, SensorNoise, StateNoise
-from fdi_torch.estimate.state_noise import LOG_BOUND, estimate_state_noise
+from fdi_torch.estimate.state_noise import LOG_BOUND, Likelihood, estimate_state_noise
 from fdi_torch.monitor.observer_gain import Gain, Linear, kalman_gain, riccati, with_effects
 from fdi_torch.simulate.build import load_library
 
 FREQUENCIES = 2048  # at which spectra are evaluated
 FIRST_TIME = 20.0  # correlation time at which the optimisation starts, in sampling intervals
+CORRELATIONS = (0.3, 0.5, 0.7, 0.85, 0.95)  # candidates for that of the sensors' noise
+WHITE_SHARE = 1e-3  # of the standard deviation of correlated measurement noise: keeps its covariance invertible
 FIRST_UNIT = 0.1  # initial flow per sample of the optimisation, in standard deviations of a level's measurement noise
 
 
@@ -38,7 +42,8 @@ class FlowFilter:
     n: the network's states, the levels of the tanks first; only tanks receive flows, the others' are 0.
 
     linear: transition A (n, n) and output C (sensors, n). noise: intensities of the tanks in m per sample. reading_std
-    (sensors,): measurement noise. observer: the observer's gain. start_std (tanks,): of the initial levels, m.
+    (sensors,): measurement noise; correlation: of its neighbouring values, the same for all sensors. observer: the
+    observer's gain. start_std (tanks,): of the initial levels, m.
     interval: s. learnt (samples, sensors): what the residual that the noise was learnt from would have been without
     the observer's corrections, NaN where a reading is missing. begins: number of samples that the observer had
     processed before the filter starts, from unknown levels and flows.
@@ -52,6 +57,7 @@ class FlowFilter:
     interval: float
     learnt: Tensor
     begins: int = 0
+    correlation: float = 0.0
 
     @property
     def samples(self) -> int:
@@ -60,10 +66,21 @@ class FlowFilter:
 
     @cached_property
     def transition(self) -> Tensor:
-        """F (2 n, 2 n) of states and flows."""
-        a, keep = self.linear.transition, self.keep
+        """F (D, D) of states, flows and correlated noise of sensors."""
+        a, keep, noises = self.linear.transition, self.keep, self.linear.transition.new_zeros(self._noises)
         flows = keep * torch.eye(len(a), dtype=a.dtype)
-        return torch.cat([torch.cat([a, forcing(a)], 1), torch.cat([torch.zeros_like(a), flows], 1)])
+        levels = torch.cat([torch.cat([a, forcing(a)], 1), torch.cat([torch.zeros_like(a), flows], 1)])
+        return torch.block_diag(levels, torch.diag(noises + self.correlation))
+
+    @property
+    def _noises(self) -> int:
+        """Number of sensors if their noise is correlated, and hence part of the filter's state; else 0."""
+        return len(self.reading_std) if self.correlation else 0
+
+    @property
+    def white_std(self) -> Tensor:
+        """Standard deviation (sensors,) of the white part of the measurement noise."""
+        return (WHITE_SHARE if self.correlation else 1.0) * self.reading_std
 
     @property
     def keep(self) -> float:
@@ -77,32 +94,34 @@ class FlowFilter:
 
     @property
     def process_std(self) -> Tensor:
-        """Standard deviation of the shocks of states and flows in one interval, (2 n,) m."""
-        sigma = self.flow_std
-        return torch.cat([0.0 * sigma, math.sqrt(1.0 - self.keep**2) * sigma])
+        """Standard deviation of the shocks of states, flows and correlated noise in one interval, (D,)."""
+        sigma, noise = self.flow_std, math.sqrt(1.0 - self.correlation**2) * self.reading_std[: self._noises]
+        return torch.cat([0.0 * sigma, math.sqrt(1.0 - self.keep**2) * sigma, noise])
 
     @property
     def joint(self) -> Linear:
-        """States and flows together."""
+        """States, flows and correlated noise of sensors together."""
         c = self.linear.output
-        return Linear(self.transition, torch.cat([c, torch.zeros_like(c)], 1))
+        own = torch.eye(len(c), dtype=c.dtype)[:, : self._noises]
+        return Linear(self.transition, torch.cat([c, torch.zeros_like(c), own], 1))
 
     @cached_property
     def gain(self) -> Gain:
-        """Kalman gain of states and flows, with its transient from unknown levels."""
-        start = torch.cat([with_effects(self.start_std, len(self.linear.transition)), self.flow_std])
-        return kalman_gain(self.joint, self.process_std, self.reading_std, start)
+        """Kalman gain of the filter's state, with its transient from unknown levels."""
+        levels = with_effects(self.start_std, len(self.linear.transition))
+        start = torch.cat([levels, self.flow_std, self.reading_std[: self._noises]])
+        return kalman_gain(self.joint, self.process_std, self.white_std, start)
 
     @cached_property
     def covariance(self) -> Tensor:
-        """Steady covariance of the predicted states and flows, (2 n, 2 n) m^2."""
-        return riccati(self.joint, torch.diag(self.process_std**2), torch.diag(self.reading_std**2))
+        """Steady covariance of the predicted state of the filter, (D, D)."""
+        return riccati(self.joint, torch.diag(self.process_std**2), torch.diag(self.white_std**2))
 
     @property
     def innovation_std(self) -> Tensor:
         """Steady standard deviation (sensors,) of the innovations, in the readings' units."""
         h = self.joint.output
-        return (torch.diagonal(h @ self.covariance @ h.mT) + self.reading_std**2).sqrt()
+        return (torch.diagonal(h @ self.covariance @ h.mT) + self.white_std**2).sqrt()
 
     def learning_from(self, residual: Tensor, number: int) -> tuple[FlowFilter, float]:
         """The filter for the noise that is most likely with what it was learnt from and further residuals, and the log
@@ -112,7 +131,8 @@ class FlowFilter:
         filter starts anew: the state of one with other noise would not be known to the precision that its gain assumes.
         """
         further = _free_residual(self.linear, self.observer, residual, number)
-        return _likeliest(replace(self, begins=number), [self.learnt, further])
+        likeliest, at = _likeliest(replace(self, begins=number), [self.learnt, further])
+        return likeliest, at.log_likelihood - at.start_log_likelihood
 
     @cached_property
     def spectra(self) -> Tensor:
@@ -123,12 +143,13 @@ class FlowFilter:
         """
         f, h, k = self.transition, self.joint.output, self.gain.steady
         tanks, n = len(self.noise.intensity), len(self.linear.transition)
-        shocks = torch.diag(self.process_std)[:, n : n + tanks]
-        sources = torch.cat([shocks, -f @ k * self.reading_std], dim=1)
+        shocks = torch.diag(self.process_std)
+        noise = shocks[:, 2 * n :] if self.correlation else -f @ k * self.reading_std
+        sources = torch.cat([shocks[:, n : n + tanks], noise], dim=1)
         z = torch.exp(1j * _frequencies(f)).reshape(-1, 1, 1)
         errors = torch.linalg.solve(z * torch.eye(len(f), dtype=f.dtype) - (f - f @ k @ h), sources.to(z.dtype))
         amplitude = h.to(z.dtype) @ errors
-        amplitude[:, :, tanks:] += torch.diag(self.reading_std)
+        amplitude[:, :, tanks:] += 0.0 if self.correlation else torch.diag(self.reading_std)
         covariance = (amplitude @ amplitude.mH).real.mean(0)
         return torch.linalg.solve_triangular(torch.linalg.cholesky(covariance).to(z.dtype), amplitude, upper=False)
 
@@ -156,8 +177,11 @@ class FlowFilter:
         return 0.5 * (slope @ self.covariance_of_variances * slope).sum(-1).sqrt()
 
     def over(self, samples: int) -> tuple[Tensor, Tensor]:
-        """Transition over some samples, and covariance of the shocks that add up meanwhile, by repeated doubling."""
-        step, shocks = self.transition, torch.diag(self.process_std**2)
+        """Transition (2 n, 2 n) of states and flows over some samples, and covariance of the shocks that add up
+        meanwhile, by repeated doubling.
+        """
+        levels = slice(2 * len(self.linear.transition))
+        step, shocks = self.transition[levels, levels], torch.diag(self.process_std[levels] ** 2)
         transition, total = torch.eye(len(step), dtype=step.dtype), torch.zeros_like(step)
         while samples:
             if samples % 2:
@@ -166,25 +190,26 @@ class FlowFilter:
         return transition, total
 
     def __call__(self, residual: Tensor, number: int = 0, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Innovations (*batch, S, sensors) in the readings' units, and the filter's state (*batch, S, 2 n) after
-        each sample.
+        """Innovations (*batch, S, sensors) in the readings' units, and the filter's state (*batch, S, D) after
+        each sample: states (n), flows (n), and the noise of sensors if it is correlated.
 
         residual (*batch, S, sensors): scaled to the steady variance (`Observation.steady_residual`). number: samples
-        of the run before the first. memory (*batch, 2 n): state before the first sample, 0 where the filter starts.
+        of the run before the first. memory (*batch, D): state before the first sample, 0 where the filter starts.
         """
         batch, (count, channels) = residual.shape[:-2], residual.shape[-2:]
-        n, lanes = len(self.linear.transition), batch.numel()
+        size, lanes = len(self.transition), batch.numel()
         raw = (residual * self.observer.spread(number, count)).reshape(lanes, count, channels).contiguous()
-        state = raw.new_zeros(2 * n) if memory is None or number == self.begins else memory
-        state = state.expand(*batch, 2 * n).reshape(lanes, -1).contiguous()
-        out, path = torch.empty_like(raw), raw.new_empty(lanes, count, 2 * n)
+        state = raw.new_zeros(size) if memory is None or number == self.begins else memory
+        state = state.expand(*batch, size).reshape(lanes, -1).contiguous()
+        out, path = torch.empty_like(raw), raw.new_empty(lanes, count, size)
         processed = number - self.begins
         tables = [self.gain.table(processed, count).contiguous(), self.observer.table(number, count).contiguous()]
-        fixed = [self.transition.contiguous(), self.linear.output.contiguous()]
+        fixed = [self.transition.contiguous(), self.joint.output.contiguous()]
         pointers = [ctypes.c_void_p(x.data_ptr()) for x in (*fixed, *tables, raw, state, out, path)]
-        _library(n, channels).flow_filter(ctypes.c_int64(lanes), ctypes.c_int64(count), *pointers)
+        library = _library(len(self.linear.transition), channels, size)
+        library.flow_filter(ctypes.c_int64(lanes), ctypes.c_int64(count), *pointers)
         out = out.reshape(residual.shape) / self.gain.spread(processed, count)
-        return out, path.reshape(*batch, count, 2 * n)
+        return out, path.reshape(*batch, count, size)
 
 
 def forcing(transition: Tensor) -> Tensor:
@@ -204,8 +229,24 @@ def estimate_flow_filter(
     return _likeliest(FlowFilter(linear, first, reading_std, observer, start_std, interval, free), [free])[0]
 
 
-def _likeliest(start: FlowFilter, segments: Sequence[Tensor]) -> tuple[FlowFilter, float]:
-    """The filter with the most likely noise, by a search from that of `start` on, and the gain in log-likelihood.
+def with_correlated_sensors(white: FlowFilter) -> FlowFilter:
+    """The most likely filter with correlated noise of sensors, by a climb over CORRELATIONS. white: the one without."""
+    middle, found = len(CORRELATIONS) // 2, dict[int, tuple[FlowFilter, Likelihood]]()
+
+    def at(i: int) -> float:
+        if i not in found:
+            found[i] = _likeliest(replace(white, correlation=CORRELATIONS[i]), [white.learnt])
+        return found[i][1].log_likelihood
+
+    best = middle
+    for step in (1, -1):
+        while 0 <= best + step < len(CORRELATIONS) and at(best + step) > at(best):
+            best += step
+    return found[best][0]
+
+
+def _likeliest(start: FlowFilter, segments: Sequence[Tensor]) -> tuple[FlowFilter, Likelihood]:
+    """The filter with the most likely noise, by a search from that of `start` on, and its likelihood.
 
     segments (S, sensors): residuals without corrections, NaN where missing, each from unknown levels on.
     """
@@ -220,12 +261,11 @@ def _likeliest(start: FlowFilter, segments: Sequence[Tensor]) -> tuple[FlowFilte
         first = last
     a, b, c = (x.expand(count, *x.shape) for x in (linear.transition, forcing(linear.transition), linear.output))
     propagation = Propagation(a, b, c, start.interval, fresh, torch.isfinite(free))
-    sensors = SensorNoise(start.reading_std, torch.zeros_like(start.reading_std))
+    sensors = SensorNoise(start.reading_std, torch.full_like(start.reading_std, start.correlation))
     noise = replace(start.noise, scale=torch.ones_like(start.reading_std))
     unit, ones = _usual_flow(linear, start.reading_std, start.start_std), free.new_ones(by_levels.shape[-1])
     likely = estimate_state_noise(propagation, sensors, free.nan_to_num(), by_levels, ones, 0.0 * ones, unit, noise)
-    gain = likely.log_likelihood - likely.start_log_likelihood
-    return replace(start, noise=likely.noise, reading_std=likely.noise.scale * start.reading_std), gain
+    return replace(start, noise=likely.noise, reading_std=likely.noise.scale * start.reading_std), likely
 
 
 def _usual_flow(linear: Linear, reading_std: Tensor, start_std: Tensor) -> Tensor:
@@ -264,9 +304,9 @@ def _by_initial_levels(linear: Linear, count: int) -> Tensor:
 
 
 @lru_cache
-def _library(n: int, channels: int) -> ctypes.CDLL:
+def _library(n: int, channels: int, size: int) -> ctypes.CDLL:
     """flow_filter.hpp compiled for these sizes."""
     source = Path(__file__).with_name("flow_filter.hpp").read_text(encoding="utf-8")
-    library = load_library(f"#define N {n}\n#define C {channels}\n{source}", "flow_filter")
+    library = load_library(f"#define N {n}\n#define C {channels}\n#define D {size}\n{source}", "flow_filter")
     library.flow_filter.restype = None
     return library

@@ -144,19 +144,6 @@ def _law_error(track: FaultTrack) -> float:
     return 3.0 * FAULT_MODEL_ERROR * track.effect_rms
 
 
-def _recovery_is_observable(
-    observer: ObserverBank, state: MonitorState, change: DetectedChange, track: FaultTrack
-) -> bool:
-    """Whether the readings since the recovery would show the fault if it were still present.
-
-    They would not if it adds less to the white innovations than its model's error, for example in a dry tank or behind
-    a closed valve.
-    """
-    window, size = state.window(change.best.onset), float(change.before[track.column])
-    effect, _ = effect_of_value(observer, window, change.before, change.hypothesis, track.column, size)
-    return effect >= _law_error(track)
-
-
 def possible_ends(
     observer: ObserverBank, state: MonitorState, change: DetectedChange, lookback: float
 ) -> tuple[float, float] | None:
@@ -231,12 +218,15 @@ def _is_recovered(space: ParameterSpace, change: DetectedChange, column: int) ->
 
 
 def with_hidden(
-    observer: ObserverBank, state: MonitorState, change: DetectedChange, earliest_end: float
+    observer: ObserverBank, state: MonitorState, change: DetectedChange, earliest_end: float, latest: float
 ) -> MonitorState:
-    """The state with the faults that recovered at a change but that the readings since would not show."""
-    best, now = change.best, state.now
-    hidden = [t for t in change.ended if not _recovery_is_observable(observer, state, change, t)]
-    new = [HiddenFault(t, float(change.before[t.column]), earliest_end, now) for t in hidden]
+    """The state with the faults that recovered at a change but that the readings since would not show.
+
+    Neither all readings since the change, nor those of the `latest` seconds, for which alone its pump may have run.
+    """
+    best, starts = change.best, (change.best.onset, state.now - latest)
+    ended = [HiddenFault(t, float(change.before[t.column]), earliest_end, state.now) for t in change.ended]
+    new = [h for h in ended if not any(_end_is_shown(observer, state, h, max(s, best.onset)) for s in starts)]
     judged = {*best.hypothesis.columns, *state.off_nominal.nonzero().flatten().tolist()}
     return replace(state, hidden=(*(h for h in state.hidden if h.track.column not in judged), *new))
 

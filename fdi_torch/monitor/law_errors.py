@@ -20,7 +20,7 @@ from torch import Tensor
 
 from fdi_torch.estimate.evidence import ODDS
 
-SIZE_ERROR = 1.0  # standard deviation of c before the readings since the latest change
+SIZE_ERROR = 1.0  # standard deviation of c of a fault whose size the readings since the latest change determine
 STEP = 0.01  # of the finite differences, as a share of a fault's effect
 
 
@@ -43,13 +43,20 @@ class LawErrors:
 
     @classmethod
     def at_start(
-        cls, columns: Sequence[int], correlation_time: float, state: Tensor, memory: Tensor, innovations: Tensor
+        cls,
+        columns: Sequence[int],
+        correlation_time: float,
+        state: Tensor,
+        memory: Tensor,
+        innovations: Tensor,
+        size_errors: Sequence[float] = (),
     ) -> LawErrors:
         """Before the readings since the latest change. state (order + M,), memory (G,) and innovations (K, sensors) are
-        those of the observer itself.
+        those of the observer itself. size_errors (F): standard deviations of c, by default SIZE_ERROR.
         """
         f = len(columns)
-        std = torch.cat([state.new_full((f,), SIZE_ERROR), state.new_full((f,), ODDS.law_error)])
+        sizes = state.new_tensor(size_errors) if size_errors else state.new_full((f,), SIZE_ERROR)
+        std = torch.cat([sizes, state.new_full((f,), ODDS.law_error)])
         state, memory, innovations = (x.expand(f, *x.shape) for x in (state, memory, innovations))
         mean, covariance = torch.zeros_like(std), torch.diag(std**2)
         return cls(tuple(columns), correlation_time, state, memory, innovations, mean, covariance)

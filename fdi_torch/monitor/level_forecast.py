@@ -1,4 +1,4 @@
-"""Forecast of overflow and dry tanks if nothing changes, by Monte Carlo simulation from the monitor's present state.
+"""Forecast of overflow and dry tanks if the inputs keep their recent mean, by Monte Carlo simulation.
 
 The draws are spread over the explanations in proportion to their probability, with sizes drawn from their standard
 deviations, and start from the levels that each explanation implies. The inputs keep their recent average, faults that
@@ -131,9 +131,10 @@ def _random_flows(
     if flows is None:
         return memory.new_zeros(1, 1), memory.new_zeros(1, 1, 1)
     transition, covariance = flows.over(max(round(span / flows.interval), 1))
-    n = len(transition) // 2
+    n, size = len(transition) // 2, len(transition)
     normal = torch.randn(POINTS + 1, DRAWS, 2 * n, generator=generator, dtype=memory.dtype)
-    deviation, flow = (memory + normal[0] @ _root(flows.covariance).mT).split(n, dim=1)
+    present = memory[:, :size] + normal[0] @ _root(flows.covariance[:size, :size]).mT
+    deviation, flow = present.split(n, dim=1)
     level_shocks, flow_shocks = (normal[1:] @ _root(covariance).mT).split(n, dim=2)
     added = []
     for level_shock, flow_shock in zip(level_shocks, flow_shocks, strict=True):

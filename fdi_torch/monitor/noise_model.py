@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.flow_filter import FlowFilter, estimate_flow_filter
+from fdi_torch.monitor.flow_filter import FlowFilter, estimate_flow_filter, with_correlated_sensors
 from fdi_torch.monitor.observer import Observation, Observer, bind_parameters, initial_levels
 from fdi_torch.monitor.observer_gain import (
     Gain,
@@ -29,8 +30,6 @@ from fdi_torch.simulate.build import BuildError
 
 # log10 of the process noise per sample over the measurement noise, both in m: from negligible to dominant.
 EXPONENTS = tuple(0.5 * i - 4.0 for i in range(11))
-# Difference of information criteria from which evidence is "very strong" (Kass and Raftery, 1995).
-VERY_STRONG = 10.0
 FINE = tuple(0.125 * i for i in range(-4, 5))
 
 
@@ -150,17 +149,20 @@ def _noise(network: TankNetwork, linear: Linear, best: _Candidate) -> NoiseModel
 def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation) -> Whitening:
     """Whitening of an observer's residuals: random flows by their Kalman filter, what remains by an autoregression.
 
-    Without the flows if the readings speak strongly against them: correlated measurement noise would be taken for flows
-    without a correlation time, and slow sums of the innovations would be far smaller than their model says. Without a
-    compiler there is no flow filter.
+    Where flows beside white noise of sensors leave a correlation, or have none in time themselves, it may be the noise
+    of sensors that is correlated: both are then estimated together. Without a compiler there is no flow filter.
     """
     residual = seen.steady_residual
-    score, of_residual = score_whitenings(residual)[0]
     flows = _flow_filter(network, linear, gain, seen)
     if flows is None:
-        return of_residual
-    score_with_flows, of_innovations = score_whitenings(flows(residual)[0])[0]
-    return of_residual if score_with_flows - score > VERY_STRONG else replace(of_innovations, flows=flows)
+        return score_whitenings(residual)[0][1]
+    score, of_innovations = score_whitenings(flows(residual)[0])[0]
+    if of_innovations.order or not flows.noise.correlation_time:
+        correlated = with_correlated_sensors(flows)
+        score_of_correlated, of_correlated = score_whitenings(correlated(residual)[0])[0]
+        if score_of_correlated + math.log(len(residual)) < score:  # the correlation is one more parameter
+            return replace(of_correlated, flows=correlated)
+    return replace(of_innovations, flows=flows)
 
 
 def _flow_filter(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation) -> FlowFilter | None:

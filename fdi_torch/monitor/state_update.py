@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.evidence import ODDS
 from fdi_torch.monitor.hypothesis import HypothesisFit, faults_of
-from fdi_torch.monitor.law_errors import STEP, LawErrors, normalized
+from fdi_torch.monitor.law_errors import SIZE_ERROR, STEP, LawErrors, normalized
 from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
 from fdi_torch.monitor.observer_bank import LONG_AGO, ChangeHypotheses, ObserverBank, ObserverWindow
 from fdi_torch.monitor.samples import ClockState, Samples, concatenated
@@ -67,29 +70,37 @@ def adopt_change(observer: ObserverBank, state: MonitorState, change: DetectedCh
     """Run the observer again from the change's onset with new parameters (P,), and restart the detector."""
     fit = change.best
     state = replace(state, change=change, pending=None)
-    return _adopt(observer, state, believed, change.before, fit.onset, fit.hypothesis.incipient)
+    return _adopt(observer, state, believed, change.before, fit)
 
 
 def adopt_sizes(observer: ObserverBank, state: MonitorState, fit: HypothesisFit) -> MonitorState:
     """Run the observer again from the fit's onset with new sizes of the known faults."""
-    return _adopt(observer, state, fit.value, state.believed, fit.onset)
+    return _adopt(observer, state, fit.value, state.believed, fit)
 
 
 def _adopt(
-    observer: ObserverBank,
-    state: MonitorState,
-    believed: Tensor,
-    before: Tensor,
-    onset: float,
-    incipient: bool = False,
+    observer: ObserverBank, state: MonitorState, believed: Tensor, before: Tensor, fit: HypothesisFit
 ) -> MonitorState:
     """Run the observer again from the onset of a change from `before` to `believed`, and restart the detector."""
-    window = state.window(onset)
+    window = state.window(fit.onset)
     first, known = len(state.samples) - len(window), _known_columns(observer, believed, state.healthy)
     past, time = _innovations_before(observer, state, first), state.errors.correlation_time
-    errors = LawErrors.at_start(known, time, window.state, state.memory[first - 1], past)
+    sizes = _size_errors(state, believed, known, fit)
+    errors = LawErrors.at_start(known, time, window.state, state.memory[first - 1], past, sizes)
     state = replace(state, believed=believed, errors=errors, detector_memory=None)
-    return _run(observer, state, window, before, onset, incipient)
+    return _run(observer, state, window, before, fit.onset, fit.hypothesis.incipient)
+
+
+def _size_errors(state: MonitorState, believed: Tensor, known: Sequence[int], fit: HypothesisFit) -> list[float]:
+    """Relative standard deviation of the size of each known fault before the readings since a change.
+
+    The readings since the change determine the sizes that it changes. The others are as well known as before it, but no
+    better than their laws: if a pump rests meanwhile, the end of its fault is no error of the fault's size.
+    """
+    estimated = {t.column: t.last[2] for t in state.tracks if t.column not in fit.hypothesis.columns}
+    effect = (believed - state.healthy).abs()
+    relative = (estimated[c] / float(effect[c]) if c in estimated else math.inf for c in known)
+    return [min(math.hypot(error, ODDS.law_error), SIZE_ERROR) for error in relative]
 
 
 def _innovations_before(observer: ObserverBank, state: MonitorState, first: int) -> Tensor:

@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.amounts import parameter_words
 from fdi_torch.clock import clock_text
-from fdi_torch.parameters import is_effect_parameter
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material, Payload
@@ -69,7 +67,6 @@ def event_section(material: Material) -> Section | None:
             number(float(m["t"]), 6),
             *([_moment(float(m["t"]))] if dated else []),
             str(m.get("event", "")),
-            tag("span", " and ".join(map(_words, str(m.get("channel", "")).split(" + "))), class_="moment"),
             _sentence(str(m.get("message", ""))),
             *_onset(m, dated),
         ]
@@ -80,18 +77,12 @@ def event_section(material: Material) -> Section | None:
         "time, s",
         *clock,
         "event",
-        "fault or sensor",
         "description",
         "onset, s",
         *(["onset, clock time"] if dated else []),
     )
     listed = table(header, rows, left=len(header) - 1 - len(clock))
     return Section("Events", [listed])
-
-
-def _words(name: str) -> str:
-    """'leak at A' of 'A.leak.size'; a sensor's name is unchanged."""
-    return parameter_words(name) if is_effect_parameter(name) else name
 
 
 def _sentence(message: str) -> str:
