@@ -204,3 +204,29 @@ def test_one_metered_tank_of_five_is_enough_to_name_a_wrong_unit() -> None:
     assert wrong_units(plant, minutes) == (
         "units: by the volume balance of the tanks, the flows of Q are 60 times too large (write l/h in place of l/min)"
     )
+
+
+def test_a_nearly_steady_level_speaks_the_more_against_a_unit_the_farther_it_is() -> None:
+    """The scale of the flows does not decide which combinations of b a recording under a constant flow determines."""
+    plant = build_plant(
+        {
+            "tanks": {"A": {"area": "43 cm^2", "height": "40 cm"}},
+            "pipes": {"out": {"source": "A", "area": "0.16 cm^2", "discharge_coefficient": 1.0}},
+            "pumps": {"P": {"target": "A", "max_flow": "200 ml/s"}},
+            "sensors": {"h": {"tank": "A"}},
+        },
+        "plant.yaml",
+    )
+    leaking = fdi_torch.simulate(
+        plant,
+        inputs={"P": "40 ml/s"},
+        duration="300 s",
+        sample_time="0.1 s",
+        faults={"A.leak": 0.3},
+        noise={"std": {"h": "1 mm"}},
+    )
+    volumes = volumes_along(plant, leaking)
+    balances = [[replace(volumes, metered=10.0 ** (sign * k) * volumes.metered) for k in range(8)] for sign in (-1, 1)]
+    for farther in balances:
+        evidence = [float(balance.log_evidence()) for balance in farther]
+        assert evidence == sorted(evidence, reverse=True)

@@ -137,7 +137,9 @@ def _regression(sums: Tensor, rounding: float) -> tuple[Tensor, Tensor, Tensor]:
     """Eigenvalues (2) and eigenvectors (2, 2) of the information of b, and b - 1 (2), by sums (GROUPS, SUMS, 3).
 
     In steady state without noise, the sums differ by rounding only, and their scatter is no measure of their errors;
-    each counts as uncertain by `rounding`, m^3, at least.
+    each counts as uncertain by `rounding`, m^3, at least. Whether a direction is determined is asked of flows scaled to
+    their root mean square, so that the answer does not depend on units; the smaller eigenvalue is then the determinant
+    divided by the larger one.
     """
     flows, excess = sums[..., 1:], sums[..., 0] - sums[..., 1] - sums[..., 2]
     rms = flows.square().mean(dim=(0, 1)).sqrt()
@@ -147,9 +149,13 @@ def _regression(sums: Tensor, rounding: float) -> tuple[Tensor, Tensor, Tensor]:
     off = _inverse(product) @ torch.einsum("gni,gn->i", scaled, excess)
     scores = torch.einsum("gni,gn->gi", scaled, excess - scaled @ off)
     variance = scores.T @ scores * GROUPS / (GROUPS - 2) + rounding**2 * product
-    eigenvalues, eigenvectors = torch.linalg.eigh(size[:, None] * (product @ _inverse(variance) @ product) * size)
-    exact = eigenvalues > 2.0 * torch.finfo(sums.dtype).eps * eigenvalues[-1]
-    return torch.where(exact, eigenvalues, 0.0), eigenvectors, off / size
+    information = product @ _inverse(variance) @ product
+    smaller, larger = torch.linalg.eigvalsh(information)
+    eigenvalues, eigenvectors = torch.linalg.eigh(size[:, None] * information * size)
+    determinant = smaller * larger * size.square().prod()
+    both = smaller > 2.0 * torch.finfo(sums.dtype).eps * larger
+    least = torch.where(both, determinant / eigenvalues[1], 0.0)
+    return torch.stack([least, eigenvalues[1]]), eigenvectors, off / size
 
 
 def _inverse(matrix: Tensor) -> Tensor:
