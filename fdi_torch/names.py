@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from fnmatch import fnmatchcase
 
 MOST_SHOWN = 80
@@ -12,6 +12,11 @@ MOST_SHOWN = 80
 def shortened(text: str) -> str:
     """A text for a message, cut to `MOST_SHOWN` characters."""
     return text if len(text) <= MOST_SHOWN else f"{text[: MOST_SHOWN - 3]}..."
+
+
+def listed(items: Sequence[str], word: str = "and") -> str:
+    """'a', 'a and b', 'a, b and c'; '' for no items."""
+    return f" {word} ".join(part for part in (", ".join(items[:-1]), *items[-1:]) if part)
 
 
 def counted(number: int, noun: str) -> str:

@@ -25,6 +25,7 @@ LAYERS = (
         "parameters",
         "quantities",
         "recording",
+        "sample_noise",
         "tables",
         "units",
     },

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
+import fdi_torch
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.config.problems import ConfigError
@@ -59,6 +61,20 @@ def test_volts_and_duty_are_told_by_the_units_of_the_gains() -> None:
     assert cascade.channel_units() == {"u_pump": "V"}
     assert (cascade.sensors[0].unit, cascade.sensors[0].gain) == ("V", pytest.approx(50.0))
     assert load_plant("three_tank_leak").channel_units() == {"pwm1": "1", "pwm3": "1"}
+
+
+def test_a_number_that_is_short_in_no_unit_is_written_in_the_unit_of_the_plant() -> None:
+    bore = math.pi / 4.0 * 0.009**2
+    plant = fdi_torch.Plant(
+        tanks=[fdi_torch.Tank("A", area="2 dm^2", height="60 cm")],
+        pipes=[fdi_torch.Pipe("out", "A", "outside", area=bore, discharge_coefficient=0.6)],
+        sensors=[fdi_torch.Sensor("h", "A")],
+    )
+    written = yaml.safe_load(dump_plant(plant))
+    assert written["tanks"]["A"]["area"] == "2 dm^2"
+    number, unit = written["pipes"]["out"]["area"].split()
+    assert unit == "dm^2" and float(number) == pytest.approx(100.0 * bore, rel=1e-15)
+    assert build_plant(written, "again").pipes == plant.pipes
 
 
 @pytest.mark.parametrize(

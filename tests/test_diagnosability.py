@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -154,3 +155,26 @@ def test_the_tables_are_in_the_units_of_the_plant(capsys: pytest.CaptureFixture[
     [bounds, effects] = offset
     assert bounds[1] == effects[1] == "cm^3/s" and 0.1 < float(effects[2]) < 1e3
     assert any(line.split()[2] == "-" for line in shown.splitlines() if line.startswith("OUT2.plugging"))
+
+
+def test_inputs_may_come_from_a_file_that_maps_the_columns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [f"{k}\t{50 + k % 7}\t50\t50\t40\t45" for k in range(100)]
+    (tmp_path / "lab.txt").write_text("\n".join(rows) + "\n")
+    columns = {
+        "t": (1, "s"),
+        "Q1": (2, "cm^3/s"),
+        "Q2": (3, "cm^3/s"),
+        "h1": (4, "cm"),
+        "h2": (5, "cm"),
+        "h3": (6, "cm"),
+    }
+    mapped = ", ".join(f"{name}: {{column: {k}, unit: {unit}}}" for name, (k, unit) in columns.items())
+    lab = f"{{file: lab.txt, header: false, columns: {{{mapped}}}}}"
+    listing = tmp_path / "runs.yaml"
+    words = ["diagnosability", "--plant", "three_tank", "--input", str(listing), "--faults", "T1.leak", "--quiet"]
+    listing.write_text(f"recordings: [{lab}]\n")
+    assert main(words) == 0
+    assert "T1.leak.size" in capsys.readouterr().out
+    listing.write_text(f"recordings: [{lab}, {lab}]\n")
+    assert main(words) == 2
+    assert "--input: expected one recording with known inputs, got 2" in capsys.readouterr().err

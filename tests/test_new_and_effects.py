@@ -215,3 +215,30 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
     assert cli.main(["new", "plant", "--recording", "none.csv", "--out", "none.yaml"]) != cli.DONE
     assert "expected a column of a level with its unit in the header" in capsys.readouterr().err
     assert cli.main(["new", "run", "--recording", "trend.csv"]) != cli.DONE
+
+
+def test_a_recording_without_a_header_is_mapped_by_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fdi("new", "plant", "--out", "rig.yaml", "--quiet")
+    rows = [f"{k},0E+0\t3,{k % 2}\t20,1\t{15 + k % 3},5" for k in range(60)]
+    Path("lab.txt").write_text("\r\n".join(rows) + "\r\n")
+    assert cli.main(["new", "plant", "--recording", "lab.txt", "--out", "b.yaml"]) == cli.MISUSE
+    assert "let fdi new run --plant FILE --recording" in capsys.readouterr().err
+    words = ["--plant", "rig.yaml", "--recording", "lab.txt"]
+    assert cli.main(["check", *words]) == cli.MISUSE
+    refused = capsys.readouterr().err
+    assert "got numbers without a header; save these lines" in refused and "by number, 1 to 4" in refused
+    fdi("new", "run", *words)
+    fdi("new", "monitor", *words, "--out", "watch.yaml")
+    assert "run.yaml; next: complete the columns, then fdi train" in capsys.readouterr().out
+    numbers = {"Q": (2, "l/min"), "hA": (3, "cm"), "hB": (4, "cm")}
+    for path in (Path("run.yaml"), Path("watch.yaml")):
+        text = path.read_text()
+        for name, (column, unit) in numbers.items():
+            text = text.replace(f"{name}: {{column: ..., unit: ...}}", f"{name}: {{column: {column}, unit: {unit}}}")
+        path.write_text(text)
+    fdi("check", "--config", "run.yaml")
+    assert "60 samples, 59 s" in capsys.readouterr().out
+    assert load_monitor(Path("watch.yaml")).plant.name == "rig"

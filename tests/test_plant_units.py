@@ -175,3 +175,58 @@ def test_open_drains_are_no_levels_above_the_rim(folder: Path, effects: str) -> 
     (folder / "rig.yaml").write_text(PLANT + effects)
     plant = load_plant(folder / "rig.yaml")
     assert wrong_units(plant, recorded(plant, {"A.leak": 1.0, "B.leak": 1.0})) == ""
+
+
+def test_one_metered_tank_of_five_is_enough_to_name_a_wrong_unit() -> None:
+    """The balance of one tank alone holds the pump's flow; the level of tank 4 is not measured."""
+    plant = build_plant(
+        {
+            "tanks": {
+                f"B{i}": {"area": f"{area} m^2", "height": "2 m"} for i, area in enumerate((0.8, 0.8, 0.6, 0.6, 1))
+            },
+            "pipes": {
+                f"P{i}": {"source": f"B{i}", "target": f"B{i + 1}", "area": "10 cm^2", "discharge_coefficient": 0.62}
+                for i in range(4)
+            }
+            | {"OUT": {"source": "B4", "area": "4.5 cm^2", "discharge_coefficient": 0.62}},
+            "pumps": {"Q": {"target": "B0", "max_flow": "5000 l/h"}},
+            "sensors": {f"L{i}": {"tank": f"B{i}", "gain": "50 %/m"} for i in (0, 1, 2, 4)},
+            "tolerances": {"*.discharge_coefficient": "10 %"},
+        },
+        "plant.yaml",
+    )
+    flows = (3000, 4200, 2500, 3800, 3300, 4500)
+    steps = [[f"{1200 * k} s", f"{flow} l/h"] for k, flow in enumerate(flows)]
+    noise = {"std": dict.fromkeys(("L0", "L1", "L2", "L4"), "0.15 %")}
+    run = fdi_torch.simulate(plant, inputs={"Q": {"steps": steps}}, duration="7200 s", sample_time="5 s", noise=noise)
+    assert wrong_units(plant, run) == ""
+    minutes = replace(run, inputs=60.0 * run.inputs, written={**run.written, "Q": "l/min"})
+    assert wrong_units(plant, minutes) == (
+        "units: by the volume balance of the tanks, the flows of Q are 60 times too large (write l/h in place of l/min)"
+    )
+
+
+def test_a_nearly_steady_level_speaks_the_more_against_a_unit_the_farther_it_is() -> None:
+    """The scale of the flows does not decide which combinations of b a recording under a constant flow determines."""
+    plant = build_plant(
+        {
+            "tanks": {"A": {"area": "43 cm^2", "height": "40 cm"}},
+            "pipes": {"out": {"source": "A", "area": "0.16 cm^2", "discharge_coefficient": 1.0}},
+            "pumps": {"P": {"target": "A", "max_flow": "200 ml/s"}},
+            "sensors": {"h": {"tank": "A"}},
+        },
+        "plant.yaml",
+    )
+    leaking = fdi_torch.simulate(
+        plant,
+        inputs={"P": "40 ml/s"},
+        duration="300 s",
+        sample_time="0.1 s",
+        faults={"A.leak": 0.3},
+        noise={"std": {"h": "1 mm"}},
+    )
+    volumes = volumes_along(plant, leaking)
+    balances = [[replace(volumes, metered=10.0 ** (sign * k) * volumes.metered) for k in range(8)] for sign in (-1, 1)]
+    for farther in balances:
+        evidence = [float(balance.log_evidence()) for balance in farther]
+        assert evidence == sorted(evidence, reverse=True)

@@ -17,7 +17,6 @@ from fdi_torch.config.simulation import noise_std, planned_recording
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.fitting import set_up, start_levels
 from fdi_torch.estimate.hybrid import HybridResult, estimate_parameters
-from fdi_torch.estimate.misfit import sample_noise
 from fdi_torch.jobs.run_setup import hybrid_settings, requested_space
 from fdi_torch.monitor.detection import NO_ALARM, Detector, make_detector
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
@@ -27,6 +26,7 @@ from fdi_torch.monitor.samples import samples_of_recording
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
+from fdi_torch.sample_noise import sample_noise
 from fdi_torch.simulate.simulated_recording import clean_readings, with_noise
 
 TIME_BETWEEN_FALSE_ALARMS = 20_000.0

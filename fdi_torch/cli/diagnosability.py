@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.loaded_recordings import read_recording
+from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.effects import full_name
@@ -49,7 +49,13 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 def _inputs(arguments: argparse.Namespace, plant: PlantDescription) -> tuple[Recording, bool]:
     """A recording with the inputs, and whether they are constant ones from the command line."""
     if Path(arguments.input).exists():
-        return read_recording(arguments.input, plant, Path.cwd()), False
+        recordings = named_recordings(arguments.input, plant, Path.cwd())
+        if len(recordings) > 1:
+            raise ValueError(
+                f"--input: expected one recording with known inputs, got {len(recordings)} in {arguments.input}; "
+                "name one file there, and select a part with start and stop"
+            )
+        return recordings[0], False
     units = plant.channel_units()
     amounts = arguments.input.split(",")
     if len(amounts) != len(units):

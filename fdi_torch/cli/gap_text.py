@@ -18,6 +18,7 @@ from fdi_torch.gap.verdict_words import (
     rounds,
     verdict_sentence,
 )
+from fdi_torch.names import listed
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_unit
@@ -64,7 +65,8 @@ def next_steps(
     moved = [name for name, c in answer.constants.items() if _tolerances_off(c, "augmented") > MOVED]
     if moved:
         steps.append(
-            f"with the causes too, {', '.join(moved)} is more than {MOVED:g} tolerances off: calibrate the plant "
+            f"even with the causes, {listed(moved)} {'is' if len(moved) == 1 else 'are'} more than {MOVED:g} "
+            "tolerances off their nominal values: calibrate the plant "
             "file with a fault-free recording (fdi refit --adopt), then repeat the diagnosis with the calibrated file"
         )
     if planned and answer.next_input:

@@ -35,7 +35,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         file.write(text)
     recording = f" --recording {arguments.recording}" if arguments.recording else ""
     correct = "correct what follows a !, then " if recording else ""
-    screen.say(f"{path}; next: {NEXT[arguments.kind].format(path, recording=recording, correct=correct)}")
+    to_complete = "complete the columns, then " if "column: ..." in text else ""
+    screen.say(f"{path}; next: {to_complete}{NEXT[arguments.kind].format(path, recording=recording, correct=correct)}")
     screen.result({"format": "fdi_torch.new/1", "file": str(path), "kind": arguments.kind})
     return DONE
 

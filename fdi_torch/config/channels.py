@@ -11,6 +11,7 @@ from fdi_torch.names import shortened, unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text, si_unit_of
 from fdi_torch.recordings.csv_files import read_header
+from fdi_torch.recordings.csv_text import HeaderlessError
 from fdi_torch.recordings.header import header_unit, names_in
 from fdi_torch.recordings.source import ChannelSource, ClockSource
 
@@ -118,44 +119,60 @@ def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[s
 
     also_known: channels that need no column. other_fix: a further way to supply inputs, with {inputs}.
     """
-    known = {*unrecorded_valves(path, plant), *also_known}
-    missing = [name for name in _without_column(path, _units(plant)) if name not in known]
+    missing = _missing(path, plant, also_known)
     if not missing:
         return
     inputs = [name for name in missing if name in plant.channels()]
-    found = ", ".join(map(shortened, read_header(path)))
+    header = ", ".join(map(shortened, _header(path)))
+    lines = "\n".join(f"    {line}" for line in mapped(path, plant, also_known))
     raise ValueError(
-        f"{path}: expected a column for {', '.join(missing)}, got {found}; "
-        f"{other_fix.format(inputs=inputs[0]) if other_fix and inputs else ''}if columns have other names, save these "
-        "lines as runs.yaml, completed and checked, and name runs.yaml instead:\n"
-        + "\n".join(_lines_to_complete(path, plant, missing))
+        f"{path}: expected a column for {', '.join(missing)}, got {header or 'numbers without a header'}; "
+        f"{other_fix.format(inputs=inputs[0]) if other_fix and inputs else ''}"
+        f"{'if columns have other names, ' if header else ''}save these lines as runs.yaml, completed and checked, and "
+        f"name runs.yaml instead:\nrecordings:\n  - file: {path.name}\n{lines}"
     )
 
 
-def _lines_to_complete(path: Path, plant: PlantDescription, missing: Sequence[str]) -> list[str]:
-    """A file that maps the missing channels, each to the next column with a unit of its kind, if there is one.
+def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()) -> list[str]:
+    """Lines for a recording file, to be completed, that map the channels without a column of their name in the table.
 
-    A file whose rows have more cells than its first line has no header: its columns are numbered.
+    Each is mapped to the next column with a unit of its kind, if there is one. A file whose rows have more cells than
+    its first line has no header: its columns are numbered. Empty if no channel lacks a column.
     """
-    header, width = read_header(path), len(read_header(path, header=False))
-    kinds, lines = _units(plant), ["recordings:", f"  - file: {path.name}"]
+    kinds, missing = _units(plant), _missing(path, plant, also_known)
+    if not missing:
+        return []
+    header, width = _header(path), len(read_header(path, header=False))
     if width > len(header):
-        lines += ["    header: false", f"    columns:    # by number, 1 to {width}", "      t: {column: 1, unit: s}"]
-        return [*lines, *(f"      {name}: {{column: ..., unit: ...}}" for name in missing)]
+        lines = ["header: false", f"columns:    # by number, 1 to {width}", "  t: {column: 1, unit: s}"]
+        return [*lines, *(f"  {name}: {{column: ..., unit: ...}}" for name in missing)]
     found = {column: si_unit_of(pair[1]) for column in header if (pair := header_unit(column)) and pair[0] not in kinds}
-    lines.append("    columns:    # units only where the header has none")
+    lines = ["columns:    # units only where the header has none"]
     for name in missing:
         column = next((c for c, kind in found.items() if kind == kinds[name]), None)
         found.pop(column or "", None)
-        lines.append(f"      {name}: {{column: " + (f'"{column}"}}' if column else "..., unit: ...}"))
+        lines.append(f"  {name}: {{column: " + (f'"{column}"}}' if column else "..., unit: ...}"))
     return lines
+
+
+def _missing(path: Path, plant: PlantDescription, also_known: Collection[str]) -> list[str]:
+    known = {*unrecorded_valves(path, plant), *also_known}
+    return [name for name in _without_column(path, _units(plant)) if name not in known]
+
+
+def _header(path: Path) -> tuple[str, ...]:
+    """The names of a table's columns; none if the table has no header."""
+    try:
+        return read_header(path)
+    except HeaderlessError:
+        return ()
 
 
 def _without_column(path: Path, names: Collection[str], config: FileConfig | None = None) -> list[str]:
     """The names that no header of a CSV file contains; none for an MCAP log."""
     if not names or is_log(path):
         return []
-    header = read_header(path) if config is None else read_header(path, config.header, config.sheet)
+    header = _header(path) if config is None else read_header(path, config.header, config.sheet)
     present = names_in(header)
     return [name for name in names if name not in present]
 

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib.resources import files
+from pathlib import Path
 from string import Template
 
+from fdi_torch.config.channels import mapped
+from fdi_torch.config.yaml_files import find_data
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recordings.csv_writing import header_of
+from fdi_torch.recordings.database import is_query
 
 
 def template(kind: str, plant: PlantDescription, plant_file: str, name: str, recording: str | None = None) -> str:
@@ -19,6 +23,12 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str, rec
     """
     header = header_of(plant.channel_units(), {s.column: s.unit for s in plant.sensors})
     file = f"{name}.csv             # with the header {header}" if recording is None else f'"{recording}"'
+    indent = "    " if kind == "run" else "  "
+    to_complete = [] if recording is None or is_query(recording) else mapped(find_data(recording, Path.cwd()), plant)
+    columns = to_complete or [
+        "# columns:                # for headers of other names",
+        f"#   {plant.sensors[0].column}: {{column: LT-101, unit: mm}}",
+    ]
     pipe = plant.pipes[0].name if plant.pipes else plant.tanks[0].name
     plugging = f"{pipe}.plugging" if plant.pipes else f"{pipe}.evaporation"
     constant = f"{pipe}.discharge_coefficient" if plant.pipes else f"{pipe}.area"
@@ -28,7 +38,7 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str, rec
         plant=plant_file,
         name=name,
         file=file,
-        output=plant.sensors[0].column,
+        columns="\n".join(indent + line for line in columns),
         leak=f"{plant.tanks[0].name}.leak",
         plugging=plugging,
         constant=constant,

@@ -15,6 +15,7 @@ from fdi_torch.plant.description import OUTSIDE
 from fdi_torch.quantities import significant, unit_factor
 from fdi_torch.recordings.csv_binding import bind_clock
 from fdi_torch.recordings.csv_files import read_csv, read_header
+from fdi_torch.recordings.csv_text import HeaderlessError
 from fdi_torch.recordings.header import header_unit
 from fdi_torch.units import spelled
 
@@ -55,7 +56,13 @@ def plant_from_recording(path: Path, name: str) -> str:
     A column is a reading if its unit is a length or a pressure, or if its name says so; if none is, each that may be.
     Others are commands. Raises ValueError if no column with a unit in its header can be a reading.
     """
-    header = read_header(path)
+    try:
+        header = read_header(path)
+    except HeaderlessError as error:
+        raise ValueError(
+            f"{path}: expected a header with names and units, got numbers; describe the plant with fdi new plant, then "
+            f"let fdi new run --plant FILE --recording {path} number the columns"
+        ) from error
     clock = bind_clock(path, header, None).header
     named = [column for column in header if column != clock]
     columns = _columns(path, [column for column in named if header_unit(column)])

@@ -24,12 +24,11 @@ from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.quantities import display_unit, displayed_in, parse_quantity
 
 _UNITS = {
-    "m": ("cm", "mm", "m", "ft", "in"),
-    "m^2": ("cm^2", "mm^2", "m^2", "ft^2", "in^2"),
+    "m": ("cm", "mm", "m", "dm", "ft", "in"),
+    "m^2": ("cm^2", "mm^2", "m^2", "dm^2", "ft^2", "in^2"),
     "m^3/s": ("cm^3/s", "l/min", "m^3/h", "gallon/min"),
     "m^3/s/V": ("cm^3/s/V", "l/min/V", "m^3/h/V"),
     "m^3/s/A": ("cm^3/s/mA", "l/min/mA", "m^3/h/mA"),
-    "m/s^2": ("cm/s^2",),
     "Pa": ("mbar", "kPa"),
     "Pa/m": ("mbar/cm", "kPa/m"),
     "A": ("mA",),
@@ -47,7 +46,7 @@ def dump_plant(plant: PlantDescription) -> str:
 def plant_mapping(plant: PlantDescription) -> dict[str, Any]:
     """The description as the mapping that `build_plant` reads, in the plant's units where these are exact."""
     with displayed_in(plant.units):
-        data: dict[str, Any] = {"name": plant.name, "gravity": _text(plant.gravity, "m/s^2")}
+        data: dict[str, Any] = {"name": plant.name, "gravity": f"{plant.gravity!r} m/s^2"}
         data["tanks"] = {t.name: _tank_mapping(t) for t in plant.tanks}
         for kind in FLOW_KINDS:
             data[kind.part()] = {c.name: _flow_mapping(c) for c in getattr(plant, kind.part())}
@@ -129,12 +128,14 @@ def _shares(values: dict[str, float]) -> dict[str, str | float]:
 
 def _text(value: float, unit: str) -> str | float:
     """'160 cm^2': the unit for display, or else the first customary unit, in which the number is short and reads back
-    exactly, else SI with all digits.
+    exactly. A number that is short in none has as many digits as it needs.
     """
     if unit == "1":
         return value
-    for shown in (display_unit(unit)[0], *_UNITS.get(unit, ()), unit):
-        short = f"{value / parse_quantity(f'1 {shown}', unit):.9g} {shown}"
-        if parse_quantity(short, unit) == value:
-            return short
+    units = dict.fromkeys((display_unit(unit)[0], *_UNITS.get(unit, ()), unit))
+    for digits in range(9, 18):
+        for shown in units:
+            text = f"{value / parse_quantity(f'1 {shown}', unit):.{digits}g} {shown}"
+            if parse_quantity(text, unit) == value:
+                return text
     return f"{value!r} {unit}"

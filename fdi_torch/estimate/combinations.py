@@ -12,6 +12,7 @@ import torch
 
 from fdi_torch.amounts import with_error
 from fdi_torch.estimate.information import Certainty, determined_combinations
+from fdi_torch.names import listed
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.quantities import display_unit
 
@@ -124,7 +125,3 @@ def undetermined_groups(space: ParameterSpace, theta: torch.Tensor, sure: Certai
 
 def _verb(subjects: Sequence[str]) -> str:
     return "is" if len(subjects) == 1 else "are"
-
-
-def listed(items: Sequence[str], word: str = "and") -> str:
-    return items[0] if len(items) == 1 else ", ".join(items[:-1]) + f" {word} " + items[-1]

@@ -12,8 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.amounts import estimate_words, parameter_words, sized_words
-from fdi_torch.estimate.combinations import Combination, listed
+from fdi_torch.estimate.combinations import Combination
 from fdi_torch.estimate.misfit import Misfit
+from fdi_torch.names import listed
 from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace, common_name
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork

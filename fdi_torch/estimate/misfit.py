@@ -17,6 +17,7 @@ from jaxtyping import Float
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.repeated_readings import resolution
+from fdi_torch.sample_noise import sample_noise
 
 UNEXPLAINED_RATIO = 1.2
 """The model is rejected if the standard deviation of its residuals exceeds this multiple of the noise of a sensor."""
@@ -79,18 +80,3 @@ def least_noise(values: Float[torch.Tensor, "S C"], weight: Float[torch.Tensor, 
         max(resolution(x) / math.sqrt(12.0), EXACT * float(x.abs().max()), 1e-12) if len(x) else 1.0 for x in valid
     ]
     return values.new_tensor(least)
-
-
-def sample_noise(values: Float[torch.Tensor, "S C"], weight: Float[torch.Tensor, "S C"]) -> Float[torch.Tensor, " C"]:
-    """Model-free estimate of the readings' noise (C,) from second differences of neighbouring samples (S, C).
-
-    sigma = median |y_{s+1} - 2 y_s + y_{s-1}| / (0.6745 sqrt 6). Second differences remove a smooth signal, and the
-    median is robust against a few switching events (Hall, Kay & Titterington 1990). weight (S, C): 0 masks a reading.
-    """
-    valid = (weight[2:] > 0) & (weight[1:-1] > 0) & (weight[:-2] > 0)
-    second = (values[2:] - 2.0 * values[1:-1] + values[:-2]).abs() / math.sqrt(6.0)
-    levels = [
-        second[:, c][valid[:, c]].median() / 0.6745 if bool(valid[:, c].any()) else second.new_zeros(())
-        for c in range(values.shape[1])
-    ]
-    return torch.stack(levels)

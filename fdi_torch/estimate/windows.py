@@ -19,13 +19,13 @@ from fdi_torch.estimate.fitting import Fitting, readings_of
 from fdi_torch.estimate.hybrid import search_box
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
-from fdi_torch.estimate.misfit import sample_noise
 from fdi_torch.estimate.objectives import Problem, Term
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
+from fdi_torch.sample_noise import sample_noise
 from fdi_torch.simulate.engine import Engine, Readings
 from fdi_torch.simulate.step_length import choose_step, probe_points, step_ladder
 

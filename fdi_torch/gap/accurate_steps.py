@@ -15,12 +15,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fdi_torch.estimate.misfit import least_noise, sample_noise
+from fdi_torch.estimate.misfit import least_noise
 from fdi_torch.gap.dataset import DataSet, RecordingPart
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.network import TankNetwork
+from fdi_torch.sample_noise import sample_noise
 from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.experiment import divided
 

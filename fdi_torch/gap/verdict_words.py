@@ -11,6 +11,7 @@ from typing import Any
 from fdi_torch.amounts import effect_words
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import UNKNOWN
+from fdi_torch.names import listed
 from fdi_torch.quantities import quantity_text
 
 FORMAT_1 = "fdi_torch.gap/1"
@@ -59,7 +60,7 @@ def cause_words(cause: Named) -> str:
 
 def explanation_words(causes: Sequence[Named]) -> str:
     """'leak at T1 and pump lag at Q1', or that nothing lies beyond tolerances; without the rounding of readings."""
-    return " and ".join(map(cause_words, apart_from_rounding(causes))) or "nothing beyond tolerances"
+    return listed([cause_words(cause) for cause in apart_from_rounding(causes)]) or "nothing beyond tolerances"
 
 
 def probability_words(probability: float) -> str:
@@ -109,7 +110,7 @@ def _with_equivalents(explanation: Sequence[Named], fitted: Sequence[Named]) -> 
     """'plugging at drain, or equivalently leak at B'. fitted: the causes with their equivalents."""
     words = {cause_words(c): equivalents_words(c) for c in fitted}
     names = [cause_words(cause) for cause in apart_from_rounding(explanation)]
-    return " and ".join(name + words.get(name, "") for name in names) or explanation_words([])
+    return listed([name + words.get(name, "") for name in names]) or explanation_words([])
 
 
 def equivalents_words(cause: Named) -> str:

@@ -19,6 +19,7 @@ from fdi_torch.estimate.combinations import undetermined_groups
 from fdi_torch.estimate.fitting import StartLevels, set_up
 from fdi_torch.estimate.information import certainty
 from fdi_torch.monitor.structural_analysis import structure_of
+from fdi_torch.names import listed
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import Pipe, PlantDescription, Tank
 from fdi_torch.recording import Recording
@@ -171,9 +172,8 @@ def _groups(plant: PlantDescription, faults: Sequence[str], apart: Tensor) -> li
         remaining = [j for j in others if j not in identical]
         if identical:
             members = [faults[first], *(faults[j] for j in identical)]
-            texts.append(
-                f"{' and '.join(map(parameter_words, members))} cannot be told apart: {_reason(plant, members)}"
-            )
+            words = listed([parameter_words(member) for member in members])
+            texts.append(f"{words} cannot be told apart: {_reason(plant, members)}")
     return texts
 
 

@@ -17,9 +17,9 @@ from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
-from fdi_torch.estimate.misfit import sample_noise
 from fdi_torch.estimate.objectives import Objective, Problem, Term, spread_of
 from fdi_torch.plant.scales import time_scale
+from fdi_torch.sample_noise import sample_noise
 from fdi_torch.simulate.engine import Readings
 
 # Integration steps of search and refinement, in units of the plant's time scale; their error over a window is far below

@@ -126,6 +126,10 @@ def _encoding(path: Path, start: bytes) -> str:
     return "utf-8-sig"
 
 
+class HeaderlessError(ValueError):
+    """A table without a header, read as if it had one."""
+
+
 def heading_of(path: Path, lines: Iterable[str], header: bool = True) -> tuple[Heading, Iterator[str]]:
     """The heading, and an iterator over the lines below it.
 
@@ -144,7 +148,7 @@ def heading_of(path: Path, lines: Iterable[str], header: bool = True) -> tuple[H
             delimiter = separator or _delimiter(line, header)
             names = _cells(path, line, delimiter, number - 1)
             if header and _ALL_NUMBERS.fullmatch(line):
-                raise ValueError(
+                raise HeaderlessError(
                     f"{path}: row {number}: expected a header line such as t_s,Q1_cm3_s,h1_cm, got numbers; for a file "
                     "without one, write header: false, and number the columns: columns: {h1: {column: 4, unit: mm}}"
                 )

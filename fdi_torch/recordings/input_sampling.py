@@ -21,7 +21,8 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.channel_finding import ChannelFinding
-from fdi_torch.recordings.repeated_readings import BY_CHANCE, NORMAL_MEDIAN, resolution
+from fdi_torch.recordings.repeated_readings import BY_CHANCE, resolution
+from fdi_torch.sample_noise import sample_noise
 
 TWO_SAMPLES_A_HOLD = 0.5
 """Correlation of successive samples of a command that is held for two samples: 1 - (sampling interval) / (hold)."""
@@ -112,7 +113,6 @@ def _scatter(recording: Recording, plant: PlantDescription, tank: str) -> float:
         if sensor.tank == tank and sensor.column in recording.output_names:
             column = recording.output_names.index(sensor.column)
             values = recording.outputs[recording.mask[:, column], column] / sensor.gain
-            if len(values) > 2:  # second differences of white noise of unit size are normal, with a variance of 6
-                scatter = float(torch.diff(values, n=2).abs().median()) / (NORMAL_MEDIAN * 6.0**0.5)
-                scatters.append(max(scatter, resolution(values)))
+            if len(values) > 2:
+                scatters.append(max(float(sample_noise(values[:, None])), resolution(values)))
     return min(scatters)

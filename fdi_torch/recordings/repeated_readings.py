@@ -18,10 +18,10 @@ from dataclasses import dataclass
 
 import torch
 
+from fdi_torch.sample_noise import sample_noise
+
 BY_CHANCE = 1e-3
 """Probability of a false detection in a recording of a sound sensor."""
-NORMAL_MEDIAN = 0.6745
-"""Median of |x| for a standard normal x."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def scatter(values: torch.Tensor) -> Scatter:
     step = resolution(values)
     if len(values) < 3 or step == 0.0:
         return Scatter(0.0, step)
-    total = float(torch.diff(values, n=2).abs().median()) / (NORMAL_MEDIAN * math.sqrt(6.0))
+    total = float(sample_noise(values[:, None]))
     return Scatter(math.sqrt(total**2 - step**2 / 12.0) if total > step else 0.0, step)
 
 

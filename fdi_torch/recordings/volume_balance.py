@@ -32,6 +32,9 @@ GROUPS, SUMS = 16, 4
 DEVIATION = 0.1
 """How far an inexact constant, an unmodelled effect or a fault usually moves a coefficient from 1: less than this in
 three of four coefficients of the practice recordings that are determined to 0.1."""
+SCALE = DEVIATION / math.tan(0.375 * math.pi)
+"""Scale of the Cauchy distribution that has three quarters within DEVIATION. It has half within 0.04, 90 % within 0.26
+and 95 % within 0.53; of 1009 coefficients of 186 practice recordings it is 0.04, 0.28 and 0.51."""
 UNRELATED = 0.1
 """Probability that a tank's readings do not depend on its flows: swapped channels, a stuck sensor."""
 
@@ -105,7 +108,7 @@ def _log_evidence(terms: Tensor, rounding: float) -> float:
 
     rounding: half of the digits of the largest volume of all tanks, m^3.
 
-    The prior of b is the multivariate Cauchy distribution of centre 1 and scale DEVIATION, a mixture of normal ones of
+    The prior of b is the multivariate Cauchy distribution of centre 1 and scale SCALE, a mixture of normal ones of
     variance v; the tank is UNRELATED if b = 0. With b in the directions of the eigenvectors of its information, whose
     eigenvalues are l, each normal one gives
 
@@ -121,8 +124,8 @@ def _log_evidence(terms: Tensor, rounding: float) -> float:
     information, directions, off = _regression(sums, rounding)
     if not bool((information > 0.0).any()):
         return math.nan
-    variance = DEVIATION**2 * torch.logspace(-2, 16, 73).to(off)
-    share = torch.log_softmax(-0.5 * (variance.log() + DEVIATION**2 / variance), dim=0)
+    variance = SCALE**2 * torch.logspace(-2, 16, 73).to(off)
+    share = torch.log_softmax(-0.5 * (variance.log() + SCALE**2 / variance), dim=0)
     wider = 1.0 + variance[:, None] * information
     squares = information * (off @ directions).square()
     related = torch.logsumexp(share - 0.5 * (wider.log() + squares / wider).sum(-1), dim=0)
@@ -134,7 +137,9 @@ def _regression(sums: Tensor, rounding: float) -> tuple[Tensor, Tensor, Tensor]:
     """Eigenvalues (2) and eigenvectors (2, 2) of the information of b, and b - 1 (2), by sums (GROUPS, SUMS, 3).
 
     In steady state without noise, the sums differ by rounding only, and their scatter is no measure of their errors;
-    each counts as uncertain by `rounding`, m^3, at least.
+    each counts as uncertain by `rounding`, m^3, at least. Whether a direction is determined is asked of flows scaled to
+    their root mean square, so that the answer does not depend on units; the smaller eigenvalue is then the determinant
+    divided by the larger one.
     """
     flows, excess = sums[..., 1:], sums[..., 0] - sums[..., 1] - sums[..., 2]
     rms = flows.square().mean(dim=(0, 1)).sqrt()
@@ -144,9 +149,13 @@ def _regression(sums: Tensor, rounding: float) -> tuple[Tensor, Tensor, Tensor]:
     off = _inverse(product) @ torch.einsum("gni,gn->i", scaled, excess)
     scores = torch.einsum("gni,gn->gi", scaled, excess - scaled @ off)
     variance = scores.T @ scores * GROUPS / (GROUPS - 2) + rounding**2 * product
-    eigenvalues, eigenvectors = torch.linalg.eigh(size[:, None] * (product @ _inverse(variance) @ product) * size)
-    exact = eigenvalues > 2.0 * torch.finfo(sums.dtype).eps * eigenvalues[-1]
-    return torch.where(exact, eigenvalues, 0.0), eigenvectors, off / size
+    information = product @ _inverse(variance) @ product
+    smaller, larger = torch.linalg.eigvalsh(information)
+    eigenvalues, eigenvectors = torch.linalg.eigh(size[:, None] * information * size)
+    determinant = smaller * larger * size.square().prod()
+    both = smaller > 2.0 * torch.finfo(sums.dtype).eps * larger
+    least = torch.where(both, determinant / eigenvalues[1], 0.0)
+    return torch.stack([least, eigenvalues[1]]), eigenvectors, off / size
 
 
 def _inverse(matrix: Tensor) -> Tensor:

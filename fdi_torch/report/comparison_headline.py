@@ -13,6 +13,7 @@ import orjson
 
 from fdi_torch.amounts import effect_words
 from fdi_torch.logbook import Comparison
+from fdi_torch.names import listed
 from fdi_torch.quantities import quantity_text
 from fdi_torch.report.html import short
 from fdi_torch.report.material import Material
@@ -33,7 +34,7 @@ def comparison_headline(compared: Comparison, runs: Sequence[Material]) -> list[
     failing = [n for n, run in zip(compared.labels, runs, strict=True) if _is_unexplained(run)]
     words = [_better(compared, runs)]
     if failing:
-        words.append(f"Unreliable: {_listed(failing)} (the model does not explain the recording).")
+        words.append(f"Unreliable: {_first(failing)} (the model does not explain the recording).")
     return [*words, _differences(compared, runs)]
 
 
@@ -62,7 +63,7 @@ def _better(compared: Comparison, runs: Sequence[Material]) -> str:
     if smaller <= chance:
         by = percent(smaller) if smaller >= 1e-3 else "less than 0.1 %"
         return f"{best} and {next_best} explain the recording equally well: residuals differ by {by}."
-    errors = _listed([_both(name, residuals[first][name], residuals[second][name]) for name in common])
+    errors = _first([_both(name, residuals[first][name], residuals[second][name]) for name in common])
     return (
         f"{best} explains the recording best: its residuals are {percent(smaller)} smaller than those of {next_best} "
         f"({errors})."
@@ -105,7 +106,7 @@ def _differences(compared: Comparison, runs: Sequence[Material]) -> str:
         parts.append(f"{len(settings) - MOST_LISTED} more settings")
     if any(compared.differences.get(section) for section in VERSIONS):
         parts.append("versions of the software")
-    return f"They differ in {_listed(parts)}." if parts else "Recording, settings and versions are the same."
+    return f"They differ in {_first(parts)}." if parts else "Recording, settings and versions are the same."
 
 
 def setting_differences(compared: Comparison) -> dict[str, tuple[str, ...]]:
@@ -152,6 +153,6 @@ def _recordings(run: Material) -> str:
     return ", ".join(names) or "simulated"
 
 
-def _listed(texts: Sequence[str]) -> str:
+def _first(texts: Sequence[str]) -> str:
     shown = [*texts[:MOST_LISTED], *([f"{len(texts) - MOST_LISTED} more"] if len(texts) > MOST_LISTED else [])]
-    return ", ".join(shown[:-1]) + (" and " if len(shown) > 1 else "") + shown[-1]
+    return listed(shown)

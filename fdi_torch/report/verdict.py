@@ -11,7 +11,7 @@ from fdi_torch.estimate.combinations import Combination
 from fdi_torch.estimate.misfit import UNRELIABLE, Misfit
 from fdi_torch.estimate.uncertainty import convergence_warning
 from fdi_torch.gap.verdict_words import verdict_sentence
-from fdi_torch.names import counted
+from fdi_torch.names import counted, listed
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
@@ -79,7 +79,7 @@ def fault_words(material: Material) -> str:
         return "No fault found"
     count = len(present) + len(not_isolated)
     kind = f"{count} faults" if count > 1 else "Fault" if present else "Fault not isolated"
-    return f"{kind}: {_listed(present + not_isolated)}"
+    return f"{kind}: {listed(present + not_isolated)}"
 
 
 def _rivals(combination: Combination) -> str:
@@ -88,7 +88,7 @@ def _rivals(combination: Combination) -> str:
 
 def gap_words(material: Material) -> str:
     """The sentence of the terminal, with the sizes of the named causes."""
-    sized = _listed([finding.sized + finding.equivalents for finding in diagnosed_effects(material)])
+    sized = listed([finding.sized + finding.equivalents for finding in diagnosed_effects(material)])
     return verdict_sentence(material.answer, sized).removesuffix(".")
 
 
@@ -110,7 +110,7 @@ def monitor_words(material: Material) -> str:
 def _latest(what: str, items: list[str]) -> str:
     """All of a few items; the number of many and the latest, as the others are among the events."""
     if len(items) <= MOST_LISTED:
-        return _listed(items)
+        return listed(items)
     return f"{len(items)} {what}, the latest: {items[-1]}"
 
 
@@ -128,7 +128,7 @@ def alarm_words(material: Material) -> str:
     alarms = [m for m in material.of("/observer/alarm") if m.get("event") in ("alarm", "raised")]
     if not alarms:
         return "No alarm"
-    channels = _listed(list(dict.fromkeys(str(m["channel"]) for m in alarms if m.get("channel"))))
+    channels = listed(list(dict.fromkeys(str(m["channel"]) for m in alarms if m.get("channel"))))
     first = f"the first at {number(float(alarms[0]['t']), 6)} s"
     return f"{counted(len(alarms), 'alarm')}, {first}{': ' + channels if channels else ''}"
 
@@ -148,7 +148,7 @@ def rehearsal_words(material: Material) -> str:
         words = "; ".join(str(entry["said"]) for entry in tables if entry.get("said"))
         return words[:1].upper() + words[1:]
     groups = [str(m.get("group", "")) for m in material.of("/study/trial")] if material.kind == "rehearsal" else []
-    plans = _listed(list(dict.fromkeys(group.partition("/")[0] for group in groups)))
+    plans = listed(list(dict.fromkeys(group.partition("/")[0] for group in groups)))
     return plans[:1].upper() + plans[1:] + ("" if tables or not plans else ", without a result yet")
 
 
@@ -180,7 +180,7 @@ def windows_words(material: Material) -> str:
     for stretch in stretches:
         spans = when.setdefault(parameter_words(str(stretch["name"])), [])
         spans.append(f"{number(float(stretch['start']), 6)} to {number(float(stretch['stop']), 6)} s")
-    text = "; ".join(f"{fault} from {_listed(spans)}" for fault, spans in when.items()) or "no fault in any window"
+    text = "; ".join(f"{fault} from {listed(spans)}" for fault, spans in when.items()) or "no fault in any window"
     return text[:1].upper() + text[1:]
 
 
@@ -203,7 +203,3 @@ def _rounded(seconds: str) -> str:
         return number(float(seconds), 3)
     except ValueError:
         return seconds
-
-
-def _listed(items: list[str]) -> str:
-    return ", ".join(items[:-1]) + " and " + items[-1] if len(items) > 1 else "".join(items)

@@ -12,9 +12,10 @@ from torch import Tensor
 from fdi_torch.estimate.evolution import distant_members, evolve
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
-from fdi_torch.estimate.misfit import UNEXPLAINED_RATIO, sample_noise
+from fdi_torch.estimate.misfit import UNEXPLAINED_RATIO
 from fdi_torch.estimate.objectives import OBJECTIVES, Objective, Problem, Term, spread_of
 from fdi_torch.estimate.refined import CONVERGED, STATUSES, Refined
+from fdi_torch.sample_noise import sample_noise
 from fdi_torch.simulate.engine import Engine, Readings
 from fdi_torch.study.study_plan import Block, Plan
 from fdi_torch.study.trial_readings import limits, make_trials

@@ -29,7 +29,7 @@ from fdi_torch.logbook import RunLog, read_run
 from fdi_torch.report.diagnosed_effects import diagnosed_effects
 from fdi_torch.report.material import gather
 from fdi_torch.report.page import RunReport, page, report_of, unbroken
-from fdi_torch.report.sections.before_after import profile_section, sample_noise
+from fdi_torch.report.sections.before_after import profile_section
 from fdi_torch.report.verdict import _latest, headline
 
 DATA = Path(__file__).parents[1] / "data"
@@ -151,12 +151,6 @@ def test_a_page_of_the_first_format_says_what_its_shares_are(gap_page: str) -> N
     assert "Share of the gap that a free discrepancy there alone closes." in text
     assert "something is wrong there" not in text and "Random flows" not in text
     assert "something unknown at Q1" in text, "which the first format says in a field of its own"
-
-
-def test_noise_is_seen_through_a_moving_signal() -> None:
-    time = np.arange(5000.0)
-    noise = np.random.default_rng(0).standard_normal((5000, 2)) * (1e-3, 5e-3)
-    assert sample_noise(np.sin(time / 50)[:, None] + noise) == pytest.approx([1e-3, 5e-3], rel=0.05)
 
 
 def test_a_monitor_page_shows_residuals_thresholds_and_events(tmp_path: Path) -> None:

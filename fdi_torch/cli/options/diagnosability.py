@@ -26,7 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--input",
         metavar="FILE|AMOUNTS",
         required=True,
-        help="a recording whose inputs are used, or constant inputs such as '50 cm^3/s,50 cm^3/s'",
+        help="a recording (or a YAML file that lists one) whose inputs are used, or constant inputs "
+        "such as '50 cm^3/s,50 cm^3/s'",
     )
     parser.add_argument(
         "--duration",

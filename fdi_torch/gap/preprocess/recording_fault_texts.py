@@ -52,9 +52,8 @@ def clock_offset(columns: tuple[str, ...], delay: float, everything: bool) -> Re
 def not_held(channels: Sequence[str], interval: float) -> RecordingFault:
     """Commands whose values between samples, `interval` seconds apart, are unknown."""
     text = (
-        f"{', '.join(channels)}: moves between its samples, one every {interval:g} s: the level of its tank changes "
-        "before the command that changes it is read, so that the flow between samples is unknown; log it faster, or "
-        "its mean over each interval"
+        f"{', '.join(channels)}: the flow between samples, one every {interval:g} s, is unknown: levels change before "
+        "the command that changes them is read; log commands faster, or their mean over each interval"
     )
     return RecordingFault(tuple(channels), text)
 

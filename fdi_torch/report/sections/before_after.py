@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+import torch
 
 from fdi_torch.logbook import Signals
 from fdi_torch.report.chart import Chart, Line
@@ -13,6 +14,7 @@ from fdi_torch.report.numbers import as_float, axis, shown_unit
 from fdi_torch.report.predictions import MODELS, holdout_prefix
 from fdi_torch.report.section import Picture, Section, signals
 from fdi_torch.report.sections.signals import clock_of
+from fdi_torch.sample_noise import sample_noise
 
 BINS = 24
 
@@ -86,16 +88,9 @@ def _noise(material: Material, recording: Signals, read: np.ndarray) -> np.ndarr
     """Noise (N,) by which the diagnosis weighed each sensor, rounding included; of the samples where it is unknown."""
     stated = material.answer.get("noise") or {}
     std = [as_float((stated.get(name) or {}).get("std")) for name in recording.output_names]
-    return np.where(np.array(std) > 0.0, std, sample_noise(read))
-
-
-def sample_noise(read: np.ndarray) -> np.ndarray:
-    """Noise (N,) of readings (T, N) from their second differences, by the median (Hall, Kay & Titterington 1990)."""
-    second = np.abs(np.diff(read, 2, axis=0)) / np.sqrt(6.0)
-    noise = [
-        np.median(column[np.isfinite(column)]) / 0.6745 if np.isfinite(column).any() else 0.0 for column in second.T
-    ]
-    return np.maximum(np.array(noise), 1e-12)
+    readings = torch.from_numpy(read)
+    of_samples = sample_noise(readings.nan_to_num(), torch.isfinite(readings).double()).clamp(min=1e-12)
+    return np.where(np.array(std) > 0.0, std, of_samples.numpy())
 
 
 def _variables(material: Material, recording: Signals) -> Iterator[tuple[str, str, np.ndarray]]:
