@@ -4,8 +4,8 @@
 
 A trajectory is solved by Newton's method on blocks of steps, from a nearby trajectory if there is one. About it, one
 call evaluates the right-hand side of all steps and its slopes, from one trace of the equations; the sensitivities to
-theta obey a linear recurrence. Local error of the
-rule: dt^2 h'''/24 per second; below 1e-3 cm for 1 s steps on the three-tank plant.
+theta obey a linear recurrence. Local error of the rule: dt^2 h'''/24 per second; below 1e-3 cm for 1 s steps on the
+three-tank plant.
 
 Internally time is the last dimension; the documented shapes are those of arguments and results. L lanes (parameter
 vectors), K steps, S samples, C sensors, P parameters.
