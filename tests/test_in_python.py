@@ -190,8 +190,10 @@ def test_a_monitor_runs_along_a_recording_in_memory(tmp_path: Path) -> None:
     wanted = {"plant": RIG, "recording": recording, "fault_free": ["0 s", "300 s"], "faults": ["A.leak"]}
     wanted["output"] = {"folder": str(tmp_path)}
     found = fdi_torch.monitor(wanted)
-    size, error = re.fullmatch(r"1 alarm in 700 s; leak at A \(size (.*) ± (.*)\)", found.headline).groups()  # type: ignore[union-attr]
-    assert abs(float(size) - 0.3) < 3.0 * float(error) < 0.01
+    headline = r"1 alarm in 700 s; leak at A \(size (.*) ± (.*), (.*) l/min now\)"
+    size, error, flow = map(float, re.fullmatch(headline, found.headline).groups())  # type: ignore[union-attr]
+    assert abs(size - 0.3) < 3.0 * error < 0.01
+    assert 0.0 < flow < 3.0  # of the inflow
     table = found.table().columns
     kinds = [kind for kind in table["kind"] if kind not in ("notice", "watching")]
     assert kinds[:2] == ["alarm", "isolated"]

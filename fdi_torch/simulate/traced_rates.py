@@ -84,7 +84,7 @@ class TracedRates:
 
     def solve(
         self,
-        path: Float[Tensor, "L n K+1"],
+        path: Float[Tensor, "L n nodes"],
         commands: Sequence[Float[Tensor, "#L K"]],
         theta: Float[Tensor, "L P"],
         nominal: Float[Tensor, " constants"],
