@@ -35,6 +35,12 @@ BOTH = Answer(
 )
 
 
+@pytest.mark.parametrize(("most_closed", "warned"), [(-0.1, True), (0.1, False)])
+def test_the_verdict_says_that_causes_make_the_holdout_worse(most_closed: float, warned: bool) -> None:
+    said = verdict_sentence(replace(BOTH, closure={"closed": -0.5, "closed_ci95": [-0.9, most_closed]}).to_dict())
+    assert said.endswith("On the hold-out, these causes make the prediction worse: do not adopt them.") is warned
+
+
 def test_the_terminal_prints_the_unknown_and_the_named_causes(capsys: pytest.CaptureFixture[str]) -> None:
     show(BOTH, nominal_plant(), [], Screen())
     said = capsys.readouterr().out

@@ -75,7 +75,17 @@ def verdict_sentence(answer: Named, best: str = "") -> str:
 
     best: the likeliest explanation in words, for example with sizes; by default without.
     """
-    return f"{_verdict(answer, best)} {rounding_words(answer.get('causes') or [])}".strip()
+    sentences = _verdict(answer, best), _holdout_words(answer), rounding_words(answer.get("causes") or [])
+    return " ".join(filter(None, sentences))
+
+
+def _holdout_words(answer: Named) -> str:
+    """A warning if the causes surely make the prediction of a hold-out worse."""
+    closure = answer.get("closure")
+    interval = closure.get("closed_ci95") if isinstance(closure, Mapping) else None
+    most = interval[-1] if isinstance(interval, list | tuple) and interval else None
+    worse = isinstance(most, int | float) and most < 0.0
+    return "On the hold-out, these causes make the prediction worse: do not adopt them." if worse else ""
 
 
 def _verdict(answer: Named, best: str) -> str:
