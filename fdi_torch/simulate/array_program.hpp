@@ -112,9 +112,10 @@ struct Trajectory {
     double *middle, *path; // path (lanes, n, steps + 1)
 };
 
-// One correction by Newton's method of the steps from `first` to `last`; returns the largest, or NaN.
+// One correction by Newton's method of the steps from `first` to `last`, of which a share is taken; returns the largest,
+// or NaN.
 static double correct(const Program& program, const Trajectory& x, int64_t lane, int64_t first, int64_t last,
-                      Register* registers) {
+                      double share, Register* registers) {
     const int64_t n = x.n;
     double* path = x.path + lane * n * (x.steps + 1);
     for (int64_t i = 0; i < n; ++i) {
@@ -141,7 +142,7 @@ static double correct(const Program& program, const Trajectory& x, int64_t lane,
         solve(n, matrix.data(), right.data());
         change.swap(right);
         for (int64_t i = 0; i < n; ++i) {
-            path[i * (x.steps + 1) + t + 1] += change[i];
+            path[i * (x.steps + 1) + t + 1] += share * change[i];
             if (!(std::fabs(change[i]) <= largest)) largest = std::fabs(change[i]);
             if (std::isnan(largest)) return largest;
         }
@@ -152,7 +153,8 @@ static double correct(const Program& program, const Trajectory& x, int64_t lane,
 // The trajectories from the first state of each lane in `path`, by Newton's method on one block of steps after the other.
 // A block starts from what `path` holds, if that is a guess, and then from the constant state at its start. If neither
 // converges within `rounds`, the block is halved: at the kink of a rim or a floor, the slopes on one side of it would
-// hold for all later steps.
+// hold for all later steps. In a single step, Newton's method may jump from one side of a kink to the other for ever,
+// unless it takes smaller and smaller shares of its corrections.
 extern "C" void solve_trajectories(const Program* program, const Trajectory* trajectory, int64_t guessed,
                                    double tolerance, int64_t rounds) {
     const Trajectory& x = *trajectory;
@@ -169,7 +171,10 @@ extern "C" void solve_trajectories(const Program* program, const Trajectory* tra
             }
             bool converged = false;
             for (int64_t round = 0; round < rounds && !converged; ++round)
-                converged = correct(*program, x, lane, first, last, registers) < tolerance;
+                converged = correct(*program, x, lane, first, last, 1.0, registers) < tolerance;
+            for (double share = 0.5; share > 1e-3 && !converged && last - first == 1; share *= 0.5)
+                for (int64_t round = 0; round < rounds && !converged; ++round)
+                    converged = correct(*program, x, lane, first, last, share, registers) < tolerance;
             if (!converged && (!constant || last - first > 1)) {
                 if (constant) length = (last - first) / 2;
                 constant = true;
