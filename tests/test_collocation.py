@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from fdi_torch.effects import build_network, place
+import fdi_torch
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.effects import build_network, place, placements_for
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
 from fdi_torch.simulate import array_program
@@ -19,7 +22,7 @@ from fdi_torch.simulate.midpoint import newton_step
 from fdi_torch.simulate.output_map import SampleGrid
 from fdi_torch.simulate.reference_engine import ReferenceEngine
 from fdi_torch.simulate.scan import scan_in_time
-from tests.rigs import constant_inputs, three_tank
+from tests.rigs import blank_recording, constant_inputs, three_tank
 
 
 def stepped(duration: float = 200.0) -> Recording:
@@ -164,6 +167,32 @@ def test_a_trajectory_with_kinks_does_not_depend_on_the_guess(kinked: tuple[Coll
     engine, theta = kinked
     levels = engine.trajectories(theta)
     assert torch.allclose(engine.trajectories(theta, torch.full_like(levels, guess)), levels, rtol=0, atol=1e-9)
+
+
+def test_a_tank_without_an_outlet_rises_by_what_flows_in() -> None:
+    tank, pump = fdi_torch.Tank("A", area="100 cm^2", height="50 cm"), fdi_torch.Pump("Q", "A", max_flow="60 l/min")
+    plant = fdi_torch.Plant(tanks=[tank], pumps=[pump], sensors=[fdi_torch.Sensor("h", "A")])
+    blank = constant_inputs(plant, 100.0)
+    recording = replace(blank, inputs=torch.full_like(blank.inputs, 1e-5))
+    network = build_network(plant).without_overflow()
+    space = ParameterSpace([network.constants["A.start_level"]])
+    theta = torch.tensor([[0.1], [0.2]], dtype=torch.float64)
+    levels = Collocation(network, space, lay_out(recording, plant.channels(), 1.0)).trajectories(theta)[..., 0]
+    time = torch.arange(levels.shape[1], dtype=torch.float64)
+    assert torch.allclose(levels, theta + 1e-3 * time, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("crest", [0.5, 1.0])
+def test_a_step_over_the_crest_of_a_wide_overflow_is_solved(crest: float) -> None:
+    """In steps of 4 s, Newton's method jumps from one side of the crest to the other."""
+    plant = load_plant(Path(__file__).parents[1] / "configs" / "real" / "cascaded_tanks_nominal.yaml")
+    values = {"upper.overflow.below_rim": 0.19, "upper.overflow.crest": crest, "upper.overflow.to_lower": 0.65}
+    time = 4.0 * torch.arange(1000, dtype=torch.float64)
+    blank = blank_recording(plant, (3.0 + 2.5 * torch.sin(0.01 * time)).unsqueeze(1), time)
+    network = build_network(plant, placements_for(values))
+    space = ParameterSpace(network.constants[n] for n in values)
+    engine = Collocation(network, space, lay_out(blank, plant.channels(), 4.0))
+    assert float(engine.converge(space.vector(values).unsqueeze(0)).defect.max()) < 1e-6
 
 
 @both_loops

@@ -19,7 +19,8 @@ from fdi_torch.effects import build_network
 from fdi_torch.monitor import noise_model
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.fault_free_checks import false_alarm_rate_text
-from fdi_torch.monitor.flow_filter import estimate_flow_filter, forcing
+from fdi_torch.monitor.flow_filter import forcing
+from fdi_torch.monitor.flow_noise_estimate import estimate_flow_filter
 from fdi_torch.monitor.noise_model import learn_noise, noise_of_gain, operating_point
 from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.observer_gain import hand_gain

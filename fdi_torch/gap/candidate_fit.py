@@ -2,8 +2,8 @@
 
     chi^2(theta) = |W (y - y(theta))|^2 + sum ((theta - nominal) / tolerance)^2
 
-W whitens the residual with the sensor noise and, where there are random flows, with a Kalman filter. Trajectories are
-fitted together with the parameters (`trajectory_problem.py`).
+W whitens the residual with the sensor noise and, where there are random flows, with a Kalman filter.
+`trajectory_problem.py` minimises this for one candidate.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Fitter:
         cap: int = CAP,
         held: Collection[str] = (),
     ) -> Fit:
-        """Fit all starts of a candidate and return the best. Nuisance parameters and trajectory start from `base`.
+        """Fit all starts of a candidate and return the best. Nuisance parameters start from `base`.
 
         target: cost of the competitor; starts that approach it too slowly are given up. cap: most evaluations. held:
         parameters that keep their initial values.

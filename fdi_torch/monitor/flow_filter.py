@@ -1,4 +1,4 @@
-"""Random flows into the tanks in the monitor's residual: their estimate, and the Kalman filter that takes them out.
+"""Random flows into the tanks in the monitor's residual: the Kalman filter that takes them out.
 
 The noise model is that of the gap diagnosis (estimate/state_noise.py): flows w with a correlation time, measurement
 noise v that is white or correlated from sample to sample. About the plant linearised at the operating point, the error
@@ -15,24 +15,20 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.kalman import SCATTER, Propagation, SensorNoise, StateNoise
-from fdi_torch.estimate.state_noise import LOG_BOUND, Likelihood, estimate_state_noise
+from fdi_torch.estimate.kalman import SCATTER, StateNoise
+from fdi_torch.estimate.state_noise import LOG_BOUND
 from fdi_torch.monitor.observer_gain import Gain, Linear, kalman_gain, riccati, with_effects
 from fdi_torch.simulate.build import load_library
 
 FREQUENCIES = 2048  # at which spectra are evaluated
-FIRST_TIME = 20.0  # correlation time at which the optimisation starts, in sampling intervals
-CORRELATIONS = (0.3, 0.5, 0.7, 0.85, 0.95)  # candidates for that of the sensors' noise
 WHITE_SHARE = 1e-3  # of the standard deviation of correlated measurement noise: keeps its covariance invertible
-FIRST_UNIT = 0.1  # initial flow per sample of the optimisation, in standard deviations of a level's measurement noise
 
 
 @dataclass(frozen=True)
@@ -123,17 +119,6 @@ class FlowFilter:
         h = self.joint.output
         return (torch.diagonal(h @ self.covariance @ h.mT) + self.white_std**2).sqrt()
 
-    def learning_from(self, residual: Tensor, number: int) -> tuple[FlowFilter, float]:
-        """The filter for the noise that is most likely with what it was learnt from and further residuals, and the log
-        of that likelihood over the one of the present noise.
-
-        residual (S, sensors): scaled to the steady variance, of the observer's samples from `number` on, where the
-        filter starts anew: the state of one with other noise would not be known to the precision that its gain assumes.
-        """
-        further = _free_residual(self.linear, self.observer, residual, number)
-        likeliest, at = _likeliest(replace(self, begins=number), [self.learnt, further])
-        return likeliest, at.log_likelihood - at.start_log_likelihood
-
     @cached_property
     def spectra(self) -> Tensor:
         """Amplitudes of the white, unit innovations by tank flows and sensor noise, (FREQUENCIES, sensors, P).
@@ -217,90 +202,9 @@ def forcing(transition: Tensor) -> Tensor:
     return 0.5 * (torch.eye(len(transition), dtype=transition.dtype) + transition)
 
 
-def estimate_flow_filter(
-    linear: Linear, observer: Gain, residual: Tensor, reading_std: Tensor, start_std: Tensor, interval: float
-) -> FlowFilter:
-    """The noise that is most likely with an observer's residuals (S, sensors), and the filter for it.
-
-    reading_std (sensors,): first guess of the measurement noise. Raises BuildError without a compiler.
-    """
-    first = StateNoise(_usual_flow(linear, reading_std, start_std), FIRST_TIME * interval, torch.ones_like(reading_std))
-    free = _free_residual(linear, observer, residual)
-    return _likeliest(FlowFilter(linear, first, reading_std, observer, start_std, interval, free), [free])[0]
-
-
-def with_correlated_sensors(white: FlowFilter) -> FlowFilter:
-    """The most likely filter with correlated noise of sensors, by a climb over CORRELATIONS. white: the one without."""
-    middle, found = len(CORRELATIONS) // 2, dict[int, tuple[FlowFilter, Likelihood]]()
-
-    def at(i: int) -> float:
-        if i not in found:
-            found[i] = _likeliest(replace(white, correlation=CORRELATIONS[i]), [white.learnt])
-        return found[i][1].log_likelihood
-
-    best = middle
-    for step in (1, -1):
-        while 0 <= best + step < len(CORRELATIONS) and at(best + step) > at(best):
-            best += step
-    return found[best][0]
-
-
-def _likeliest(start: FlowFilter, segments: Sequence[Tensor]) -> tuple[FlowFilter, Likelihood]:
-    """The filter with the most likely noise, by a search from that of `start` on, and its likelihood.
-
-    segments (S, sensors): residuals without corrections, NaN where missing, each from unknown levels on.
-    """
-    linear, free = start.linear, torch.cat(list(segments))
-    count, tanks = len(free), len(start.start_std)
-    fresh, by_levels = torch.zeros(count, dtype=torch.bool), free.new_zeros(*free.shape, len(segments) * tanks)
-    first = 0
-    for k, segment in enumerate(segments):
-        last, fresh[first] = first + len(segment), True
-        moved = _by_initial_levels(linear, len(segment))[..., :tanks] * start.start_std
-        by_levels[first:last, :, k * tanks : (k + 1) * tanks] = moved
-        first = last
-    a, b, c = (x.expand(count, *x.shape) for x in (linear.transition, forcing(linear.transition), linear.output))
-    propagation = Propagation(a, b, c, start.interval, fresh, torch.isfinite(free))
-    sensors = SensorNoise(start.reading_std, torch.full_like(start.reading_std, start.correlation))
-    noise = replace(start.noise, scale=torch.ones_like(start.reading_std))
-    unit, ones = _usual_flow(linear, start.reading_std, start.start_std), free.new_ones(by_levels.shape[-1])
-    likely = estimate_state_noise(propagation, sensors, free.nan_to_num(), by_levels, ones, 0.0 * ones, unit, noise)
-    return replace(start, noise=likely.noise, reading_std=likely.noise.scale * start.reading_std), likely
-
-
-def _usual_flow(linear: Linear, reading_std: Tensor, start_std: Tensor) -> Tensor:
-    """Order of magnitude of each tank's random flow, (tanks,) m per sample."""
-    metres = reading_std / torch.linalg.vector_norm(linear.output, dim=-1)
-    return FIRST_UNIT * metres.median() * torch.ones_like(start_std)
-
-
 def _frequencies(like: Tensor) -> Tensor:
     """Angular frequencies between 0 and pi, rad per sample."""
     return (torch.arange(FREQUENCIES, dtype=like.dtype) + 0.5) * math.pi / FREQUENCIES
-
-
-def _free_residual(linear: Linear, observer: Gain, residual: Tensor, number: int = 0) -> Tensor:
-    """What the residual (S, sensors) would be without the observer's corrections: r_k + C xi_k, with
-    xi_{k+1} = A (xi_k + L_k r_k). NaN where a reading is missing, which makes no correction.
-
-    number: samples of the run before the first.
-    """
-    raw = residual * observer.spread(number, len(residual))
-    steps = (observer.table(number, len(raw)) @ raw.nan_to_num().unsqueeze(-1)).squeeze(-1)
-    shift, path = torch.zeros_like(steps[0]), []
-    for step in steps:
-        path.append(shift)
-        shift = linear.transition @ (shift + step)
-    return raw + torch.stack(path) @ linear.output.mT
-
-
-def _by_initial_levels(linear: Linear, count: int) -> Tensor:
-    """Derivatives of the readings by the initial states, C A^k, (S, sensors, n)."""
-    power, path = torch.eye(len(linear.transition), dtype=linear.transition.dtype), []
-    for _ in range(count):
-        path.append(linear.output @ power)
-        power = linear.transition @ power
-    return torch.stack(path)
 
 
 @lru_cache

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.flow_filter import FlowFilter, estimate_flow_filter, with_correlated_sensors
+from fdi_torch.monitor.flow_filter import FlowFilter
+from fdi_torch.monitor.flow_noise_estimate import estimate_flow_filter, with_correlated_sensors
 from fdi_torch.monitor.observer import Observation, Observer, bind_parameters, initial_levels
 from fdi_torch.monitor.observer_gain import (
     Gain,

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.monitor.flow_filter import FlowFilter
+from fdi_torch.monitor.flow_noise_estimate import learning_from
 
 HIGHEST_ORDER = 8
 FEWEST_SAMPLES = 40
@@ -59,7 +60,7 @@ class Whitening:
         """
         if self.flows is None:
             return self, 0.0
-        flows, gain = self.flows.learning_from(residual, number)
+        flows, gain = learning_from(self.flows, residual, number)
         whitener = self.whitener * (self.flows.innovation_std / flows.innovation_std)
         return replace(self, whitener=whitener, samples=self.samples + len(residual), flows=flows), gain
 

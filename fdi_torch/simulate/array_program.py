@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from fdi_torch.simulate.assembly import NUMBER, Instructions, assemble
 from fdi_torch.simulate.build import BuildError, load_library
 from fdi_torch.simulate.cpp_source import primitives
 from fdi_torch.simulate.expression import Graph, Varies
@@ -26,21 +27,6 @@ from fdi_torch.simulate.section import Place
 BLOCK = 64
 """Steps in a block; a multiple of the numbers in a vector register."""
 _SKELETON = Path(__file__).with_name("array_program.hpp")
-_NUMBER = {name: i for i, name in enumerate(OPERATIONS)}
-
-
-@dataclass
-class _Registers:
-    """Allocation of registers; one that is free is used again."""
-
-    count: int = 0
-    free: list[int] = field(default_factory=list)
-
-    def take(self) -> int:
-        if self.free:
-            return self.free.pop()
-        self.count += 1
-        return self.count - 1
 
 
 @dataclass(frozen=True)
@@ -80,7 +66,6 @@ class ArrayProgram:
         self,
         inputs: Mapping[Place, Tensor],
         middle: Tensor,
-        into: Sequence[Tensor],
         slopes: Sequence[tuple[int, int]],
         span: Tensor,
         path: Tensor,
@@ -88,16 +73,18 @@ class ArrayProgram:
     ) -> bool:
         """Solve trajectories path (L, n, K+1) from their first states by the implicit midpoint rule, in place.
 
-        The inputs contain views of middle (n, K), the states in the middle of each step, expanded over the lanes. The
-        outputs, into which the program writes, are rows of one array, likewise expanded: the n rates, and then their
-        slopes by (rate, state). span (K,): lengths of the steps, s. Returns False without a compiler.
+        The inputs contain views of middle (n, K), the states in the middle of each step. The program computes the n
+        rates, and then their slopes by (rate, state). span (K,): lengths of the steps, s. Returns False without a
+        compiler.
         """
         (lanes, n, _), steps, library = path.shape, len(span), _library()
         if library is None:
             return False
+        values = path.new_empty(n + len(slopes), steps)  # all lanes share them
+        into = values.unsqueeze(1).expand(-1, lanes, -1).unbind()
         program = self._program(*self._leaves(inputs, path, lanes, steps), into)
         entries = torch.tensor(slopes, dtype=torch.int64).reshape(-1, 2).T.contiguous()
-        addresses = [x.data_ptr() for x in (*entries, span, into[0], into[n], middle, path)]
+        addresses = [x.data_ptr() for x in (*entries, span, values, values[n:], middle, path)]
         trajectory = _Trajectory(lanes, n, steps, len(slopes), *addresses)
         library.solve_trajectories(
             ctypes.byref(program),
@@ -151,77 +138,8 @@ class ArrayProgram:
         return program
 
     @cached_property
-    def _code(self) -> _Instructions:
-        return _assemble(self._graph, self._nodes, self._scalars, self._arrays, self._outputs)
-
-
-@dataclass(frozen=True)
-class _Instructions:
-    """Instructions (N, 5), int32. order: of the outputs, as they are completed; stores and output_registers follow it.
-
-    stores: number of varying instructions after which an output is complete.
-    """
-
-    registers: int
-    scalar_registers: Tensor
-    array_registers: Tensor
-    fixed: Tensor
-    varying: Tensor
-    order: list[int]
-    stores: Tensor
-    output_registers: Tensor
-
-
-def _assemble(
-    graph: Graph, nodes: Sequence[int], scalars: Sequence[int], arrays: Sequence[int], outputs: Sequence[int]
-) -> _Instructions:
-    registers, places = _Registers(), {}
-    for i in (*scalars, *arrays):
-        places[i] = registers.take()
-    computed = [i for i in nodes if graph.nodes[i].arguments]
-    fixed = [i for i in computed if not graph.nodes[i].varies & Varies.STEP]
-    varying = [i for i in computed if graph.nodes[i].varies & Varies.STEP]
-    code: dict[str, list[tuple[int, ...]]] = {"fixed": [], "varying": []}
-
-    def write(part: str, i: int, arguments: Sequence[int]) -> None:
-        used = [*(places[a] for a in arguments), 0, 0]
-        code[part].append((_NUMBER[graph.nodes[i].operation], places[i], *used[:3]))
-
-    for i in fixed:
-        places[i] = registers.take()
-        write("fixed", i, graph.nodes[i].arguments)
-    last_use = {a: i for i in varying for a in graph.nodes[i].arguments}
-    wanted: dict[int, list[int]] = {}
-    for k, i in enumerate(outputs):
-        wanted.setdefault(i, []).append(k)
-    order, stores = [k for i, ks in wanted.items() if i not in set(varying) for k in ks], []
-    stores += [0] * len(order)
-    output_registers = [places[outputs[k]] for k in order]
-    for done, i in enumerate(varying, 1):
-        arguments = graph.nodes[i].arguments
-        places[i] = registers.take()  # before its arguments are freed: an operation may not overwrite them
-        write("varying", i, arguments)
-        for k in wanted.get(i, ()):
-            order.append(k)
-            stores.append(done)
-            output_registers.append(places[i])
-        ended = {a for a in arguments if last_use[a] == i and a in places and graph.nodes[a].arguments}
-        ended |= {i} if i not in last_use else set()
-        registers.free += [places[a] for a in ended if graph.nodes[a].varies & Varies.STEP]
-    return _Instructions(
-        registers.count,
-        _int32([places[i] for i in scalars]),
-        _int32([places[i] for i in arrays]),
-        _int32(code["fixed"]),
-        _int32(code["varying"]),
-        order,
-        torch.tensor(stores, dtype=torch.int64),
-        _int32(output_registers),
-    )
-
-
-def _int32(values: Sequence[object]) -> Tensor:
-    return torch.tensor(values, dtype=torch.int32)
+    def _code(self) -> Instructions:
+        return assemble(self._graph, self._nodes, self._scalars, self._arrays, self._outputs)
 
 
 class _Scalars(ctypes.Structure):
@@ -297,7 +215,7 @@ def _cases() -> list[str]:
     """One case of the interpreter's switch for each operation; truth values are kept as 1 and 0."""
     truth = {"and": "abc", "or": "abc", "not": "abc", "where": "a"}
     cases = []
-    for name, number in _NUMBER.items():
+    for name, number in NUMBER.items():
         arguments = [f"DIFFERENT(AT({x}), real(0))" if x in truth.get(name, "") else f"AT({x})" for x in "abc"]
         expression = OPERATIONS[name].c.format(*arguments)
         result = f"WHERE({expression}, real(1), real(0))" if OPERATIONS[name].boolean else expression

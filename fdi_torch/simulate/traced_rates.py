@@ -93,12 +93,10 @@ class TracedRates:
     ) -> bool:
         """Solve trajectories from their first states by the implicit midpoint rule, in place; False without a
         compiler."""
-        (lanes, n, _), steps, slopes = path.shape, len(clock.step), self._slopes(frozenset(), frozenset())
-        middle, into = path.new_empty(n, steps), path.new_empty(n + len(slopes.by_state), steps)
-        inputs = self._inputs(middle.expand(lanes, -1, -1), commands, theta, nominal, clock)
-        outputs = into.unsqueeze(1).expand(-1, lanes, -1).unbind()
+        slopes, middle = self._slopes(frozenset(), frozenset()), path.new_empty(path.shape[1], len(clock.step))
+        inputs = self._inputs(middle.expand(len(path), -1, -1), commands, theta, nominal, clock)
         spans = clock.step.contiguous()
-        return slopes.program.solve_trajectories(inputs, middle, outputs, slopes.by_state, spans, path, control)
+        return slopes.program.solve_trajectories(inputs, middle, slopes.by_state, spans, path, control)
 
     def _inputs(
         self, state: Tensor, commands: Sequence[Tensor], theta: Tensor, nominal: Tensor, clock: Clock
