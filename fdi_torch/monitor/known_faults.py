@@ -222,7 +222,8 @@ def with_hidden(
 ) -> MonitorState:
     """The state with the faults that recovered at a change but that the readings since would not show.
 
-    Neither all readings since the change, nor those of the `latest` seconds, for which alone its pump may have run.
+    Asked of all readings since the change, and of those of the last `latest` seconds alone: a pump with the fault may
+    have run only in these.
     """
     best, starts = change.best, (change.best.onset, state.now - latest)
     ended = [HiddenFault(t, float(change.before[t.column]), earliest_end, state.now) for t in change.ended]
