@@ -66,7 +66,7 @@ def next_steps(
     if moved:
         steps.append(
             f"even with the causes, {listed(moved)} {'is' if len(moved) == 1 else 'are'} more than {MOVED:g} "
-            "tolerances off their nominal values: calibrate the plant "
+            f"tolerances off {'its nominal value' if len(moved) == 1 else 'their nominal values'}: calibrate the plant "
             "file with a fault-free recording (fdi refit --adopt), then repeat the diagnosis with the calibrated file"
         )
     if planned and answer.next_input:
