@@ -18,6 +18,7 @@ LAYERS = (
         "amounts",
         "capacity",
         "clock",
+        "device",
         "disk",
         "interruption",
         "names",

@@ -384,6 +384,8 @@ def test_auto_compiles_where_the_processor_computes() -> None:
     assert make_engine(network, space, e, "reference").name == "reference"
     assert make_engine(network, space, e, "traced").name == "traced"
     assert make_engine(network, space, e, device="cuda").name == "traced"
+    with pytest.raises(ValueError, match="on cuda, got compiled, which runs on the CPU"):
+        make_engine(network, space, e, "compiled", device="cuda")
     with pytest.raises(ValueError, match="expected an engine of auto"):
         make_engine(network, space, e, "quick")
 

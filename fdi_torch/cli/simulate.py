@@ -26,6 +26,10 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         named = Path(job.config.output.folder) / f"{job.name}.csv"
         path = write_csv(recording, named if arguments.replace else free_path(named.parent, job.name, "csv"))
         advance(1.0, "done")
+    if job.config.device != "cpu":
+        screen.note(
+            f"device: {job.config.device} is for fdi train and fdi study; one simulation is computed on the CPU"
+        )
     screen.say(f"{len(recording)} samples, {float(recording.time[-1]):g} s: {path}")
     if path != named:
         screen.say(f"- {named} existed and was kept; with --replace it is overwritten")

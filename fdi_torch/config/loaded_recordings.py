@@ -121,7 +121,8 @@ def read_recording(
     From now on its channels are displayed in the units that its file has for them.
     config: the name of the file, or the recording's entry in a run file: {"file": "run.xlsx", "columns": {"h1":
     {"column": "LT-101", "unit": "mm"}}}. base: folder of relative paths. given:
-    recordings in memory, by the name that `file` gives them. Raises ConfigError naming file, row and column.
+    recordings in memory, by the name that `file` gives them; the result is on the CPU. Raises ConfigError naming file,
+    row and column.
     """
     if not isinstance(config, RecordingConfig):
         config = config_of(config)
@@ -135,7 +136,7 @@ def read_recording(
             path = find_data(config.file, folder)
             recording = _read(config, path, folder, plant, channels, columns)
         else:
-            recording = in_memory.selected(channels, columns)
+            recording = in_memory.to(torch.device("cpu")).selected(channels, columns)
         names = (*recording.input_names, *recording.output_names)
         expect_units(recording.source, names, (*recording.input_units, *recording.output_units), plant)
         start = -math.inf if config.start is None else in_seconds(config.start, recording, config)

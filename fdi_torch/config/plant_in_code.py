@@ -120,7 +120,8 @@ class Plant(PlantDescription):
 
         inputs: a `Recording`, constant inputs (channels,) in SI, or a function of t in s to these. theta: parameters
         that differ from their nominal values, by full name in SI, each a number or a tensor (*batch), through which
-        gradients flow: {"A.leak.size": size}. resolution: time scale of the smoothing of square roots and rims, s.
+        gradients flow: {"A.leak.size": size}; on their device, else on that of the inputs, the plant is computed.
+        resolution: time scale of the smoothing of square roots and rims, s.
         Raises ValueError for an unknown parameter, and for actuators with memory or dead time.
         """
         named = theta or {}
@@ -128,7 +129,9 @@ class Plant(PlantDescription):
 
         network = build_network(self, placements_for(named))
         space = ParameterSpace(network.constants[name] for name in named)
-        columns = torch.broadcast_tensors(*(torch.as_tensor(v, dtype=torch.float64) for v in named.values()))
+        device = next((v.device for v in named.values() if isinstance(v, torch.Tensor)), None)
+        values = (torch.as_tensor(v, dtype=torch.float64, device=device) for v in named.values())
+        columns = torch.broadcast_tensors(*values)
         return PlantOde(network, inputs, space, torch.stack(columns, -1) if columns else None, resolution=resolution)
 
     def __str__(self) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import Field, model_validator
 
@@ -16,6 +16,7 @@ from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve
 from fdi_torch.config.simulation import SimulationConfig
 from fdi_torch.config.strict import Strict
 from fdi_torch.config.yaml_files import DEFAULT_RUN
+from fdi_torch.estimate.fitting import EngineKind
 from fdi_torch.recording import Recording
 
 
@@ -26,8 +27,10 @@ class RunConfig(Strict):
     estimate: EstimationConfig = Field(default_factory=EstimationConfig)
     output: OutputConfig = Field(default_factory=OutputConfig)
     seed: int = Field(0, ge=0, description="seed of all random numbers")
-    device: str = Field("cpu", pattern=r"^(cpu|cuda(:\d{1,2})?)$", description="cpu or cuda")
-    engine: Literal["auto", "reference", "compiled"] = Field("auto", description="simulation engine")
+    device: str = Field(
+        "cpu", pattern=r"^(cpu|cuda(:\d{1,2})?)$", description="of the search and the refinement: cpu or cuda"
+    )
+    engine: EngineKind = Field("auto", description="simulation engine; compiled only on the CPU")
 
     @model_validator(mode="after")
     def _one_source(self) -> RunConfig:

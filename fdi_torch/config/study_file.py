@@ -19,6 +19,7 @@ from fdi_torch.config.run_file import Run, RunConfig, build_run
 from fdi_torch.config.simulation import planned_recording
 from fdi_torch.config.strict import Decibel, ScaledSeconds, ScaledSteps, Share, Strict, scaled_to_plant
 from fdi_torch.config.yaml_files import write_yaml
+from fdi_torch.device import tensors_on, usable_device
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.fitting import Fitting, set_up
@@ -115,7 +116,8 @@ def _plan(config: StudyConfig, run: Run) -> Plan:
         data_step=config.data_step,
     )
     definition = run.config.simulate.noise.definition if run.config.simulate else "variance"
-    settings = tuple(_settings(config, run, fitting))
+    with tensors_on(fitting.device):
+        settings = tuple(_settings(config, run, fitting))
     return Plan(fitting, settings, method, run.config.seed, definition, config.block)
 
 
@@ -137,6 +139,7 @@ def _fitting(run: Run) -> Fitting:
     planned = planned_recording(simulated, run.plant)
     zeros = torch.zeros_like(planned.outputs)
     planned = replace(planned, outputs=zeros, mask=torch.ones_like(planned.mask))
+    planned = planned.to(usable_device(run.config.device))
     return set_up(run.plant, [planned], space, [simulated.start_levels], run.config.engine)
 
 

@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from fdi_torch.device import on_its_device, tensors_on
 from fdi_torch.effects import build_network, full_name, placements_for
 from fdi_torch.estimate.objectives import Objective, Problem, Term
 from fdi_torch.parameters import Parameter, ParameterSpace, name_in_recording
@@ -29,7 +30,7 @@ from fdi_torch.simulate.step_length import commensurate_step
 
 StartLevel = Literal["equilibrium", "free"] | float
 StartLevels = StartLevel | Mapping[str, StartLevel]
-EngineKind = Literal["auto", "reference", "compiled"]
+EngineKind = Literal["auto", "reference", "compiled", "traced"]
 
 # An estimated initial level is searched within this fraction of the tank's height on either side of the level that the
 # first readings show (their median).
@@ -69,6 +70,11 @@ class Fitting:
         return self.networks[0].description
 
     @property
+    def device(self) -> torch.device:
+        """The device on which the problem is computed, that of its recordings."""
+        return self.recordings[0].time.device
+
+    @property
     def is_slow(self) -> bool:
         """Whether the engine evaluates every integration step in Python, so that steps are expensive."""
         return self.engine == "reference"
@@ -79,6 +85,7 @@ class Fitting:
         own = (self.networks[k],), (self.own_spaces[k],), (self.columns[k],)
         return replace(self, recordings=recordings, networks=own[0], own_spaces=own[1], columns=own[2])
 
+    @on_its_device
     def engines(self, step: float) -> list[Engine]:
         """A simulation engine for each recording, with its samples, in steps of at most `step` s.
 
@@ -119,6 +126,7 @@ class Fitting:
         inputs_constant = recording.hold == "zero_order" and not acts_on_commands
         return inputs_constant and not self.is_slow and steps > OWN_STEP_COST * len(recording)
 
+    @on_its_device
     def problem(
         self, step: float, objective: Objective = "likelihood", adaptive: bool = False, averaged: bool = True
     ) -> Problem:
@@ -159,28 +167,33 @@ def set_up(
 
     start: initial levels, one choice for all tanks or a mapping by tank, for all recordings or a sequence with one
     entry per recording. A choice is 'equilibrium' (the level of the plant file, else the equilibrium under the first
-    inputs), 'free' (estimated) or a level in m.
+    inputs), 'free' (estimated) or a level in m. The fit is computed on the device of the recordings.
     Raises ValueError for an unknown parameter or choice, and for a channel that is not recorded.
     """
     if not isinstance(plant, PlantDescription):
         raise TypeError(f"plant: expected a Plant, got {plant!r}; read a plant file by fdi_torch.load_plant")
     requested = [full_name(p, plant) if isinstance(p, str) else p for p in parameters]
     names = [p if isinstance(p, str) else p.name for p in requested]
-    placements = placements_for(names)
-    reference = build_network(plant, placements)
-    common = [reference.constants[p] if isinstance(p, str) else p for p in requested]
-    networks, own_spaces, columns, joint = [], [], [], list(common)
-    starts = start if isinstance(start, Sequence) and not isinstance(start, str) else [start] * len(recordings)
-    for k, (recording, recording_start) in enumerate(zip(recordings, starts, strict=True)):
-        levels, free = start_levels(plant, reference, recording, recording_start)
-        if twice := [p.name for p in free if p.name in names]:
-            raise ValueError(f"{twice[0]}: expected no initial level among the parameters, as it is estimated anyway")
-        tanks = tuple(replace(t, start_level=float(h)) for t, h in zip(plant.tanks, levels, strict=True))
-        networks.append(build_network(replace(plant, tanks=tanks), placements))
-        own_spaces.append(ParameterSpace([*common, *free]))
-        columns.append(torch.tensor([*range(len(common)), *range(len(joint), len(joint) + len(free))]))
-        joint += [replace(p, name=name_in_recording(p.name, k)) for p in free]
-    return Fitting(ParameterSpace(joint), tuple(recordings), tuple(networks), tuple(own_spaces), tuple(columns), engine)
+    with tensors_on(recordings[0].time.device):
+        placements = placements_for(names)
+        reference = build_network(plant, placements)
+        common = [reference.constants[p] if isinstance(p, str) else p for p in requested]
+        networks, own_spaces, columns, joint = [], [], [], list(common)
+        starts = start if isinstance(start, Sequence) and not isinstance(start, str) else [start] * len(recordings)
+        for k, (recording, recording_start) in enumerate(zip(recordings, starts, strict=True)):
+            levels, free = start_levels(plant, reference, recording, recording_start)
+            if twice := [p.name for p in free if p.name in names]:
+                raise ValueError(
+                    f"{twice[0]}: expected no initial level among the parameters, as it is estimated anyway"
+                )
+            tanks = tuple(replace(t, start_level=float(h)) for t, h in zip(plant.tanks, levels, strict=True))
+            networks.append(build_network(replace(plant, tanks=tanks), placements))
+            own_spaces.append(ParameterSpace([*common, *free]))
+            columns.append(torch.tensor([*range(len(common)), *range(len(joint), len(joint) + len(free))]))
+            joint += [replace(p, name=name_in_recording(p.name, k)) for p in free]
+        return Fitting(
+            ParameterSpace(joint), tuple(recordings), tuple(networks), tuple(own_spaces), tuple(columns), engine
+        )
 
 
 def start_levels(

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fdi_torch.device import on_its_device
 from fdi_torch.estimate.diagnosis import Diagnosis, correlation_inflation, diagnose
 from fdi_torch.estimate.evolution import EvolutionResult, Search, evolve
 from fdi_torch.estimate.fitting import Fitting
@@ -62,6 +63,7 @@ class HybridResult:
     engine: str
 
 
+@on_its_device
 def estimate_parameters(
     fitting: Fitting,
     settings: HybridSettings | None = None,

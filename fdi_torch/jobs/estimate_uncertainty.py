@@ -10,6 +10,7 @@ from torch import Tensor
 
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.run_file import Run
+from fdi_torch.device import on_its_device
 from fdi_torch.effects import full_name
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import HybridResult
@@ -31,6 +32,7 @@ def profiled_names(run: Run, space: ParameterSpace) -> list[str]:
     return names
 
 
+@on_its_device
 def profiles_of(
     fitting: Fitting, result: HybridResult, names: Iterable[str], confidence: float = 0.95
 ) -> tuple[Profile, ...]:
@@ -38,6 +40,7 @@ def profiles_of(
     return profile_likelihood(result.likelihood.linearise, fitting.space, result.estimate, names, confidence)
 
 
+@on_its_device
 def with_draws(
     fitting: Fitting,
     result: HybridResult,

@@ -103,4 +103,8 @@ def unfinished_search(folder: Path, run: Run) -> tuple[Path, tuple[Message, ...]
         return path, (), None
     generation, arrays = state
     copied = (m for m in before.messages() if m.topic in COPIED_TOPICS and m.payload.get("generation", 0) <= generation)
-    return path, tuple(copied), Search.from_dict({name: torch.tensor(array) for name, array in arrays.items()})
+    return (
+        path,
+        tuple(copied),
+        Search.from_dict({name: torch.tensor(array, device=run.config.device) for name, array in arrays.items()}),
+    )

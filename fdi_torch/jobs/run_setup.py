@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 import torch
@@ -13,6 +12,7 @@ from fdi_torch.config.loaded_recordings import LoadedRecording, load_recordings
 from fdi_torch.config.problems import ConfigError, naming_source
 from fdi_torch.config.run_file import Run
 from fdi_torch.config.simulation import noise_std, planned_recording
+from fdi_torch.device import usable_device
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.fitting import Fitting, set_up, start_levels
 from fdi_torch.estimate.hybrid_settings import HybridSettings
@@ -107,29 +107,12 @@ def requested_space(run: Run) -> ParameterSpace:
         return estimated_space(config, network.constants, run.plant, bool(run.config.recordings))
 
 
-def usable_device(name: str) -> torch.device:
-    """The device of that name. Raises ValueError if it is not available."""
-    try:
-        torch.zeros(1, device=name)
-    except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"device: expected one that torch can use here, such as cpu, got '{name}'") from error
-    return torch.device(name)
-
-
-def tensors_on(device: torch.device) -> AbstractContextManager[object]:
-    """Context that creates tensors on a device; empty for the default device, because torch's context
-    slows each call.
-    """
-    return nullcontext() if device == torch.get_default_device() else device
-
-
 def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording]) -> Fitting:
     """The estimation problem of parameters and recordings, with all tensors on the configured device."""
     device = usable_device(run.config.device)
     recordings = [part.recording.to(device) for part in loaded]
     space = bounded_by_recording(space, max(float(r.time[-1]) for r in recordings))
-    with tensors_on(device):
-        fitting = set_up(run.plant, recordings, space, [part.start_levels for part in loaded], run.config.engine)
+    fitting = set_up(run.plant, recordings, space, [part.start_levels for part in loaded], run.config.engine)
     expect_enough_samples(recordings, fitting.space)
     return fitting
 

@@ -28,8 +28,6 @@ from fdi_torch.jobs.run_setup import (
     recordings_of,
     requested_space,
     simulated_truth,
-    tensors_on,
-    usable_device,
 )
 from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
@@ -129,11 +127,10 @@ def estimate_logged(
     if config.draws:
         needed("emcee", "draws")
     watch = SearchLogger(log, fitting.space, settings, tell)
-    with tensors_on(usable_device(run.config.device)):
-        result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration, resume)
-        profiles = profiles_of(fitting, result, profiled, config.confidence) if profiled else ()
-        if config.draws:
-            result = with_draws(fitting, result, config.draws, run.config.seed, tell=tell)
+    result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration, resume)
+    profiles = profiles_of(fitting, result, profiled, config.confidence) if profiled else ()
+    if config.draws:
+        result = with_draws(fitting, result, config.draws, run.config.seed, tell=tell)
     log_result(log, result, fitting.space, profiles)
     for k, (recording, predicted) in enumerate(zip(fitting.recordings, result.predicted, strict=True)):
         group = group_of(k, len(fitting.recordings))

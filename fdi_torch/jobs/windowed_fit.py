@@ -39,6 +39,8 @@ def fit_windows(run: Run, tell: Callable[[float, str], None] = lambda share, tex
     window. Effects of the plant that act only at the start of a run are left out, because windows start in mid-run.
     """
     run = replace(run, plant=without_startup_effects(run.plant, run.plant.channels()))
+    if run.config.device != "cpu":
+        raise ConfigError([f"device: expected cpu with estimate.windows, got {run.config.device}; leave it out"])
     length = run.config.estimate.windows
     assert length is not None
     loaded = recordings_of(run)

@@ -26,8 +26,8 @@ def environment(packages: Iterable[str] = PACKAGES) -> dict[str, str]:
 @cache
 def version_of(package: str) -> str:
     """The version of a package: its `__version__` if imported, else from the installation."""
-    imported = getattr(sys.modules.get(package), "__version__", None)
     try:
+        imported = getattr(sys.modules.get(package), "__version__", None)
         return imported if isinstance(imported, str) else metadata.version(package)
     except metadata.PackageNotFoundError:
         return "absent"

@@ -28,7 +28,8 @@ def make_engine(
 ) -> Engine:
     """The requested engine, or under 'auto' the fastest one; `engine.why` states the reason.
 
-    Raises ValueError for an unknown kind, and BuildError if 'compiled' is requested without a compiler.
+    Raises ValueError for an unknown kind, or for 'compiled' on another device than the CPU, and BuildError if
+    'compiled' is requested without a compiler.
     """
     if kind not in KINDS:
         raise ValueError(f"expected an engine of {', '.join(KINDS)}, got '{kind}'")
@@ -37,6 +38,8 @@ def make_engine(
     if kind == "traced":
         return TracedEngine(network, space, experiment, "traced engine (torch): asked for")
     engine = CompiledEngine(network, space, experiment, "compiled engine: asked for")
+    if kind == "compiled" and torch.device(device).type != "cpu":
+        raise ValueError(f"engine: expected auto, traced or reference on {device}, got compiled, which runs on the CPU")
     if kind == "compiled":
         engine.prepare()
         return engine

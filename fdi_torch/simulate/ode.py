@@ -28,7 +28,8 @@ class PlantOde(nn.Module):
 
     network: the plant. space, theta (*batch, P): constants and effects that differ from their nominal values. inputs:
     SI, one per input channel of the plant, in its order. resolution: time scale of the smoothing of square roots and
-    rims, s. Gradients flow to theta and x through every call; a new theta needs a new PlantOde.
+    rims, s. Gradients flow to theta and x through every call; a new theta needs a new PlantOde. The device is that of
+    theta, else that of the inputs.
 
     Raises ValueError for an actuator with memory or dead time, whose output is not a function of t alone.
     """
@@ -44,8 +45,8 @@ class PlantOde(nn.Module):
     ) -> None:
         super().__init__()
         space = space or ParameterSpace()
-        like = network.nominal
-        self.network = network
+        self.network = network.to(_device_of(inputs, theta, network))
+        like = self.network.nominal
         self._values = network.bind(space, like.new_zeros(0) if theta is None else theta)
         delayed = bool(network.command_delays(self._values))
         if network.command_memory() or delayed:
@@ -79,6 +80,11 @@ class PlantOde(nn.Module):
         channels = self._inputs(instant).unbind(-1)
         actuator_inputs = [channels[channel] for _, channel in self.network.actuators()]
         return self.network.commands(actuator_inputs, (), clock, self._values)[0], clock
+
+
+def _device_of(inputs: Inputs, theta: Tensor | None, network: TankNetwork) -> torch.device:
+    given = theta if theta is not None else inputs.time if isinstance(inputs, Recording) else inputs
+    return given.device if isinstance(given, Tensor) else network.nominal.device
 
 
 def _function_of_time(inputs: Inputs, network: TankNetwork, like: Tensor) -> Callable[[Tensor], Tensor]:

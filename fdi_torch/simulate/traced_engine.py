@@ -112,7 +112,7 @@ class _Run:
     def samples(self) -> Iterator[int]:
         """Run the simulation; yields the index of each sample while the state holds its levels as 'sample'."""
         e, p, state = self.experiment, self.program, self.state
-        firsts = torch.searchsorted(e.sample_step, torch.arange(len(e.nodes))).tolist()
+        firsts = torch.searchsorted(e.sample_step, torch.arange(len(e.nodes), device=e.nodes.device)).tolist()
         shares = e.sample_share.tolist()
         self.compute(p.prepare)
         self._restore_levels()

@@ -57,7 +57,7 @@ class Tracer(TorchDispatchMode):
     def tensor(self, node: int) -> Tensor:
         """A tensor that represents a node: (2,) if it varies between lanes, else without dimensions."""
         shape = (_LANES,) if self.graph.nodes[node].varies & Varies.LANE else ()
-        return self._track(torch.full(shape, 0.5, dtype=torch.float64), node)
+        return self._track(torch.full(shape, 0.5, dtype=torch.float64, device="cpu"), node)
 
     def node(self, value: Any) -> int:
         """The node that a tensor or number represents."""

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from fdi_torch.device import on_its_device
 from fdi_torch.estimate.evolution import distant_members, evolve
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
@@ -36,6 +37,7 @@ class Trial:
     numbers: dict[str, list[float] | float]
 
 
+@on_its_device
 def run_block(plan: Plan, block: Block) -> list[Trial]:
     """Estimate every trial of a block with each requested estimator."""
     trials = make_trials(plan, block)

@@ -95,6 +95,10 @@ class Plan:
     block: int = 200
 
     @property
+    def device(self) -> torch.device:
+        return self.fitting.device
+
+    @property
     def trials(self) -> int:
         return sum(setting.trials for setting in self.settings)
 
@@ -118,12 +122,13 @@ class Plan:
                     yield replace(block, first=chosen[0] - block.offset, last=chosen[-1] + 1 - block.offset)
 
     def noise(self, block: Block, shape: tuple[int, ...]) -> Float[Tensor, "trials ..."]:
-        """Standard normal draws, with one generator per trial."""
+        """Standard normal draws, with one generator per trial; the same on every device."""
         base = _key(self.seed, _NOISE, block.setting)
         # The generator uses 32 bits of its seed; consecutive seeds give each trial of a setting its own.
         seeds = [(base + trial) % 2**32 for trial in range(block.first, block.last)]
         made = [torch.Generator().manual_seed(seed) for seed in seeds]
-        return torch.stack([torch.randn(shape, generator=g, dtype=torch.float64) for g in made])
+        draws = [torch.randn(shape, generator=g, dtype=torch.float64, device="cpu") for g in made]
+        return torch.stack(draws).to(self.device)
 
     def search_seeds(self, block: Block, again: int = 0) -> Int[Tensor, " trials"]:
         """Seeds of a search; each repetition has other ones."""

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 import time
 from collections import Counter
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import orjson
@@ -161,6 +164,16 @@ def test_where_the_code_and_data_come_from(tmp_path: Path) -> None:
     versions = environment(("numpy", "no-such-package"))
     assert versions["numpy"] == np.__version__ and versions["no-such-package"] == "absent"
     assert git_state(tmp_path) == {"commit": "", "changed": ""}
+
+
+def test_a_package_run_from_its_source_alone_has_no_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    def without_metadata(name: str) -> str:
+        raise PackageNotFoundError(name)
+
+    source_only = ModuleType("source_only")
+    source_only.__getattr__ = without_metadata  # type: ignore[method-assign]
+    monkeypatch.setitem(sys.modules, "source_only", source_only)
+    assert environment(("source_only",))["source_only"] == "absent"
 
 
 @pytest.mark.slow

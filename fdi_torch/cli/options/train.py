@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import add_config, add_live, add_run
+from fdi_torch.cli.options import add_config, add_device, add_live, add_run
 
 STEP, SUMMARY = "diagnose", "estimate the sizes of faults in a recording"
 LONG = True
@@ -23,5 +23,6 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(parser, "fdi_torch.config.run_file:RunConfig")
     add_run(parser)
+    add_device(parser)
     add_live(parser)
     parser.add_argument("--resume", action="store_true", help="continue a killed run of the same file")
