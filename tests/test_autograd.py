@@ -132,7 +132,7 @@ def test_an_ode_takes_constant_inputs_functions_and_batches() -> None:
     t = torch.tensor(0.0, dtype=torch.float64)
     assert float(plant.ode(inputs)(t, rest).abs().max()) < 1e-9
     size = torch.tensor([0.0, 0.1, 0.3], dtype=torch.float64, requires_grad=True)
-    rates = plant.ode(lambda t: inputs, {"T1.leak.size": size, "P13.area": 6e-5})(t, rest.expand(3, 3))
+    rates = plant.ode(lambda t: inputs, {"T1.leak": size, "P13.area": 6e-5})(t, rest.expand(3, 3))
     assert rates.shape == (3, 3) and bool((rates[0] > rates[2])[0])
     (slope,) = torch.autograd.grad(rates.sum(), size)
     assert bool((slope < 0).all())
@@ -174,7 +174,7 @@ class Fitted(nn.Module):
 def test_a_batch_of_plants_trains_inside_a_module() -> None:
     plant: Plant = load_plant("three_tank")
     names = ["T1.leak.size", "P13.plugging.size"]
-    engine = fdi_torch.set_up(plant, [recording()], names, "equilibrium").engines(10.0)[0]
+    engine = fdi_torch.set_up(plant, recording(), names, "equilibrium").engines(10.0)[0]
     truth = torch.tensor([[0.1, 0.3], [0.2, 0.2], [0.3, 0.1], [0.05, 0.05]], dtype=torch.float64)
     measured = engine.readings(truth)
     module = Fitted(engine)

@@ -117,7 +117,7 @@ def test_overrides_reach_into_lists() -> None:
         ("estimate.search.population=2", "estimate.search: expected a population of at least 4, got 2"),
         ("simulate.duration=1000", "simulate.duration: expected a quantity in s, got the bare number 1000"),
         ("simulate.duration=1000 cm", "simulate.duration: expected a quantity in s .* got '1000 cm'"),
-        ("engine=fast", "engine: expected 'auto', 'reference' or 'compiled', got 'fast'"),
+        ("engine=fast", "engine: expected 'auto', 'reference', 'compiled' or 'traced', got 'fast'"),
         ("seed=-1", "seed: expected greater than or equal to 0, got -1"),
         ("plant=three_tanks", "plant: expected a plant file .* got 'three_tanks'; the nearest is 'three_tank'"),
         ("plant=7", "plant: expected a shipped plant, a plant file or a plant, got 7"),
@@ -164,6 +164,11 @@ def test_boxes_and_beliefs_can_be_changed_with_units() -> None:
     [
         ({"parameters": ["T1.leek.size"]}, "expected an effect of the library, got 'leek'; the nearest is 'leak'"),
         ({"parameters": ["P13.area_"]}, "estimate.parameters.0: expected a parameter .* the nearest is 'P13.area'"),
+        (
+            {"parameters": ["h1.sensor_bias.size"]},
+            "expected h1.sensor_bias.bias or h1.sensor_bias.onset or h1.sensor_bias.ramp, got 'h1.sensor_bias.size'; "
+            "the size is h1.sensor_bias.bias",
+        ),
         ({"parameters": ["T1.leak", "T1.leak.size"]}, "expected each parameter once, got T1.leak.size twice"),
         ({"parameters": [{"name": "T1.leak", "low": 2}]}, r"parameters.0 \(T1.leak\): .* expected low <= nominal"),
         ({"parameters": [{"name": "T1.leak", "high": "2 cm"}]}, r"parameters.0 \(T1.leak\): expected a quantity in 1"),

@@ -134,6 +134,24 @@ def test_an_ambiguous_answer_writes_the_next_input(tmp_path: Path, capsys: pytes
     assert "--noise: expected a positive standard deviation such as '1 mm', got '0'" in capsys.readouterr().err
 
 
+def test_planned_inputs_need_no_readings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [f"{10 * k},{50 + 20 * (k % 7 > 3)},50" for k in range(60)]
+    planned, listing = tmp_path / "planned.csv", tmp_path / "runs.yaml"
+    planned.write_text("t_s,Q1_cm3_s,Q2_cm3_s\n" + "\n".join(rows) + "\n")
+    listing.write_text("recordings: [planned.csv]\n")
+    for source in map(str, (planned, listing)):
+        words = ["--plant", "three_tank", "--recording", source, "--library", "leak@T1,pump_gain@Q1", "--json"]
+        assert cli.main(["plan", *words]) == cli.DONE
+        assert set(json.loads(capsys.readouterr().out)["shown"]) == {"T1.leak", "Q1.pump_gain"}
+        words = ["--plant", "three_tank", "--input", source, "--faults", "T1.leak"]
+        assert cli.main(["diagnosability", *words]) == cli.DONE
+        assert "T1.leak.size" in capsys.readouterr().out
+    for command in ("check", "predict"):
+        assert cli.main([command, "--plant", "three_tank", "--recording", str(planned)]) == cli.MISUSE
+        expected = "expected readings of h1, h2, h3, got inputs alone; what planned inputs can show is told by fdi plan"
+        assert expected in capsys.readouterr().err
+
+
 def test_nothing_to_adopt_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = str(write_csv(recorded({"P13.discharge_coefficient": 0.6}, 3, samples=200), tmp_path / "run.csv"))
     words = ["gap", "--plant", "three_tank", "--recording", file, "--library", "pump_gain", "--out", str(tmp_path)]

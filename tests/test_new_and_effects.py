@@ -23,6 +23,7 @@ from fdi_torch.config.study_file import load_study
 from fdi_torch.config.yaml_files import read_yaml, shipped_plants
 from fdi_torch.effects import EFFECTS, build_network
 from fdi_torch.effects.catalogue import effects
+from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.recordings.csv_files import read_header
 
 
@@ -56,6 +57,11 @@ def test_every_template_is_a_file_of_its_kind_for_every_shipped_plant(name: str,
         assert "${" not in path.read_text()
     assert load_plant(paths["plant"]).name == "rig"
     assert load_run(paths["run"]).plant == plant and load_monitor(paths["monitor"]).plant == plant
+    head, _, rest = paths["run"].read_text().partition("recordings:")
+    _, _, described = rest.partition("# simulate:")
+    block, _, estimate = described.partition("\nestimate:")
+    paths["run"].write_text(head + "simulate:" + block.replace("\n# ", "\n") + "\nestimate:" + estimate)
+    assert len(simulate_recording(load_run(paths["run"]))) == 601
     assert load_study(paths["study"]).plan.trials == 600
     assert len(load_rehearsal(paths["rehearsal"]).plans) == 2
 

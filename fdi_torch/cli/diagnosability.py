@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.loaded_recordings import named_recordings
+from fdi_torch.config.loaded_recordings import planned_recordings
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.effects import full_name
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 def _inputs(arguments: argparse.Namespace, plant: PlantDescription) -> tuple[Recording, bool]:
     """A recording with the inputs, and whether they are constant ones from the command line."""
     if Path(arguments.input).exists():
-        recordings = named_recordings(arguments.input, plant, Path.cwd())
+        recordings = planned_recordings(arguments.input, plant, Path.cwd())
         if len(recordings) > 1:
             raise ValueError(
                 f"--input: expected one recording with known inputs, got {len(recordings)} in {arguments.input}; "

@@ -68,9 +68,9 @@ def show(inspection: Inspection, screen: Screen) -> None:
     log = f"a log of fdi {kind}" if kind else "a foreign MCAP file"
     screen.say(f"{inspection.path}: {log}, written by {inspection.library}")
     for record in RECORDS:
-        values = inspection.about.get(record, {})
+        values = {name: value for name, value in inspection.about.get(record, {}).items() if value}
         if values:
-            screen.say(f"{record:<8}{', '.join(f'{name} {value}' for name, value in values.items() if value)}")
+            screen.say(f"{record:<8}{', '.join(f'{name} {value}' for name, value in values.items())}")
     results = list(inspection.about.get("result", {}).items())
     for name, value in results[:MOST_RESULTS]:
         screen.say(f"result  {name} {value[:100]}")

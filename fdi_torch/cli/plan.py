@@ -1,6 +1,6 @@
 """`fdi plan`: what it does and prints. Its options: `options/plan.py`.
 
-Path: cli.plan.run → config.loaded_recordings.named_recordings → gap.identifiability.planned_identifiability
+Path: cli.plan.run → config.loaded_recordings.planned_recordings → gap.identifiability.planned_identifiability
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from fdi_torch.amounts import effect_words
 from fdi_torch.cli import DONE
 from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.loaded_recordings import named_recordings
+from fdi_torch.config.loaded_recordings import planned_recordings
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.gap.identifiability import Identifiability, planned_identifiability
 from fdi_torch.jobs.gap import one_thread
@@ -22,7 +22,7 @@ from fdi_torch.quantities import parse_level_deviation
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     noise = parse_level_deviation(arguments.noise, "--noise")
     plant = chosen_plant(arguments.plant)
-    planned = named_recordings(arguments.recording, plant, Path.cwd())[0]
+    planned = planned_recordings(arguments.recording, plant, Path.cwd())[0]
     for note in planned.notes:
         screen.note(note)
     with one_thread():

@@ -111,7 +111,7 @@ def unrecorded_valves(
 ) -> dict[str, ChannelSource]:
     """The valves without a column, with their opening from the plant file."""
     openings = {p.valve: p.unrecorded for p in plant.pipes if p.valve and p.unrecorded is not None}
-    return {name: ChannelSource(None, "1", openings[name]) for name in _without_column(path, openings, config)}
+    return {name: ChannelSource(None, "1", openings[name]) for name in without_column(path, openings, config)}
 
 
 def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[str] = (), other_fix: str = "") -> None:
@@ -123,6 +123,12 @@ def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[s
     if not missing:
         return
     inputs = [name for name in missing if name in plant.channels()]
+    sensors = {sensor.column for sensor in plant.sensors}
+    if set(missing) == sensors and not _other_columns(path, plant):
+        raise ValueError(
+            f"{path}: expected readings of {', '.join(missing)}, got inputs alone; what planned inputs can show is "
+            "told by fdi plan and fdi diagnosability"
+        )
     header = ", ".join(map(shortened, _header(path)))
     lines = "\n".join(f"    {line}" for line in mapped(path, plant, also_known))
     raise ValueError(
@@ -157,7 +163,12 @@ def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()
 
 def _missing(path: Path, plant: PlantDescription, also_known: Collection[str]) -> list[str]:
     known = {*unrecorded_valves(path, plant), *also_known}
-    return [name for name in _without_column(path, _units(plant)) if name not in known]
+    return [name for name in without_column(path, _units(plant)) if name not in known]
+
+
+def _other_columns(path: Path, plant: PlantDescription) -> list[str]:
+    """The columns of a table that are neither a channel of the plant nor, first, the time."""
+    return [column for column in _header(path)[1:] if not names_in((column,)) & set(_units(plant))]
 
 
 def _header(path: Path) -> tuple[str, ...]:
@@ -168,7 +179,7 @@ def _header(path: Path) -> tuple[str, ...]:
         return ()
 
 
-def _without_column(path: Path, names: Collection[str], config: FileConfig | None = None) -> list[str]:
+def without_column(path: Path, names: Collection[str], config: FileConfig | None = None) -> list[str]:
     """The names that no header of a CSV file contains; none for an MCAP log."""
     if not names or is_log(path):
         return []

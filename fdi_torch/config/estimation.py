@@ -187,6 +187,10 @@ def _calibrated(
 
 def _unknown_parameter(name: str, constants: ParameterSpace, plant: PlantDescription) -> str:
     faults = [p.prefix for p in all_placements(plant)]
+    prefix = name.rpartition(".")[0]
+    fields = [known for known in constants.names if known.startswith(f"{prefix}.")]
+    if prefix in faults and fields:
+        return f"expected {' or '.join(fields)}, got '{shortened(name)}'; the size is {fields[0]}"
     candidates = (*constants.names, *faults)
     sentence = unknown("a parameter of the plant or its faults", name, candidates)
     return sentence.replace(f" ({', '.join(candidates)})", "")

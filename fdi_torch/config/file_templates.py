@@ -43,6 +43,8 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str, rec
         plugging=plugging,
         constant=constant,
         inputs=_inputs(plant),
+        simulated="\n".join(f"# {line}" for line in _inputs(plant).splitlines()),
+        noise=", ".join(f"{s.column}: {quantity_text(1e-3 * abs(s.gain), s.unit, 3, s.column)}" for s in plant.sensors),
         channels=", ".join(plant.channels()),
         commands=", ".join(_shares(plant, channel, (0.4,))[0] for channel in plant.channels()),
     )

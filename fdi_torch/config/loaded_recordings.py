@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,9 +12,23 @@ from typing import Any
 import torch
 from pydantic import ValidationError
 
-from fdi_torch.config.channels import channel_mapping, expect_columns, expect_units, is_log, unrecorded_valves
+from fdi_torch.config.channels import (
+    channel_mapping,
+    expect_columns,
+    expect_units,
+    is_log,
+    unrecorded_valves,
+    without_column,
+)
 from fdi_torch.config.problems import ConfigError, explain
-from fdi_torch.config.recording_config import FileConfig, RecordingConfig, StartLevel, config_of, in_seconds
+from fdi_torch.config.recording_config import (
+    ColumnConfig,
+    FileConfig,
+    RecordingConfig,
+    StartLevel,
+    config_of,
+    in_seconds,
+)
 from fdi_torch.config.yaml_files import find_data, find_file, read_extended
 from fdi_torch.logbook import LogError
 from fdi_torch.names import unknown
@@ -77,15 +91,30 @@ def named_recordings(name: str, plant: PlantDescription, base: Path) -> list[Rec
     return [part.recording for part in load_recordings(configs, plant, folder)]
 
 
-def listed_recordings(name: str, plant: PlantDescription, base: Path) -> tuple[list[RecordingConfig], Path]:
+def planned_recordings(name: str, plant: PlantDescription, base: Path) -> list[Recording]:
+    """As `named_recordings`, of planned inputs: a sensor without a column counts as not recorded."""
+    sensors = [sensor.column for sensor in plant.sensors]
+    configs, folder = listed_recordings(name, plant, base, optional=sensors)
+    planned = []
+    for config in configs:
+        read = [] if is_query(config.file) else without_column(find_data(config.file, folder), sensors, config)
+        unrecorded = {sensor: ColumnConfig(recorded=False) for sensor in read if sensor not in config.columns}
+        planned.append(config.model_copy(update={"columns": config.columns | unrecorded}))
+    return [part.recording for part in load_recordings(planned, plant, folder)]
+
+
+def listed_recordings(
+    name: str, plant: PlantDescription, base: Path, optional: Collection[str] = ()
+) -> tuple[list[RecordingConfig], Path]:
     """The entries of a command line's argument, and the folder of their relative paths.
 
-    name: a CSV or MCAP file, or a YAML file with a list under `recordings`, as in a run file.
+    name: a CSV or MCAP file, or a YAML file with a list under `recordings`, as in a run file. optional: channels that
+    the file may lack.
     """
     if is_query(name):
         return [config_of(name)], base
     if Path(name).suffix not in (".yaml", ".yml"):
-        expect_columns(find_data(name, base), plant)
+        expect_columns(find_data(name, base), plant, optional)
         return [config_of(name)], base
     path = find_file(name, base)
     listed = read_extended(path).get("recordings")

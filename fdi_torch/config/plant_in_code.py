@@ -11,7 +11,7 @@ import torch
 
 from fdi_torch.config.strict import quantity
 from fdi_torch.config.written_units import written_units
-from fdi_torch.effects import build_network, effect_at, placements_for
+from fdi_torch.effects import build_network, effect_at, full_name, placements_for
 from fdi_torch.names import matching, unknown
 from fdi_torch.parameters import Parameter, ParameterSpace, is_effect_parameter
 from fdi_torch.plant.description import (
@@ -119,12 +119,12 @@ class Plant(PlantDescription):
         """dh/dt = f(t, h) of this plant, for `torchdiffeq.odeint`; `.start` holds the start levels.
 
         inputs: a `Recording`, constant inputs (channels,) in SI, or a function of t in s to these. theta: parameters
-        that differ from their nominal values, by full name in SI, each a number or a tensor (*batch), through which
+        that differ from their nominal values, by name in SI, each a number or a tensor (*batch), through which
         gradients flow: {"A.leak.size": size}; on their device, else on that of the inputs, the plant is computed.
         resolution: time scale of the smoothing of square roots and rims, s.
         Raises ValueError for an unknown parameter, and for actuators with memory or dead time.
         """
-        named = theta or {}
+        named = {full_name(name, self): value for name, value in (theta or {}).items()}
         from fdi_torch.simulate.ode import PlantOde
 
         network = build_network(self, placements_for(named))

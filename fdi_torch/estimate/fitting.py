@@ -158,12 +158,13 @@ def _step_control(step: float, recording: Recording, plant: PlantDescription) ->
 
 def set_up(
     plant: PlantDescription,
-    recordings: Sequence[Recording],
+    recordings: Recording | Sequence[Recording],
     parameters: Iterable[str | Parameter],
     start: StartLevels | Sequence[StartLevels] = "free",
     engine: EngineKind = "auto",
 ) -> Fitting:
-    """Set up the fit of `parameters` ('T1.leak', 'T1.leak.size', or a Parameter with its own range) to recordings.
+    """Set up the fit of `parameters` ('T1.leak', 'T1.leak.size', or a Parameter with its own range) to one or several
+    recordings.
 
     start: initial levels, one choice for all tanks or a mapping by tank, for all recordings or a sequence with one
     entry per recording. A choice is 'equilibrium' (the level of the plant file, else the equilibrium under the first
@@ -172,6 +173,7 @@ def set_up(
     """
     if not isinstance(plant, PlantDescription):
         raise TypeError(f"plant: expected a Plant, got {plant!r}; read a plant file by fdi_torch.load_plant")
+    recordings = [recordings] if isinstance(recordings, Recording) else recordings
     requested = [full_name(p, plant) if isinstance(p, str) else p for p in parameters]
     names = [p if isinstance(p, str) else p.name for p in requested]
     with tensors_on(recordings[0].time.device):

@@ -59,7 +59,7 @@ def simulate_recording(run: Run) -> Recording:
     """
     config = run.config.simulate
     if config is None:
-        raise ValueError(f"{run.source}: expected simulate, got none; describe the simulation under that key")
+        raise ValueError(f"{run.source}: expected simulate, got none; fdi new run writes a file that shows its keys")
     with naming_source(run.source):
         planned = planned_recording(config, run.plant)
         placements = placements_of(config.faults, run.plant)

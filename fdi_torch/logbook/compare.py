@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import orjson
 
 from fdi_torch.logbook.fingerprint import content_hash
 from fdi_torch.logbook.reader import Run, read_run
@@ -150,7 +151,9 @@ _NOTHING = (float("nan"), float("nan"), "")
 
 
 def _estimates(run: Run) -> dict[str, tuple[float, float, str]]:
-    """Parameter -> (value, standard error, unit), from the last estimate of each problem."""
+    """Parameter -> (value, standard error, unit), from the last estimate of each problem, the causes of a gap, and the
+    faults that a monitor last held for present.
+    """
     estimates: dict[str, tuple[float, float, str]] = {}
     for message in run.messages(["/estimate/final"]):
         payload = message.payload
@@ -159,4 +162,18 @@ def _estimates(run: Run) -> dict[str, tuple[float, float, str]]:
         units = payload.get("units") or [""] * len(names)
         for name, value, error, unit in zip(names, values, std, units, strict=True):
             estimates[prefix + name] = (float(value), float(error), unit)
+    for message in run.messages(["/gap/verdict"]):
+        for cause in orjson.loads(message.payload.get("answer", "{}")).get("causes", []):
+            for field, size in cause.get("parameters", {}).items():
+                numbers = (_number(size.get(key)) for key in ("value", "std"))
+                estimates[f"{cause['location']}.{cause['effect']}.{field}"] = (*numbers, size.get("unit", ""))
+    last = {(m.payload["location"], m.payload["fault"]): m.payload for m in run.messages(["/diagnosis/fault"])}
+    for (location, fault), payload in last.items():
+        if payload.get("present"):
+            numbers = (_number(payload.get(key)) for key in ("size", "size_std"))
+            estimates.setdefault(f"{location}.{fault}", (*numbers, payload.get("unit", "")))
     return estimates
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)

@@ -39,6 +39,18 @@ def test_only_what_differs_is_told(tmp_path: Path) -> None:
     assert "run" not in found.differences, "wall-clock fields are not compared"
 
 
+def test_every_kind_of_run_shows_its_faults(tmp_path: Path) -> None:
+    cause = {"effect": "leak", "location": "T1", "parameters": {"size": {"value": 0.31, "std": 0.02, "unit": "1"}}}
+    with RunLog(tmp_path / "gap.mcap", "gap", **FIXED) as log:
+        log.gap_verdict({"verdict": "named", "causes": [cause]})
+    with RunLog(tmp_path / "monitor.mcap", "monitor", **FIXED) as log:
+        for time, present, size in ((1.0, True, 0.5), (2.0, True, 0.3)):
+            log.fault("leak.size", "T1", present, t=time, size=size, size_std=0.01, unit="1")
+        log.fault("plugging.size", "P13", False, t=3.0, size=0.0, unit="1")
+    [leak] = compare([tmp_path / "gap.mcap", tmp_path / "monitor.mcap"]).results
+    assert (leak.name, leak.values, leak.std) == ("T1.leak.size", (0.31, 0.3), (0.02, 0.01))
+
+
 def test_equal_runs_have_nothing_to_tell(tmp_path: Path) -> None:
     found = compare([write_finished(tmp_path / f"{name}.mcap") for name in "abc"])
     assert found.differences == {} and found.same_content

@@ -42,9 +42,15 @@ def add_keys(parser: argparse.ArgumentParser, what: str, *models: str) -> None:
     parser.add_argument("--keys", action=ShowKeys, models=models, help=text)
 
 
-def add_config(parser: argparse.ArgumentParser, *models: str, required: bool = False) -> None:
-    """Add --config and --set. models: models of the file as 'module:Model'."""
-    parser.add_argument("--config", metavar="FILE", required=required, help="run file (YAML)")
+def add_config(
+    parser: argparse.ArgumentParser,
+    *models: str,
+    required: bool = False,
+    kind: str = "run",
+    example: str = "estimate.search.population=40",
+) -> None:
+    """Add --config and --set. models: models of the file as 'module:Model'. kind: of the file. example: of --set."""
+    parser.add_argument("--config", metavar="FILE", required=required, help=f"{kind} file (YAML)")
     if models:
         add_keys(parser, "such a file", *models)
     parser.add_argument(
@@ -52,7 +58,7 @@ def add_config(parser: argparse.ArgumentParser, *models: str, required: bool = F
         metavar="KEY=VALUE",
         action="append",
         default=[],
-        help="change one value of the file, as in --set estimate.search.population=40; may be repeated",
+        help=f"change one value of the file, as in --set {example}; may be repeated",
     )
 
 

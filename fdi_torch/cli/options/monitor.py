@@ -19,7 +19,13 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, "fdi_torch.config.monitor_file:MonitorConfig", required=True)
+    add_config(
+        parser,
+        "fdi_torch.config.monitor_file:MonitorConfig",
+        required=True,
+        kind="monitor",
+        example="false_alarms_every='1 h'",
+    )
     parser.add_argument("--out", metavar="DIR", help="folder for the log (default: logs)")
     parser.add_argument(
         "--follow", action="store_true", help="the file is still being written; process its samples as they come"

@@ -18,7 +18,9 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, "fdi_torch.config.rehearsal_file:RehearsalConfig", required=True)
+    add_config(
+        parser, "fdi_torch.config.rehearsal_file:RehearsalConfig", required=True, kind="rehearsal", example="seed=2"
+    )
     parser.add_argument("--out", metavar="DIR", help="folder for the log (default: logs)")
     parser.add_argument("--resume", action="store_true", help="continue from the log of a stopped run")
     add_live(parser)

@@ -16,6 +16,6 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, "fdi_torch.config.run_file:RunConfig")
+    add_config(parser, "fdi_torch.config.run_file:RunConfig", example="simulate.faults.T1.leak=0.3")
     add_run(parser)
     parser.add_argument("--replace", action="store_true", help="replace a recording of the same name")

@@ -20,7 +20,7 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, "fdi_torch.config.study_file:StudyFile", required=True)
+    add_config(parser, "fdi_torch.config.study_file:StudyFile", required=True, kind="study", example="study.trials=100")
     add_run(parser)
     add_device(parser)
     add_live(parser)
