@@ -148,7 +148,7 @@ def test_planned_inputs_need_no_readings(tmp_path: Path, capsys: pytest.CaptureF
         assert "T1.leak.size" in capsys.readouterr().out
     for command in ("check", "predict"):
         assert cli.main([command, "--plant", "three_tank", "--recording", str(planned)]) == cli.MISUSE
-        expected = "expected readings of h1, h2, h3, got inputs alone; what planned inputs can show is told by fdi plan"
+        expected = "expected readings of h1, h2, h3, got inputs alone; fdi plan and fdi diagnosability show"
         assert expected in capsys.readouterr().err
 
 

@@ -104,7 +104,8 @@ def _some(rng: np.random.Generator, count: int, chance: float, always: int) -> l
 def equilibrium(plant: PlantDescription, pumped: Array) -> Array:
     """(N,) m: levels at which a network of floor-level pipes rests. pumped (M,) m^3/s.
 
-    Implicit Euler steps of A h' = F(h) that grow without bound end as Newton's method on F(h) = 0.
+    A h' = F(h) is integrated by implicit Euler steps of growing length; in the limit they are Newton's method for
+    F(h) = 0.
     """
     names = [t.name for t in plant.tanks]
     places = [*names, OUTSIDE]

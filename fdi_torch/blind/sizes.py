@@ -99,7 +99,7 @@ def size_errors(truth: Mapping[str, Any], causes: Iterable[Mapping[str, Any]], p
 
 
 def sizes(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """By effect and for all: root mean square of z with its interval, and the share within 1.96 standard errors."""
+    """For each effect and all together: root mean square of z with its interval, share within 1.96 standard errors."""
     by: dict[str, list[float]] = {}
     for row in rows:
         for effect, z in (text.split() for text in row.get("z") or ()):

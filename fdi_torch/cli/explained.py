@@ -12,8 +12,8 @@ def say_first(misfit: Misfit, screen: Screen, *hints: str) -> None:
     if misfit.warning:
         screen.say(f"{misfit.warning}.")
         gap = (
-            "next: fdi gap tells random disturbances of the flows from an error of the plant file, and names its place "
-            "and cause"
+            "next: fdi gap distinguishes random disturbances of the flows from an error of the plant file, and names "
+            "its place and cause"
         )
         for hint in (gap, *hints):
             screen.say(f"- {hint}")

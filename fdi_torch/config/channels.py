@@ -126,8 +126,8 @@ def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[s
     sensors = {sensor.column for sensor in plant.sensors}
     if set(missing) == sensors and not _other_columns(path, plant):
         raise ValueError(
-            f"{path}: expected readings of {', '.join(missing)}, got inputs alone; what planned inputs can show is "
-            "told by fdi plan and fdi diagnosability"
+            f"{path}: expected readings of {', '.join(missing)}, got inputs alone; fdi plan and fdi "
+            "diagnosability show what planned inputs can reveal"
         )
     header = ", ".join(map(shortened, _header(path)))
     lines = "\n".join(f"    {line}" for line in mapped(path, plant, also_known))

@@ -104,7 +104,7 @@ def resolve(
 
 
 def plant_of(entry: Any, base: Path, source: str) -> PlantDescription:
-    """The plant by name, by file, or as a mapping or object. Raises ConfigError."""
+    """The plant of an entry: a shipped name, a plant file, its mapping or the plant itself. Raises ConfigError."""
     if isinstance(entry, PlantDescription):
         return entry
     if isinstance(entry, str | Path):

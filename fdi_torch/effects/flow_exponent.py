@@ -27,7 +27,7 @@ class FlowExponent(Effect):
         height = source_height(plant, place)
         typical, low, high = (share * height for share in (TYPICAL, LEAST, MOST))
         return (
-            Parameter("excess", "1", 0.0, -0.4, 0.6, meaning="exponent of the head less 1/2"),
+            Parameter("excess", "1", 0.0, -0.4, 0.6, meaning="exponent of the head minus 1/2"),
             Parameter("reference", "m", typical, low, high, meaning="head at which the flow is the nominal one"),
         )
 

@@ -22,7 +22,7 @@ class ValveCharacteristic(Effect):
     mistaken_for = ("valve_dead_zone", "valve_leak", "actuator_stuck", "valve_authority", "plugging")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("bend", "1", 0.0, -0.8, 4.0, meaning="exponent of the opening less 1"),)
+        return (Parameter("bend", "1", 0.0, -0.8, 4.0, meaning="exponent of the opening minus 1"),)
 
     def command(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         opening = torch.clamp(value, 0.0, 1.0)

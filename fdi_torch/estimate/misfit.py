@@ -46,7 +46,7 @@ class Misfit:
         return "" if self.explained else f"{UNRELIABLE}{size}"
 
     def headline(self, text: str) -> str:
-        """The text, after the warning if there is one."""
+        """The text, preceded by the warning if there is one."""
         return f"{self.warning}; {text}" if self.warning else text
 
     def to_dict(self) -> dict[str, bool | float | None]:

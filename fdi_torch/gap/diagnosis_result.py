@@ -42,7 +42,7 @@ class DiagnosisResult:
 
     @property
     def fitter(self) -> Fitter:
-        """With the disturbance noise of the likeliest hypothesis."""
+        """The fitter with the disturbance noise of the likeliest hypothesis."""
         return self.posterior.best.explanation.fitter
 
     @property

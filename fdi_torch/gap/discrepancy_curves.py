@@ -102,7 +102,7 @@ def _unit(
 
 
 def _of_stage(free: Sequence[Placement], here: Sequence[Placement]) -> tuple[Placement, ...]:
-    """At a tank: the free cross-section for effects on the cross-section, the free inflow for all others."""
+    """The free functions that belong to a tank's effects: the cross-section for effects on it, else the inflow."""
     storage = any(p.effect.stage is Stage.STORAGE for p in here)
     return tuple(p for p in free if (p.effect.stage is Stage.STORAGE) == storage) or tuple(free)
 

@@ -71,8 +71,8 @@ class ExplanationPool:
         """Estimate noise and fit alternately until the evidence converges; keep the better explanation.
 
         Effects that were evaluated before are evaluated again only if this fit is better under the noise found then.
-        An explanation that falls too far behind those of its size that will be extended, or behind one with some of its
-        effects, is given up, as a fit is.
+        The evaluation stops early if the explanation cannot compete: with those of as many effects that will be
+        extended, or with one that has only some of its effects.
         """
         before = self.explanations.get(fit.key)
         if before and before.fitter.cost(fit) > before.fit.cost - CONVERGED:

@@ -148,7 +148,7 @@ def fitted_free_form(
 
 
 def discrepancy_tables(fit: Fit) -> dict[str, object]:
-    """The fitted discrepancy as tables over its local variables, in shares of `scale`."""
+    """The fitted discrepancy as tables over its local variables, as multiples of `scale`."""
     values, tables = fit.effect_values, {}
     free = [p for p in fit.candidate.placements if isinstance(p.effect, _Free)]
     for placement in free:

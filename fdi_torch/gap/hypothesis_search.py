@@ -89,7 +89,7 @@ class HypothesisSearch:
     def _with_discrepancies(
         self, explanation: RankedExplanation, at: Sequence[str], best: CauseHypothesis | None = None
     ) -> list[CauseHypothesis]:
-        """An explanation alone, and with a discrepancy at each of some places, as far as relevant against the best."""
+        """An explanation alone, and with a discrepancy at each of the places unless it is far worse than `best`."""
         if all((id(explanation), place) in self._evaluated for place in at):
             return [h for place in at for h in self._evaluated[id(explanation), place]]
         needed, rival = (self._needed(explanation, best), best.noise) if best else (-math.inf, None)
@@ -141,7 +141,7 @@ class HypothesisSearch:
             best = likeliest(trials)
 
     def _with_fewer_effects(self, best: CauseHypothesis) -> list[CauseHypothesis]:
-        """Without each of the effects, with the same discrepancy, or one at the place of another effect."""
+        """Variants of a hypothesis without one of its effects, with its discrepancy or one at an effect's place."""
         if (at := best.discrepancy) is not None:
             beside = _without_discrepancy(best, at)
             reduced = [
@@ -156,7 +156,7 @@ class HypothesisSearch:
         return [h for e in explanations for h in self._with_discrepancies(e, sorted({at for _, at in e.key}), best)]
 
     def _with_more_effects(self, best: CauseHypothesis) -> list[CauseHypothesis]:
-        """With each of the most promising further effects beside the discrepancy."""
+        """Variants of a hypothesis with one of the most promising further effects beside the discrepancy."""
         if (at := best.discrepancy) is None:
             return []
         beside = _without_discrepancy(best, at)
@@ -236,7 +236,7 @@ class HypothesisSearch:
         return explanation.log_weight - log_prior(fit.key, self.pool.choices) - volume
 
     def _with_inexact_laws(self, h: CauseHypothesis) -> list[CauseHypothesis]:
-        """Without effects that may describe the error of the law of another effect at their place.
+        """Variants without effects that may only describe the error of the law of another effect at their place.
 
         Such an effect costs its selection among all effects there instead of the prior odds of one more cause.
         """

@@ -178,7 +178,7 @@ def log_prior(causes: Iterable[CauseName], choices: int) -> float:
 
 
 def log_width(fitter: Fitter, space: ParameterSpace, i: int) -> float:
-    """Log width of a parameter's prior over sqrt(2 pi), in the parameter's unit."""
+    """log(w / sqrt(2 pi)), where w is the width of a parameter's prior in the parameter's unit."""
     p = space.parameters[i]
     if math.isfinite(p.std):
         return math.log(p.std)

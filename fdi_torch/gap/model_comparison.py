@@ -134,7 +134,7 @@ SHOWN = ("nominal", "recalibrated", "augmented", "ceiling")
 
 
 def prediction_arrays(result: DiagnosisResult, holdouts: Sequence[HeldOut]) -> dict[str, Tensor]:
-    """Predictions by name, SI, sensors and samples as recorded; hold-outs after the first carry their number."""
+    """Predictions in SI by name, for the recorded samples and sensors; names of further hold-outs end in a number."""
     fitter = result.fitter
     arrays: dict[str, Tensor] = {}
     for k, rows in enumerate(fitter.data.rows):

@@ -150,8 +150,8 @@ def _without_stuck_sensors(
         return plant
     if len(silent) == len(plant.sensors):
         raise ValueError(
-            f"{recordings[0].source}: expected a sensor that reads its level, got none: {', '.join(sorted(silent))} "
-            "stand still throughout; check their wiring"
+            f"{recordings[0].source}: expected a sensor whose readings vary, got none: {', '.join(sorted(silent))} "
+            "repeat one value throughout; check their wiring"
         )
     return without_sensors(plant, silent)
 

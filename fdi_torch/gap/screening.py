@@ -101,7 +101,7 @@ class ScreeningResult:
 
 
 def options_of(placements: Sequence[Placement], fitter: Fitter, reach: OperatingRange) -> list[Option]:
-    """All starts of all placements."""
+    """One option for each start value of each effect at each place."""
     plant = fitter.data.plant
     return [
         Option(p, {p.full_name(name): value for name, value in start.items()}, parameters)

@@ -48,7 +48,7 @@ def _write_log(
 
 
 def _trial_fields(row: Row) -> dict[str, Any]:
-    """Fields of a row without None, with causes as texts, and without those that a trial's message has anyway."""
+    """Fields of a row that are not None, causes as texts; kind, seed and verdict are fields of each trial message."""
     named = {key: [f"{effect}@{place}" for effect, place in row[key]] for key in ("truth", "causes")}
     return {k: v for k, v in row.items() if v is not None and k not in ("kind", "seed", "verdict")} | named
 

@@ -291,7 +291,7 @@ def usable_part(plant: PlantDescription, part: Recording) -> Recording:
     checked = usable(plant, part)
     if checked.stuck:
         raise ValueError(
-            f"{part.source}: expected a fault-free part in which every sensor reads its level, but "
+            f"{part.source}: expected a fault-free part in which the readings of every sensor vary, but "
             f"{checked.stuck[0].text}; choose another part, or leave the sensor out of the plant file"
         )
     return checked.recording

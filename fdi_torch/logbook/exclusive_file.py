@@ -1,4 +1,4 @@
-"""The file of a log: written by one process only, with disk errors as sentences."""
+"""The file of a log: only one process writes it, and disk errors are raised with a sentence for the user."""
 
 from __future__ import annotations
 

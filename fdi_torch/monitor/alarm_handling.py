@@ -152,7 +152,7 @@ class AlarmHandler:
         events: list[Event] = []
         earlier_alarm = self._alarm_of_known_faults(state, fits[0])
         if earlier_alarm is not None:  # only the size of a known fault changed
-            state, event = self.retire(state, number, f"it counts with alarm {earlier_alarm}", announced=False)
+            state, event = self.retire(state, number, f"it belongs to alarm {earlier_alarm}", announced=False)
             events, number = [event], earlier_alarm
             state = state.with_alarm(state.alarm(earlier_alarm).raised_again(alarm.last))
         next_fit = self.explainer.next_fit(fits[0], state.now)
@@ -166,7 +166,7 @@ class AlarmHandler:
         """Count the pending alarm with the alarm of the latest change, which explains both."""
         assert state.pending is not None
         alarm = state.alarm(state.pending.number)
-        state, event = self.retire(state, alarm.number, f"it counts with alarm {change.number}", announced=False)
+        state, event = self.retire(state, alarm.number, f"it belongs to alarm {change.number}", announced=False)
         state = state.with_alarm(state.alarm(change.number).raised_again(alarm.last))
         revised, events = self._revise(state, change, "isolated", fits)
         return revised, [event, *events]

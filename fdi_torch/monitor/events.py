@@ -175,7 +175,7 @@ class Event:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Of sizes and stds, SI."""
+        """SI units of `sizes` and `stds`."""
         return tuple(s.unit for s in self.best.sizes) if self.best else ()
 
     @property

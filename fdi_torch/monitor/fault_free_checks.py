@@ -88,8 +88,8 @@ def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -
     """Text: the expected time between false alarms, the 95 % interval of their number in it, and how long a fault-free
     part would determine their rate within a factor of RATE_FACTOR (95 %).
 
-    No interval of the rate: a small share of the posterior of the noise may determine its mean, which then lies
-    outside.
+    The text gives no interval of the rate itself, because the mean rate may lie outside of it: a small share of the
+    posterior of the noise may dominate the mean.
     """
     design = detector.design
     seconds = noise.whitening.samples * design.interval

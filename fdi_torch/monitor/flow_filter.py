@@ -96,14 +96,14 @@ class FlowFilter:
 
     @property
     def joint(self) -> Linear:
-        """States, flows and correlated noise of sensors together."""
+        """The linear model of all states of the filter: plant states, random flows and correlated sensor noise."""
         c = self.linear.output
         own = torch.eye(len(c), dtype=c.dtype)[:, : self._noises]
         return Linear(self.transition, torch.cat([c, torch.zeros_like(c), own], 1))
 
     @cached_property
     def gain(self) -> Gain:
-        """Kalman gain of the filter's state, with its transient from unknown levels."""
+        """Kalman gain from the first sample on, where the levels are still unknown, to its steady value."""
         levels = with_effects(self.start_std, len(self.linear.transition))
         start = torch.cat([levels, self.flow_std, self.reading_std[: self._noises]])
         return kalman_gain(self.joint, self.process_std, self.white_std, start)

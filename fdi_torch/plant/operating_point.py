@@ -96,7 +96,9 @@ class OperatingPoint:
         return replace(local, head=component.head(local))
 
     def at_tank(self, name: str, far: str | None = None, net: Tensor | None = None) -> Local:
-        """Conditions at a tank, or between a tank and `far`; net: inflow of the tank so far, m^3/s."""
+        """Conditions at a tank, or between it and the tank `far`. net: sum of the flows into the tank that are already
+        computed, m^3/s.
+        """
         constants, level = self.values[name], self.levels[name]
         return Local(
             self.clock,

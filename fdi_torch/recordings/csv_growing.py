@@ -56,7 +56,7 @@ class GrowingCsv:
 
     @property
     def clock_zero(self) -> float | None:
-        """Time 0 as the file's clock shows it, s since 1970; None before the first row, and without dates."""
+        """Date of the file's time 0, s since 1970; None before the first row is read and if the file has no dates."""
         dated = self._first is not None and (self._clock.stamps or self._first > SINCE_1970)
         return self._first + self._columns.read_stamp.offset if dated and self._first is not None else None
 

@@ -70,8 +70,8 @@ def undersampled_inputs(recording: Recording, plant: PlantDescription) -> Iterat
 def inputs_not_held(recording: Recording, plant: PlantDescription) -> list[str]:
     """The undersampled commands that are certainly not held from each sample to the next.
 
-    The test errs in a share of BY_CHANCE of recordings, divided among the commands. It says nothing of a command that
-    its own past determines, such as a sine, or of one that is interpolated linearly.
+    The test has a false-alarm probability of BY_CHANCE per recording, divided equally among the commands. It says
+    nothing of a command that its own past determines, such as a sine, or of one that is interpolated linearly.
     """
     names = {finding.channel for finding in undersampled_inputs(recording, plant)}
     if recording.hold != "zero_order" or not names:

@@ -41,11 +41,11 @@ class Chart:
     """Lines over a common axis.
 
     log: use a logarithmic axis if the values span more than a decade; with zeros among them it is linear below the
-    median of the positive values (asinh). level: a horizontal reference
-    line; at a level of 0 the lines are residuals. events: times of vertical lines. clock: charts of one clock show the
-    same crosshair and zoom together. from_zero: the vertical axis begins at 0. height: of the picture, inches.
-    zero: time 0 as the recording's clock showed it, s since 1970; None for another axis, or a clock without dates.
-    after: its words beside the label.
+    median of the positive values (asinh). level: a horizontal reference line; at 0, the lines are residuals.
+    events: times of vertical lines. clock: charts of one clock show the same crosshair and zoom together. from_zero:
+    the vertical axis begins at 0. height: of the picture, inches.
+    zero: date of time 0, s since 1970; None if the axis is not time or the recording has no dates. after: words behind
+    the label of the axis, as in ' after 2026-11-01 08:00:00'.
     """
 
     title: str

@@ -43,7 +43,8 @@ def _is_unexplained(run: Material) -> bool:
 
 
 def _better(compared: Comparison, runs: Sequence[Material]) -> str:
-    """The run with the smallest residuals; the verdicts, if the runs have no residuals of one recording.
+    """A sentence that names the run with the smallest residuals; if the runs did not read the same recording, their
+    verdicts instead.
 
     A run's size is the geometric mean of its sensors' root mean squares. Two sizes from N independent readings differ
     by chance by up to 1.96 / sqrt(N) of them at 95 %: the relative variance of each is 1 / (2 N).

@@ -56,7 +56,7 @@ class DiagnosedEffect:
 
 
 def diagnosed_effects(material: Material) -> list[DiagnosedEffect]:
-    """Faults of a diagnosis (the last message about each), then the causes of a gap, rounded readings excepted."""
+    """Faults of a diagnosis, from the last message about each, and causes of a gap other than rounded readings."""
     faults = {(m.get("fault"), m.get("location")): _fault(m) for m in material.of("/diagnosis/fault")}
     causes = apart_from_rounding(material.answer.get("causes", []))
     return [*faults.values(), *(_cause(cause, material.plant) for cause in causes)]

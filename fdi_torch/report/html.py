@@ -69,5 +69,5 @@ def pairs(entries: Sequence[tuple[Any, Any]]) -> Markup:
 
 
 def folded(summary: str, *content: Any, printed: bool = True) -> Markup:
-    """Content that opens on click; it is open in print, or left out there."""
+    """Content that opens on a click. printed: whether it appears (opened) on paper."""
     return tag("details", tag("summary", summary), *content, **({} if printed else {"class_": "raw"}))

@@ -1,4 +1,4 @@
-"""Progress of a run as its log tells it, and the size of its residuals."""
+"""Progress of a run according to its log, and the size of its residuals."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fdi_torch.report.predictions import predicted
 
 @dataclass(frozen=True)
 class Progress:
-    """text: how far the run is. share: part of its budget that is used, 0 to 1; None if the log does not tell."""
+    """text: how far the run is. share: part of its budget that is used, 0 to 1; None if the log does not contain it."""
 
     text: str
     share: float | None = None

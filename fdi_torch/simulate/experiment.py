@@ -57,7 +57,8 @@ class Experiment:
     def sample_intervals(self) -> Tensor:
         """Time since the preceding sample, (S,) s.
 
-        For the first sample, the time since the start; if it is at the start, the second interval, or the first step.
+        The first sample has none before it: its interval is the time since the start or, if it lies at the start, the
+        interval that follows it (a step of the grid if there is only one sample).
         """
         times = self.sample_times
         if float(self.sample_share[0]) > 0.0:

@@ -5,7 +5,7 @@ them); or a gap that no effect of the library explains (with its location and sh
 with a tolerance in the plant file are always refitted and do not count as a gap.
 
 CSV headers are name_unit, as in t_s,Q1_cm3_s,h1_cm. `fdi report LOG` makes a page of the answer, `fdi replay LOG`
-repeats the diagnosis from its log. `fdi plan` tells beforehand what planned inputs cannot show; `fdi refit` fits the
+repeats the diagnosis from its log. `fdi plan` lists beforehand what planned inputs cannot show; `fdi refit` fits the
 causes that were adopted together with all constants.
 """
 

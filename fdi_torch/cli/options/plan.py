@@ -12,7 +12,7 @@ from fdi_torch.cli.options import add_library, add_plant_and_recording
 
 NOISE = "1 mm"
 
-STEP, SUMMARY = "plan", "tell what planned inputs cannot show before an experiment"
+STEP, SUMMARY = "plan", "list what planned inputs cannot show, before an experiment"
 EXAMPLES = """
 examples:
   fdi plan --plant rig.yaml --recording planned.csv

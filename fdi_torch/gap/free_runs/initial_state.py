@@ -4,7 +4,7 @@ The segment determines the initial levels, the constants that vary between recor
 plant's equations are wrong by more than the sensor noise, and for longer; without allowance for it, a varying constant
 would be biased until it compensated the error. Each tank therefore has an unknown constant inflow in each part of the
 segment, normal about zero. Its standard deviation, as a share of the outflow of a full tank, maximises the evidence
-(MacKay, 1992; Laplace's approximation). After the segment there is none.
+(MacKay, 1992; Laplace's approximation). After the segment this inflow is zero.
 """
 
 from __future__ import annotations

@@ -42,10 +42,11 @@ UNMEASURED_STARTS = (0.1, 0.25, 0.5, 0.8)  # initial levels, as shares of the he
 
 @dataclass(frozen=True)
 class Prediction:
-    """readings (S, C) in SI, in the order of the plant's sensors. start_levels: m. own: constants determined from the
-    first samples, SI. rmse: by sensor, over all samples or those after the initial segment.
+    """readings (S, C) in SI, in the order of the plant's sensors. start_levels: m. own: constants that were
+    estimated from the first samples, SI. rmse: by sensor, over all samples or those after the initial segment.
 
-    settled: whether the trajectory converged to CONVERGED, scaled with the size of the tanks. defect: what remains, m.
+    settled: whether the trajectory converged to CONVERGED, scaled with the size of the tanks. defect: the largest
+    correction of a state in the last iteration, m.
     """
 
     readings: Tensor
@@ -65,7 +66,7 @@ def predict(
     settle: float | None = None,
     vary: Collection[str] = (),
 ) -> Prediction:
-    """Run the plant freely as its file has it.
+    """Simulate the plant along the recording with the constants of its file, from estimated initial levels.
 
     step: of the simulation, s; None for half the sampling interval (in long recordings the MOST_STEPS-th part of them),
     and less if a rim or another sharp bend keeps the trajectory from converging.

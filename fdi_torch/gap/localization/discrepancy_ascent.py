@@ -124,7 +124,7 @@ class Ascent:
         return self.evaluate(regression, regression.of(place), place, noise)
 
     def climbed(self, best: EvaluatedDiscrepancy, needed: float) -> EvaluatedDiscrepancy:
-        """Noise, regressors and parameters of the fit in turn, until nothing gains or `needed` is out of reach."""
+        """Improve noise, regressors and fit parameters in turn, until nothing gains or `needed` is out of reach."""
         for turn in range(MOST_TURNS):
             before, best = best.gain, max(best, self._with_likely_noise(best, turn == 0), key=gain_of)
             best = self.with_finer_positions(best)
@@ -138,7 +138,7 @@ class Ascent:
         return best
 
     def with_finer_positions(self, current: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
-        """With further regressors under the same noise, until none is worth its selection.
+        """The discrepancy with further regressors under the same noise, until none is worth its selection.
 
         The estimated noise falls only after most of them were added, so that each alone seems to gain little.
         """

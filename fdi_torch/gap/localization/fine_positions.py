@@ -48,7 +48,7 @@ class Positions:
     """All positions of a kink, a jump, a relay or a step in time at a place, under one noise.
 
     under: fitter with the disturbance noise. used (M,): the regressors of the discrepancy that are selected already.
-    The strength of each position is that beside these; regressors that are added later only reduce it.
+    The strength of each position is computed with these present; regressors that are added later only reduce it.
     """
 
     def __init__(

@@ -119,7 +119,7 @@ def _under_the_noise_of_the_likeliest(
 
 
 def _likeliest_of_each_place(discrepancies: Sequence[LocalizedDiscrepancy]) -> tuple[LocalizedDiscrepancy, ...]:
-    """Of each place the discrepancy with the largest gain, the likeliest place first."""
+    """The discrepancy with the largest gain at each place, the likeliest place first."""
     best: dict[str, LocalizedDiscrepancy] = {}
     for discrepancy in sorted(discrepancies, key=gain_of, reverse=True):
         best.setdefault(discrepancy.location, discrepancy)

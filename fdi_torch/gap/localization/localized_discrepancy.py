@@ -27,7 +27,10 @@ class Estimate:
 
     @staticmethod
     def beside(under: Fitter, fit: Fit, linearised: Linearised, columns: Tensor, precision: Tensor) -> Estimate:
-        """To first order, beside coefficients of columns (S, C, M) with normal priors of this precision (M,)."""
+        """First-order estimate of the parameters together with the coefficients of columns (S, C, M).
+
+        precision (M,): of the normal priors of the coefficients.
+        """
         residual, jacobian = (x[0] for x in under.white(linearised))
         scale, pull, off = under.priors(fit.space, fit.theta)
         rows = torch.cat([jacobian * scale, under.whiten(columns)], dim=-1).flatten(0, 1)
@@ -62,7 +65,7 @@ class LocalizedDiscrepancy:
 
     @property
     def periods(self) -> tuple[float, ...]:
-        """Of the sinusoids, s."""
+        """Periods of the sinusoids, s."""
         return () if self.frequency is None else tuple(1.0 / (k * self.frequency) for k in range(1, HARMONICS + 1))
 
 

@@ -97,7 +97,7 @@ def _moved(fitter: Fitter, linearised: Linearised) -> float:
 def drifting_sensors(
     regression: DiscrepancyRegression, noise: StateNoise, places: Sequence[str], base: float, needed: float
 ) -> list[LocalizedDiscrepancy]:
-    """Sensors with a drift, as far as their gain in evidence can be relevant, which it is from `needed` on."""
+    """A drift at each sensor, without those whose gain in log evidence cannot reach `needed`."""
     fitter, fit = regression.fitter, regression.fit
 
     def evaluate(noise: StateNoise) -> LocalizedDiscrepancy:

@@ -190,7 +190,7 @@ def _typical_scatter(plant: PlantDescription, recording: Recording, sensor: Sens
 
 
 def _other_readings(recording: Recording, stuck: StuckSegment) -> Tensor:
-    """The sensor's valid readings at other values."""
+    """The sensor's valid readings that differ from the value at which it is stuck."""
     _, values = _values(recording, stuck.sensor)
     return values[values != stuck.value]
 

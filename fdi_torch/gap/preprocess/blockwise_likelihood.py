@@ -34,7 +34,8 @@ from fdi_torch.recording import Recording
 from fdi_torch.recordings.repeated_readings import scatter
 
 SAMPLES = 1200
-"""Most samples of a thinned recording; recording faults show at the time scale of the plant."""
+"""Recordings are thinned to at most this many samples, because recording faults already show at the time scale of the
+plant."""
 ROUNDS = 3
 """Alternations between the fit and the variances of its residuals."""
 BROAD = 0.1

@@ -68,7 +68,8 @@ class ComparisonRow:
     """Performance of one estimator.
 
     over_bound: root mean square of error / bound over the faulty parameters of successful runs, and its 95 % interval.
-    failures: runs that ended neither close nor within five bounds, of `runs`. never: runs that did not stay within 5 %.
+    failures: number of the `runs` whose final errors exceed both 5 % of the range and five bounds. never: number of
+    runs that did not stay within 5 %.
     to_close: quartiles of the time after which all parameters stay within 5 % of their range, s; infinite: never.
     """
 
