@@ -16,6 +16,7 @@ import fdi_torch
 from fdi_torch import Pipe, PlacedEffect, Plant, Pump, Recording, Sensor, Tank
 from fdi_torch.config import plant_in_code
 from fdi_torch.config.plant_file import build_plant
+from fdi_torch.config.run_file import build_run
 from fdi_torch.config.yaml_files import shipped_plants
 from fdi_torch.quantities import displayed_in
 from tests.rigs import blank_recording
@@ -253,6 +254,20 @@ def test_arguments_of_another_kind_are_named() -> None:
             function(RIG, frame)  # type: ignore[operator]
     with pytest.raises(fdi_torch.ConfigError, match=r"train: recordings.0: expected a file name, .* got a set"):
         fdi_torch.train({"plant": RIG, "recordings": [frame], "estimate": {"parameters": ["A.leak"]}})
+    with pytest.raises(TypeError, match="predict: expected one recording, got a list of 2"):
+        fdi_torch.predict(RIG, [simulated(), simulated()])  # type: ignore[arg-type]
+    with pytest.raises(
+        fdi_torch.ConfigError, match=r"fault_free: expected a value, .* \(interval .* as in \[0 s, 300 s\]"
+    ):
+        fdi_torch.monitor({"plant": RIG, "recording": simulated()})
+
+
+def test_one_recording_and_one_effect_need_no_list(tmp_path: Path) -> None:
+    blank, estimate = simulated(), {"parameters": ["A.leak"]}
+    run = build_run({"plant": RIG, "recordings": blank, "estimate": estimate}, tmp_path, "train")
+    assert [recording is blank for recording in run.given.values()] == [True]
+    found = fdi_torch.gap(RIG, blank, library="leak", out=tmp_path)
+    assert found.answer.verdict
 
 
 def test_constant_inputs_of_the_differential_equation_are_a_tensor_or_numbers() -> None:

@@ -31,6 +31,11 @@ def keys(model: type[BaseModel], prefix: str = "") -> Iterator[Key]:
             yield from ((f"{path}.{f.name}", _shown(f.default), "") for f in dataclasses.fields(inner))
 
 
+def meanings(model: type[BaseModel]) -> dict[str, str]:
+    """The meaning of each key of a model by its path."""
+    return {path: meaning for path, _, meaning in keys(model)}
+
+
 def config_reference(model: type[BaseModel]) -> str:
     """The keys as aligned lines."""
     rows = [(path, f"[{default}]" if default else "", meaning) for path, default, meaning in keys(model)]

@@ -60,7 +60,9 @@ class MonitorConfig(Strict):
     plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
     recording: RecordingConfig = Field(description="the recording to follow; none beside `source`")
     source: SourceConfig | None = Field(None, description="a live source in place of a recording")
-    fault_free: tuple[Seconds, Seconds] = Field(description="interval from which the noise is estimated, s")
+    fault_free: tuple[Seconds, Seconds] = Field(
+        description="interval from which the noise is estimated, as in [0 s, 300 s]"
+    )
     calibrate: list[str] = Field(default_factory=list, description="constants fitted to the fault-free part first")
     faults: list[str] = Field(default_factory=list, description="parameters that may change; by default the usual ones")
     ranges: dict[str, tuple[float, float]] = Field(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -25,9 +25,9 @@ class UnknownKeyError(ValueError):
         self.key = key
 
 
-def explain(error: ValidationError, source: str, known: Iterable[str] = ()) -> ConfigError:
-    """Pydantic's findings as sentences. known: the paths of all keys, to locate a misplaced key."""
-    known = list(known)
+def explain(error: ValidationError, source: str, known: Mapping[str, str] | None = None) -> ConfigError:
+    """Pydantic's findings as sentences. known: the meaning of each key by its path, see `meanings`."""
+    known = known or {}
     sentences = [f"{source}: {_path(e['loc'])}{_sentence(e, known)}" for e in error.errors(include_url=False)]
     return ConfigError(list(dict.fromkeys(sentences)))
 
@@ -45,9 +45,10 @@ def _path(location: tuple[int | str, ...]) -> str:
     return ".".join(str(part) for part in location) + ": " if location else ""
 
 
-def _sentence(finding: Any, known: Sequence[str]) -> str:
+def _sentence(finding: Any, known: Mapping[str, str]) -> str:
     if finding["type"] == "missing":
-        return "expected a value, got nothing; add it"
+        meaning = known.get(".".join(map(str, finding["loc"])))
+        return "expected a value, got nothing; add it" + (f" ({meaning})" if meaning else "")
     if "error" in finding.get("ctx", {}):
         return f"{finding['ctx']['error']}{_elsewhere(finding['ctx']['error'], known)}"
     if finding["type"] in ("list_type", "tuple_type"):
@@ -60,7 +61,7 @@ def _sentence(finding: Any, known: Sequence[str]) -> str:
     return f"{expected}, got {_shown(finding['input'])}"
 
 
-def _elsewhere(error: Exception, known: Sequence[str]) -> str:
+def _elsewhere(error: Exception, known: Mapping[str, str]) -> str:
     if not isinstance(error, UnknownKeyError):
         return ""
     if ":" in error.key:

@@ -9,7 +9,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from pydantic import Field, ValidationError, field_validator
 
-from fdi_torch.config.key_reference import keys
+from fdi_torch.config.key_reference import meanings
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import ConfigError, explain
@@ -93,7 +93,7 @@ def resolve(
     try:
         config = model.model_validate(dict(data))
     except ValidationError as error:
-        raise explain(error, source, (path for path, _, _ in keys(model))) from None
+        raise explain(error, source, meanings(model)) from None
     try:
         plant = plant_of(data.get("plant", model.model_fields["plant"].default), base, source)
     except ConfigError as error:  # errors within a plant file already name that file

@@ -62,6 +62,7 @@ def build_run(data: Mapping[str, Any], base: Path, source: str) -> Run:
     A `Plant` or a `Recording` object may replace the name of a plant or of a recording's file.
     """
     recordings = data.get("recordings")
+    recordings = [recordings] if isinstance(recordings, Recording) else recordings
     listed, given = separate_recordings(recordings) if isinstance(recordings, list | tuple) else (recordings, {})
     config, plant, text = resolve(RunConfig, {**data, "recordings": listed} if given else data, base, source)
     return Run(config, plant, base, source, text, given)

@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError
 
 from fdi_torch.capacity import expect_room
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
-from fdi_torch.config.key_reference import keys
+from fdi_torch.config.key_reference import meanings
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.resolved_config import values_in
 from fdi_torch.config.run_file import Run, RunConfig, build_run
@@ -96,7 +96,7 @@ def build_study(data: Mapping[str, Any], base: Path, source: str) -> Study:
     try:
         config = scaled_to_plant(StudyConfig.model_validate(block), time_scale(run.plant))
     except ValidationError as error:
-        raise explain(error, f"{source}: study", (path for path, _, _ in keys(StudyFile))) from None
+        raise explain(error, f"{source}: study", meanings(StudyFile)) from None
     text = run.text + write_yaml({"study": block})
     return Study(config, run, _plan(config, run), text)
 

@@ -114,6 +114,9 @@ def gap(
     (names of effects), step (s), most, named_only, as the options of `fdi gap`. Raises ValueError for other settings.
     """
     plant = plant_of(plant)
+    for name in ("library", "leave_out"):
+        if isinstance(settings.get(name), str):
+            settings[name] = (settings[name],)
     valid_settings = [field.name for field in fields(Settings)]
     for name in settings:
         if name not in valid_settings:
@@ -155,6 +158,8 @@ def predict(
     unknown for a time.
     """
     plant = plant_of(plant)
+    if isinstance(recording, list | tuple):
+        raise TypeError(f"predict: expected one recording, got a list of {len(recording)}; call it for each of them")
     parts = recordings_of(recording, plant)
     if len(parts) != 1:
         raise ValueError(
