@@ -157,7 +157,7 @@ def test_a_file_without_its_option_is_told_the_option(capsys: pytest.CaptureFixt
     assert "unrecognized argument: leak.yaml; name a file by its option: --config leak.yaml" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         cli.main(["train", "run.csv"])
-    assert "run.csv; a file with --config names it" in capsys.readouterr().err
+    assert "run.csv; name it in the file for --config" in capsys.readouterr().err
 
 
 def test_check_states_the_volume_and_the_emptying_time_of_each_tank(capsys: pytest.CaptureFixture[str]) -> None:

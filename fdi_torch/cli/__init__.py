@@ -176,7 +176,7 @@ class _Parser(argparse.ArgumentParser):
         if Path(file).suffix and option in self._option_string_actions:
             self.error(f"unrecognized argument: {file}; name a file by its option: {option} {file}")
         if Path(file).suffix and "--config" in self._option_string_actions:
-            self.error(f"unrecognized argument: {file}; a file with --config names it (fdi new --help writes one)")
+            self.error(f"unrecognized argument: {file}; name it in the file for --config (fdi new writes one)")
         return known, others
 
 

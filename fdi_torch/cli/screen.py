@@ -41,7 +41,7 @@ def log_words(log: Path) -> str:
 
 
 def _shown(text: str) -> Text:
-    """Text in the only form in which it is printed to the terminal."""
+    """The text without control characters; all text goes through here before it is printed."""
     return Text(printable(text))
 
 

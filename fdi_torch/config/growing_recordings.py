@@ -51,7 +51,9 @@ def growing_rows(
         raise ConfigError([f"{config.file}: expected neither zone, sort nor period to follow a file; remove them"])
     path = _find(config.file, base)
     if isinstance(config.start, datetime) or isinstance(config.stop, datetime):
-        raise ConfigError([f"{config.file}: expected start and stop in s for a file that is followed, got a stamp"])
+        raise ConfigError(
+            [f"{config.file}: expected start and stop in s for a file that is followed, got a time stamp"]
+        )
     start = -np.inf if config.start is None else config.start
     stop = np.inf if config.stop is None else config.stop
     try:

@@ -157,8 +157,8 @@ def in_seconds(moment: float | datetime, recording: Recording, config: Recording
 
 class RecordingConfig(FileConfig):
     also: list[FileConfig] = Field(default_factory=list, description="CSV files with further channels of the same run")
-    start: Moment | None = Field(None, description="first time used, s, or a stamp such as 2026-03-29 08:30:00")
-    stop: Moment | None = Field(None, description="last time used, s, or a stamp")
+    start: Moment | None = Field(None, description="first time used, s, or a time stamp such as 2026-03-29 08:30:00")
+    stop: Moment | None = Field(None, description="last time used, s, or a time stamp")
     mask: list[tuple[Moment, Moment]] = Field(
         default_factory=list, description="intervals whose readings are ignored, s or stamps"
     )

@@ -259,7 +259,7 @@ def _try_with_correction(
 
 
 def _lower(before: Tensor, step: Step, cost: Tensor) -> Tensor:
-    """Which trials have a finite cost below that before, from a solvable step with a predicted decrease, (L,) bool."""
+    """(L,) bool: the step was solvable, its predicted decrease is positive, and the new cost is finite and lower."""
     return step.solvable & torch.isfinite(cost) & (cost < before) & (step.predicted > 0)
 
 

@@ -42,7 +42,8 @@ def test_the_verdict_comes_first_in_words(log: Path) -> None:
     text = page([report_of(material_of(log, load_plant("three_tank")))])
     assert headline(material_of(log)) == "Fault: leak at T1 (size 0.3004 ± 0.0020, 30 cm³/s)"
     assert text.index("Fault: leak at T1") < text.index("<svg")
-    assert "0.3004 ± 0.0020" in text and "leak at T1 moves 30 cm³/s, as a sharp-edged hole of 4.8 mm would" in text
+    assert "0.3004 ± 0.0020" in text
+    assert "leak at T1 changes the flow by 30 cm³/s, as a sharp-edged hole of 4.8 mm would" in text
 
 
 def test_each_section_is_there_that_the_log_has_something_for(log: Path) -> None:

@@ -61,7 +61,7 @@ class SignalRanges:
         return steps_in_value(s[name], self(name), 3 * count)
 
     def kinks(self, s: Signals, name: str, count: int, factor: Tensor | None = None) -> Breakpoints:
-        """Kinks as closely spaced as `count` of the hinges times FINER."""
+        """Kinks on a grid that is FINER times as fine as that of `hinges` with this `count`."""
         return self._breakpoints(s, name, 2 * FINER * count, factor, jump=False)
 
     def jumps(self, s: Signals, name: str, count: int, factor: Tensor | None = None) -> Breakpoints:

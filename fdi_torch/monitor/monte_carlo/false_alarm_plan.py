@@ -81,7 +81,7 @@ class FalseAlarmPlan:
         header = (*what, "s between", "95 %", "single calibrations", "within own 95 %")
         summary = f"{agreeing} of {total} calibrations alarm falsely as often as they predict" if total else ""
         return ResultTable(
-            f"false alarms, one in {significant(self.every, 3)} s asked for", header, tuple(rows), summary
+            f"false alarms; configured: one in {significant(self.every, 3)} s", header, tuple(rows), summary
         )
 
 

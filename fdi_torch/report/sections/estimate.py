@@ -133,7 +133,7 @@ def _water(material: Material) -> list[Any]:
     lines = []
     for finding in diagnosed_effects(material):
         if finding.present and np.isfinite(finding.flow):
-            text = f"{finding.words} moves {amount(finding.flow, 'm^3/s', 3)}"
+            text = f"{finding.words} changes the flow by {amount(finding.flow, 'm^3/s', 3)}"
             if np.isfinite(finding.hole):
                 text += f", as a sharp-edged hole of {number(1e3 * finding.hole, 3)} mm would"
             lines.append(tag("li", text))
