@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from fdi_torch.monitor.flow_filter import FlowFilter
-from fdi_torch.monitor.flow_noise_estimate import estimate_flow_filter, with_correlated_sensors
+from fdi_torch.monitor.flow_noise_estimate import estimate_flow_filter, likeliest_correlation
 from fdi_torch.monitor.observer import Observation, Observer, bind_parameters, initial_levels
 from fdi_torch.monitor.observer_gain import (
     Gain,
@@ -153,26 +154,26 @@ def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observati
     Where flows beside white noise of sensors leave a correlation, or have none in time themselves, it may be the noise
     of sensors that is correlated: both are then estimated together. Without a compiler there is no flow filter.
     """
-    residual = seen.steady_residual
-    flows = _flow_filter(network, linear, gain, seen)
-    if flows is None:
-        return score_whitenings(residual)[0][1]
-    score, of_innovations = score_whitenings(flows(residual)[0])[0]
-    if of_innovations.order or not flows.noise.correlation_time:
-        correlated = with_correlated_sensors(flows)
-        score_of_correlated, of_correlated = score_whitenings(correlated(residual)[0])[0]
-        if score_of_correlated + math.log(len(residual)) < score:  # the correlation is one more parameter
-            return replace(of_correlated, flows=correlated)
-    return replace(of_innovations, flows=flows)
-
-
-def _flow_filter(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation) -> FlowFilter | None:
     residual, interval = seen.steady_residual, usual_interval(seen.time)
     std, start = residual.square().nanmean(dim=0).sqrt(), start_uncertainty(network.description, residual)
+    estimate = partial(estimate_flow_filter, linear, gain, residual, std, start, interval)
     try:
-        return estimate_flow_filter(linear, gain, residual, std, start, interval)
+        flows, log_likelihood = estimate(0.0)
     except BuildError:
-        return None
+        return score_whitenings(residual)[0][1]
+    score, whitening = _scored(flows, log_likelihood, residual)
+    if whitening.order or not flows.noise.correlation_time:
+        score_of_correlated, of_correlated = _scored(*likeliest_correlation(estimate), residual)
+        if score_of_correlated + math.log(len(residual)) < score:  # the correlation is one more parameter
+            return of_correlated
+    return whitening
+
+
+def _scored(flows: FlowFilter, log_likelihood: float, residual: Tensor) -> tuple[float, Whitening]:
+    """-2 log-likelihood with the penalty for what whitens the innovations of a flow filter, and that whitening."""
+    fits = score_whitenings(flows(residual)[0])
+    without = next(score for score, whitening in fits if not whitening.order and not bool(whitening.mean.any()))
+    return fits[0][0] - without - 2.0 * log_likelihood, replace(fits[0][1], flows=flows)
 
 
 def operating_point(
