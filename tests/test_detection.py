@@ -282,12 +282,8 @@ def test_misuse_is_refused() -> None:
     generator = torch.Generator()
     with pytest.raises(ValueError, match="expected a detector of fixed, cusum, glr, got 'cusam'"):
         make_detector("cusam", 1000.0, 1.0, 3, generator)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="expected a positive drift"):
-        make_detector("cusum", 1000.0, 1.0, 3, generator, drift=0.0)
     with pytest.raises(ValueError, match="at least 20 samples"):
         make_detector("fixed", 10.0, 1.0, 3, generator)
-    with pytest.raises(ValueError, match="at least one sample"):
-        make_detector("glr", 1000.0, 1.0, 3, generator, window=0)
     with pytest.raises(ValueError, match="at least 40 fault-free samples"):
         whitening_of(noise(30, 2))
     with pytest.raises(ValueError, match="none in channel 2"):
@@ -320,7 +316,7 @@ def test_the_stated_error_of_low_frequency_sums_is_right() -> None:
 def test_thresholds_allow_for_noise_estimated_from_a_short_recording(chart: Chart) -> None:
     generator = torch.Generator().manual_seed(1)
     long, short = (whitening_of(torch.randn(n, 2, generator=generator, dtype=torch.float64)) for n in (20000, 400))
-    designs = [make_detector(chart, 5000.0, 1.0, 2, generator, window=20, learnt=w).design for w in (long, short)]
+    designs = [make_detector(chart, 5000.0, 1.0, 2, generator, learnt=w).design for w in (long, short)]
     one = torch.ones(1, 2, dtype=torch.float64)
     sure, unsure = (1.0 / (5000.0 * float(d.chart_rate(d.threshold, one))) for d in designs)
     assert 1.0 < sure < 1.05 < unsure < 2.0

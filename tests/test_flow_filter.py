@@ -120,10 +120,11 @@ def test_flows_learnt_from_a_window_too_are_those_of_the_whole_recording(correla
     residual, flows = Observer(NETWORK, noise.gain).run(samples).steady_residual, noise.whitening.flows
     assert flows is not None
     further = noise.whitening.learning_from(residual[300:], 300)[0]
-    whole = estimate_flow_filter(flows.linear, noise.gain, residual, flows.reading_std, flows.start_std, 1.0)
+    whole, _ = estimate_flow_filter(flows.linear, noise.gain, residual, flows.reading_std, flows.start_std, 1.0)
     assert further.flows is not None
     found, expected = further.flows.noise, whole.noise
-    assert found.correlation_time == expected.correlation_time != flows.noise.correlation_time
+    assert found.correlation_time == pytest.approx(expected.correlation_time, rel=0.05)
+    assert flows.noise.correlation_time != pytest.approx(expected.correlation_time, rel=0.3)
     assert found.intensity.tolist() == pytest.approx(expected.intensity.tolist(), rel=0.05)
     white = further.of_innovations(further.innovations(residual[300:], 300)[0])
     assert white.std(dim=0).tolist() == pytest.approx([1.0] * 3, abs=0.1)
@@ -238,13 +239,15 @@ def test_shocks_that_add_up_over_samples_have_the_covariance_of_the_recursion() 
             torch.testing.assert_close(own, expected)
 
 
-def test_the_estimate_has_the_flow_that_was_simulated() -> None:
-    samples = disturbed(80.0, 4000)
+@pytest.mark.parametrize("correlation_time", [15.0, 80.0, 150.0])
+def test_the_estimate_has_the_flow_that_was_simulated(correlation_time: float) -> None:
+    samples = disturbed(correlation_time, 4000)
     noise, _ = learn_noise(NETWORK, samples)
     flows = noise.whitening.flows
-    assert flows is not None and flows.noise.correlation_time == 80.0
-    expected = FLOW / PLANT.tanks[0].area
-    error = 0.5 * float(torch.diagonal(flows.covariance_of_variances)[:3].max()) ** 0.5
+    assert flows is not None
+    expected, variances = FLOW / PLANT.tanks[0].area, torch.diagonal(flows.covariance_of_parameters)
+    assert flows.keep == pytest.approx(math.exp(-1.0 / correlation_time), abs=2.0 * float(variances[-1]) ** 0.5)
+    error = 0.5 * float(variances[:3].max()) ** 0.5
     assert flows.noise.intensity.tolist() == pytest.approx([expected] * 3, rel=4.0 * error)
     assert flows.reading_std.tolist() == pytest.approx([STD] * 3, rel=0.05)
     assert float(flows.error_of_sums(100).max()) < 0.15

@@ -34,14 +34,14 @@ class AdaptiveRun:
 class JointModel:
     """Levels and parameters as one state z = (x, theta) with constant parameters."""
 
-    def __init__(self, network: TankNetwork, space: ParameterSpace, longest_step: float | None = None) -> None:
+    def __init__(self, network: TankNetwork, space: ParameterSpace) -> None:
         with_states = [p.prefix for p in network.placements if p.effect.memory or p.effect.states]
         if with_states:
             raise ValueError(
                 f"expected effects without memory and states in joint estimation, got {', '.join(with_states)}; leave "
                 "them out"
             )
-        self.stepper, self.network, self.space = Stepper(network, longest_step), network, space
+        self.stepper, self.network, self.space = Stepper(network), network, space
         self.tanks = len(network.description.tanks)
 
     def moved(self, z: Tensor, samples: Samples, k: int) -> Tensor:

@@ -16,6 +16,7 @@ from fdi_torch.monitor.event_text import EventWriter
 from fdi_torch.monitor.events import Event, Kind
 from fdi_torch.monitor.explanations import Explainer
 from fdi_torch.monitor.hypothesis import HypothesisFit, merged
+from fdi_torch.monitor.hypothesis_fit import changes_of
 from fdi_torch.monitor.isolation import SMALLEST_PROBABILITY
 from fdi_torch.monitor.known_faults import (
     STRONG_EVIDENCE,
@@ -257,7 +258,9 @@ class AlarmHandler:
             state,
             change,
             [fault.size for fault in self.faults],
-            lambda c: effect_of_value(self.observer, window, change.before, change.hypothesis, c, healthy[c])[0],
+            lambda c: effect_of_value(self.observer, window, change.before, changes_of([change.best]), c, healthy[c])[
+                0
+            ],
         )
         ends = possible_ends(self.observer, state, change, self.settings.lookback)
         earliest_end = change.best.onset if ends is None else ends[0]

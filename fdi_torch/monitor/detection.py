@@ -96,16 +96,14 @@ def make_detector(
     sampling: float,
     channels: int,
     generator: torch.Generator,
-    drift: float = DRIFT,
-    window: int = LONGEST_WINDOW,
     learnt: Whitening | None = None,
     peaks: Tensor | None = None,
 ) -> Detector:
     """A detector with the given mean time between false alarms (s) over all channels together.
 
-    sampling: s between samples. drift: of the CUSUM. window: longest window of the GLR, in samples. learnt: whitening
-    estimated from a finite recording, whose uncertainty raises the threshold; without it the noise is known. peaks:
-    simulated block maxima of the GLR, to save repeating the simulation. Raises ValueError.
+    sampling: s between samples. learnt: whitening estimated from a finite recording, whose uncertainty raises the
+    threshold; without it the noise is known. peaks: simulated block maxima of the GLR, to save repeating the
+    simulation. Raises ValueError.
     """
     run_length = time_between_false_alarms / sampling
     if not run_length >= 20.0:
@@ -119,13 +117,11 @@ def make_detector(
         rate, sums = fixed_rate, lambda threshold: (1,)
         statistic, update = max_abs, lambda e, before: (max_abs(e), e[:0])
     elif chart == "cusum":
-        if not drift > 0:
-            raise ValueError(f"expected a positive drift of the CUSUM, got {drift}")
         # A sum that alarms by chance has most likely grown by the drift with each sample.
-        rate, sums = partial(cusum_rate, drift=drift), lambda threshold: (max(round(threshold / drift), 1),)
-        statistic, update = partial(cusum, drift=drift), lambda e, before: cusum_update(e, drift, before)
+        rate, sums = partial(cusum_rate, drift=DRIFT), lambda threshold: (max(round(threshold / DRIFT), 1),)
+        statistic, update = partial(cusum, drift=DRIFT), lambda e, before: cusum_update(e, DRIFT, before)
     elif chart == "glr":
-        lengths = window_lengths(window)
+        lengths = window_lengths(LONGEST_WINDOW)
         statistic, update = partial(glr, lengths=lengths), lambda e, before: glr_update(e, lengths, before)
         peaks = block_maxima(statistic, channels, generator) if peaks is None else peaks
         rate, sums = sum_of_squares_rate(peaks, channels, generator), lambda threshold: lengths
@@ -198,7 +194,5 @@ def glr(white: Tensor, lengths: tuple[int, ...]) -> Tensor:
 
 def window_lengths(longest: int) -> tuple[int, ...]:
     """1, 2, 3, 4, 6, 8, 11, 16, ... up to `longest`: half an octave apart, which loses 1.5 % of a shift's evidence."""
-    if longest < 1:
-        raise ValueError(f"expected a GLR window of at least one sample, got {longest}")
     lengths = {min(round(2.0 ** (i / 2)), longest) for i in range(2 * math.ceil(math.log2(max(longest, 2))) + 1)}
     return tuple(sorted(lengths))

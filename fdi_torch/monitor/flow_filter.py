@@ -139,14 +139,28 @@ class FlowFilter:
         return torch.linalg.solve_triangular(torch.linalg.cholesky(covariance).to(z.dtype), amplitude, upper=False)
 
     @cached_property
-    def covariance_of_variances(self) -> Tensor:
-        """Posterior covariance (P, P) of ln of the variances of flows and sensor noise: inverse Fisher information.
+    def _by_parameters(self) -> Tensor:
+        """Derivatives of the log power of each source by the parameters, (FREQUENCIES, P, P + 1).
 
-        The information is that of a stationary series (Whittle 1953), samples / 2 times the mean of |t_p^H t_q|^2 over
-        frequencies, and that of the prior of the flows' intensities.
+        The parameters are ln of the variances of flows and sensor noise, and the share `keep` of the flows, whose
+        spectrum is proportional to (1 - a^2) / (1 - 2 a cos w + a^2).
         """
-        t, tanks = self.spectra, len(self.noise.intensity)
-        information = 0.5 * self.samples * (t.mH @ t).abs().square().mean(0)
+        a, cosine, tanks = self.keep, torch.cos(_frequencies(self.transition)), len(self.noise.intensity)
+        by_keep = 2.0 * (cosine - a) / (1.0 - 2.0 * a * cosine + a * a) - 2.0 * a / (1.0 - a * a)
+        sources = self.spectra.shape[-1]
+        last = torch.cat([by_keep.unsqueeze(-1).expand(-1, tanks), by_keep.new_zeros(len(by_keep), sources - tanks)], 1)
+        return torch.cat([torch.eye(sources, dtype=last.dtype).expand(len(last), -1, -1), last.unsqueeze(-1)], -1)
+
+    @cached_property
+    def covariance_of_parameters(self) -> Tensor:
+        """Posterior covariance (P + 1, P + 1) of ln of the variances of flows and sensor noise, and of `keep`: inverse
+        Fisher information.
+
+        The information is that of a stationary series (Whittle 1953), samples / 2 times the mean over frequencies of
+        |t_p^H t_q|^2 for sources p and q, and that of the prior of the flows' intensities.
+        """
+        t, by, tanks = self.spectra, self._by_parameters, len(self.noise.intensity)
+        information = 0.5 * self.samples * (by.mT @ (t.mH @ t).abs().square() @ by).mean(0)
         eye = torch.eye(tanks, dtype=information.dtype)
         information[:tanks, :tanks] += (eye - 1.0 / tanks) / (2.0 * SCATTER) ** 2
         return torch.linalg.inv(information + torch.eye(len(information), dtype=eye.dtype) / (2.0 * LOG_BOUND) ** 2)
@@ -156,10 +170,10 @@ class FlowFilter:
 
         It is for innovations that were scaled to unit variance in the recording (delta method).
         """
-        power, half = self.spectra.abs().square(), 0.5 * _frequencies(self.transition)
+        power, half = self.spectra.abs().square() @ self._by_parameters, 0.5 * _frequencies(self.transition)
         of_sums = (torch.sin(length * half) / torch.sin(half)).square() / length
         slope = ((of_sums - 1.0).reshape(-1, 1, 1) * power).mean(0)
-        return 0.5 * (slope @ self.covariance_of_variances * slope).sum(-1).sqrt()
+        return 0.5 * (slope @ self.covariance_of_parameters * slope).sum(-1).sqrt()
 
     def over(self, samples: int) -> tuple[Tensor, Tensor]:
         """Transition (2 n, 2 n) of states and flows over some samples, and covariance of the shocks that add up

@@ -5,54 +5,72 @@ It maximises the likelihood of the observer's residuals (`estimate/state_noise.p
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from fdi_torch.estimate.kalman import Propagation, SensorNoise, StateNoise
-from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
+from fdi_torch.estimate.state_noise import CORRELATION_TIMES, Likelihood, estimate_state_noise
 from fdi_torch.monitor.flow_filter import FlowFilter, forcing
 from fdi_torch.monitor.observer_gain import Gain, Linear
 
 FIRST_TIME = 20.0  # correlation time at which the optimisation starts, in sampling intervals
+# The correlation time is 2^e sampling intervals, searched with this step of e; flows are white at the lowest e.
+WHITE, SLOWEST, STEP = -1.0, 8.5, 1.0
 CORRELATIONS = (0.3, 0.5, 0.7, 0.85, 0.95)  # candidates for that of the sensors' noise
 FIRST_UNIT = 0.1  # initial flow per sample of the optimisation, in standard deviations of a level's measurement noise
 
 
 def estimate_flow_filter(
-    linear: Linear, observer: Gain, residual: Tensor, reading_std: Tensor, start_std: Tensor, interval: float
-) -> FlowFilter:
-    """The noise that is most likely with an observer's residuals (S, sensors), and the filter for it.
+    linear: Linear,
+    observer: Gain,
+    residual: Tensor,
+    reading_std: Tensor,
+    start_std: Tensor,
+    interval: float,
+    correlation: float = 0.0,
+) -> tuple[FlowFilter, float]:
+    """The filter for the noise that is most likely with an observer's residuals (S, sensors), and its log-likelihood.
 
-    reading_std (sensors,): first guess of the measurement noise. Raises BuildError without a compiler.
+    reading_std (sensors,): first guess of the measurement noise. correlation: of its neighbouring values. Raises
+    BuildError without a compiler.
     """
     first = StateNoise(_usual_flow(linear, reading_std, start_std), FIRST_TIME * interval, torch.ones_like(reading_std))
     free = _free_residual(linear, observer, residual)
-    return _likeliest(FlowFilter(linear, first, reading_std, observer, start_std, interval, free), [free])[0]
+    start = FlowFilter(linear, first, reading_std, observer, start_std, interval, free, correlation=correlation)
+    flows, likely = _likeliest(start, [free], CORRELATION_TIMES)
+    return flows, likely.log_likelihood
 
 
-def with_correlated_sensors(white: FlowFilter) -> FlowFilter:
-    """The most likely filter with correlated noise of sensors, by a climb over CORRELATIONS. white: the one without."""
-    middle, found = len(CORRELATIONS) // 2, dict[int, tuple[FlowFilter, Likelihood]]()
+def likeliest_correlation(estimate: Callable[[float], tuple[FlowFilter, float]]) -> tuple[FlowFilter, float]:
+    """The most likely filter with correlated noise of sensors, by a climb over CORRELATIONS, and its log-likelihood.
+
+    estimate: `estimate_flow_filter` with a correlation.
+    """
+    best = len(CORRELATIONS) // 2
+    found = {best: estimate(CORRELATIONS[best])}
 
     def at(i: int) -> float:
         if i not in found:
-            found[i] = _likeliest(replace(white, correlation=CORRELATIONS[i]), [white.learnt])
-        return found[i][1].log_likelihood
+            found[i] = estimate(CORRELATIONS[i])
+        return found[i][1]
 
-    best = middle
     for step in (1, -1):
         while 0 <= best + step < len(CORRELATIONS) and at(best + step) > at(best):
             best += step
-    return found[best][0]
+    return found[best]
 
 
-def _likeliest(start: FlowFilter, segments: Sequence[Tensor]) -> tuple[FlowFilter, Likelihood]:
+def _likeliest(
+    start: FlowFilter, segments: Sequence[Tensor], times: Sequence[float] = ()
+) -> tuple[FlowFilter, Likelihood]:
     """The filter with the most likely noise, by a search from that of `start` on, and its likelihood.
 
-    segments (S, sensors): residuals without corrections, NaN where missing, each from unknown levels on.
+    segments (S, sensors): residuals without corrections, NaN where missing, each from unknown levels on. The
+    search begins at the best of these correlation times, in sampling intervals, and that of `start`.
     """
     linear, free = start.linear, torch.cat(list(segments))
     count, tanks = len(free), len(start.start_std)
@@ -66,10 +84,52 @@ def _likeliest(start: FlowFilter, segments: Sequence[Tensor]) -> tuple[FlowFilte
     a, b, c = (x.expand(count, *x.shape) for x in (linear.transition, forcing(linear.transition), linear.output))
     propagation = Propagation(a, b, c, start.interval, fresh, torch.isfinite(free))
     sensors = SensorNoise(start.reading_std, torch.full_like(start.reading_std, start.correlation))
-    noise = replace(start.noise, scale=torch.ones_like(start.reading_std))
     unit, ones = _usual_flow(linear, start.reading_std, start.start_std), free.new_ones(by_levels.shape[-1])
-    likely = estimate_state_noise(propagation, sensors, free.nan_to_num(), by_levels, ones, 0.0 * ones, unit, noise)
+    residual = free.nan_to_num()
+
+    def solved(noise: StateNoise) -> Likelihood:
+        priors = ones, 0.0 * ones
+        return estimate_state_noise(propagation, sensors, residual, by_levels, *priors, unit, noise, climb=False)
+
+    noise = replace(start.noise, scale=torch.ones_like(start.reading_std))
+    likely = _with_likeliest_time(solved, noise, start.interval, times)
     return replace(start, noise=likely.noise, reading_std=likely.noise.scale * start.reading_std), likely
+
+
+def _with_likeliest_time(
+    solved: Callable[[StateNoise], Likelihood], start: StateNoise, interval: float, times: Sequence[float]
+) -> Likelihood:
+    """The most likely noise over all correlation times: by a climb from the best of `times` (in sampling intervals) and
+    that of `start`, and the parabola through its last three points.
+
+    solved: the most likely noise with the correlation time of a first guess.
+    """
+    first = _exponent(start.correlation_time / interval)
+    found = {first: solved(start)}
+
+    def at(e: float) -> float:
+        if e not in found:
+            nearest = min(found, key=lambda other: abs(other - e))
+            noise, time = found[nearest].noise, interval * 2.0**e if e > WHITE else 0.0
+            # keeps the variance of a flow integrated over a long time, intensity^2 max(2 tau, interval)
+            intensity = noise.intensity * 2.0 ** (0.5 * (nearest - e))
+            found[e] = solved(replace(noise, correlation_time=time, intensity=intensity))
+        return found[e].log_likelihood
+
+    best = max(sorted({first, *map(_exponent, times)}, key=lambda e: abs(e - first)), key=at)
+    for step in (STEP, -STEP):
+        while at(further := min(max(best + step, WHITE), SLOWEST)) > at(best):
+            best = further
+    below, above = best - STEP, best + STEP
+    if below > WHITE and above < SLOWEST and (bend := at(below) - 2.0 * at(best) + at(above)) < 0.0:
+        at(best + 0.5 * STEP * (at(below) - at(above)) / bend)
+    likeliest = max(found.values(), key=lambda likely: likely.log_likelihood)
+    return replace(likeliest, start_log_likelihood=found[first].start_log_likelihood)
+
+
+def _exponent(time: float) -> float:
+    """e of a correlation time in sampling intervals."""
+    return math.log2(time) if time else WHITE
 
 
 def _usual_flow(linear: Linear, reading_std: Tensor, start_std: Tensor) -> Tensor:

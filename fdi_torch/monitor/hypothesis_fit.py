@@ -66,10 +66,11 @@ def point_of(fit: HypothesisFit) -> Tensor:
     return torch.cat([fit.value, fit.value.new_tensor([fit.onset])])
 
 
-def change_of(fit: HypothesisFit) -> ChangeHypotheses:
-    """A fit as the single lane of a bank of observers."""
-    incipient = torch.tensor([fit.hypothesis.incipient])
-    return ChangeHypotheses(fit.value[None], fit.value.new_tensor([fit.onset]), incipient)
+def changes_of(fits: Sequence[HypothesisFit]) -> ChangeHypotheses:
+    """Fits as the lanes of a bank of observers."""
+    theta = torch.stack([f.value for f in fits])
+    incipient = torch.tensor([f.hypothesis.incipient for f in fits])
+    return ChangeHypotheses(theta, theta.new_tensor([f.onset for f in fits]), incipient)
 
 
 def fit(

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.monitor.hypothesis import Fault, Hypothesis, HypothesisFit, with_posterior
-from fdi_torch.monitor.hypothesis_fit import Prior, change_of, fit, misfit, no_change_fit, point_of
+from fdi_torch.monitor.hypothesis_fit import Prior, changes_of, fit, misfit, no_change_fit, point_of
 from fdi_torch.monitor.initial_guess import oscillation_guess, recovery_guesses, recovery_hypotheses, signature_guesses
 from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow, no_change
 
@@ -84,7 +84,7 @@ def _with_flows_of_window(
     fitted with the flows that are most likely under the likeliest hypothesis. The evidence of each plausible one then
     gains what flows of its own add to the likelihood.
     """
-    observer, _ = observer.learning_from(window, believed, change_of(ranked[0]))
+    observer, _ = observer.learning_from(window, believed, changes_of(ranked[:1]))
     base = observer.white_innovations(window, believed, no_change(believed))
     changes = [f for f in ranked if f.hypothesis.columns and f.probability > SMALLEST_PROBABILITY**2]
     starts, hypotheses = torch.stack([point_of(f) for f in changes]), [f.hypothesis for f in changes]
@@ -93,7 +93,7 @@ def _with_flows_of_window(
     likely = {f.hypothesis for f in (*ranked, *with_posterior(fits)) if f.probability > SMALLEST_PROBABILITY}
     for i, f in enumerate(fits):
         if f.hypothesis in likely:
-            gain = observer.learning_from(window, believed, change_of(f))[1]
+            gain = observer.learning_from(window, believed, changes_of([f]))[1]
             fits[i] = replace(f, evidence=f.evidence + gain)
     return observer, with_posterior(fits)
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from fdi_torch.monitor.events import Limit
 from fdi_torch.monitor.flow_filter import FlowFilter
 from fdi_torch.monitor.hypothesis import HypothesisFit
+from fdi_torch.monitor.hypothesis_fit import changes_of
 from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank
 from fdi_torch.monitor.samples import Samples
@@ -32,10 +33,6 @@ class _ContinuedRamps(ChangeHypotheses):
     """Changes with a duration of their own, (L,) s."""
 
     duration: Tensor
-
-    def subset(self, first: int, last: int) -> _ContinuedRamps:
-        rows = slice(first, last)
-        return _ContinuedRamps(self.theta[rows], self.onset[rows], self.incipient[rows], self.duration[rows])
 
     def ramp(self, end: float) -> Tensor:
         return self.duration
@@ -90,9 +87,7 @@ def _present_states(
 ) -> tuple[Tensor, Tensor]:
     """The observer's state (fits, order + M) and that of the flow filter (fits, F) now, under each explanation."""
     window = state.window(min(f.onset for f in fits))
-    theta, onset = torch.stack([f.value for f in fits]), torch.tensor([f.onset for f in fits], dtype=torch.float64)
-    changes = ChangeHypotheses(theta, onset, torch.tensor([f.hypothesis.incipient for f in fits]))
-    path, residual = observer.run(window, change.before, changes)
+    path, residual = observer.run(window, change.before, changes_of(fits))
     memory = observer.whitening.innovations(residual, window.number, window.memory)[1]
     return path[:, -1], memory[:, -1]
 

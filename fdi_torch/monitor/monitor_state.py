@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
 from fdi_torch.monitor.alarm_state import Alarm
 from fdi_torch.monitor.hypothesis import HypothesisFit
 from fdi_torch.monitor.law_errors import LawErrors
-from fdi_torch.monitor.observer_bank import LONG_AGO, ChangeHypotheses, ObserverWindow
+from fdi_torch.monitor.observer_bank import LONG_AGO, ObserverWindow
 from fdi_torch.monitor.samples import ClockState, Samples
 
 
@@ -78,13 +77,6 @@ class DetectedChange:
     def best(self) -> HypothesisFit:
         """The likeliest explanation that changes a parameter."""
         return self.explanations[0]
-
-    @property
-    def hypothesis(self) -> ChangeHypotheses:
-        """The likeliest explanation as the single lane of a bank of observers."""
-        best = self.best
-        onset, incipient = best.value.new_tensor([best.onset]), torch.tensor([best.hypothesis.incipient])
-        return ChangeHypotheses(best.value[None], onset, incipient)
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from fdi_torch.monitor.flow_filter import FlowFilter
-from fdi_torch.monitor.flow_noise_estimate import estimate_flow_filter, with_correlated_sensors
+from fdi_torch.monitor.flow_noise_estimate import estimate_flow_filter, likeliest_correlation
 from fdi_torch.monitor.observer import Observation, Observer, bind_parameters, initial_levels
 from fdi_torch.monitor.observer_gain import (
     Gain,
@@ -38,12 +39,11 @@ FINE = tuple(0.125 * i for i in range(-4, 5))
 class NoiseModel:
     """Noise model identified from a fault-free recording.
 
-    process_std (tanks,) m per sample; reading_std (sensors,) in the readings' units; ratio: process over measurement
-    noise, both as levels. whitening: of the observer's residual. gain: of the observer. interval: usual
-    time between samples, s.
+    reading_std (sensors,): measurement noise in the readings' units. ratio: process over measurement noise, both as
+    levels; NaN if unknown. whitening: of the observer's residual. gain: of the observer. interval: usual time between
+    samples, s.
     """
 
-    process_std: Tensor
     reading_std: Tensor
     ratio: float
     whitening: Whitening
@@ -87,14 +87,13 @@ def noise_of_gain(
     theta: Tensor | None = None,
     longest_step: float | None = None,
 ) -> tuple[NoiseModel, Observation]:
-    """Noise model for a given observer gain: only the residual's autocorrelation; process noise is unknown (NaN)."""
+    """Noise model for a given observer gain: only the residual's autocorrelation, and its standard deviation."""
     seen = Observer(network, gain, space, theta, longest_step).run(fault_free)
     settled = seen.last(max(len(fault_free) - len(gain.opening), len(fault_free) // 2))
     linear = operating_point(network, fault_free, space, theta, longest_step)
     whitening = _whitening(network, linear, gain, seen)
-    unknown = network.nominal.new_full((len(network.description.tanks),), torch.nan)
     std = settled.steady_residual.square().nanmean(dim=0).sqrt()
-    return NoiseModel(unknown, std, float("nan"), whitening, gain, usual_interval(fault_free.time)), seen
+    return NoiseModel(std, math.nan, whitening, gain, usual_interval(fault_free.time)), seen
 
 
 @dataclass(frozen=True)
@@ -133,18 +132,16 @@ def _gain(network: TankNetwork, linear: Linear, exponents: Tensor) -> Gain:
 
 
 def _noise(network: TankNetwork, linear: Linear, best: _Candidate) -> NoiseModel:
-    """Both noises from the innovations' covariance, H P H' + R, at the best ratio."""
+    """The measurement noise from the innovations' covariance, H P H' + R, at the best ratio."""
     unit, ratio = torch.linalg.vector_norm(linear.output, dim=-1), network.nominal.new_tensor(10.0**best.exponent)
-    tanks = len(network.description.tanks)
-    process = with_effects(ratio.expand(tanks), network.order)
+    process = with_effects(ratio.expand(len(network.description.tanks)), network.order)
     predicted = riccati(linear, torch.diag_embed(process**2), torch.diag(unit**2))
     variance = torch.diagonal(linear.output @ predicted @ linear.output.mT) + unit**2
     reading_std = torch.sqrt(best.seen.steady_residual.square().nanmean(dim=0) / variance) * unit
-    process_std = ratio * (reading_std / unit).mean().expand(tanks)
     batch = _gain(network, linear, ratio.log10().unsqueeze(0))
     gain = Gain(batch.steady[0], batch.opening[:, 0], batch.inflation[:, 0])
     whitening = _whitening(network, linear, gain, best.seen)
-    return NoiseModel(process_std, reading_std, float(ratio), whitening, gain)
+    return NoiseModel(reading_std, float(ratio), whitening, gain)
 
 
 def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation) -> Whitening:
@@ -153,26 +150,26 @@ def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observati
     Where flows beside white noise of sensors leave a correlation, or have none in time themselves, it may be the noise
     of sensors that is correlated: both are then estimated together. Without a compiler there is no flow filter.
     """
-    residual = seen.steady_residual
-    flows = _flow_filter(network, linear, gain, seen)
-    if flows is None:
-        return score_whitenings(residual)[0][1]
-    score, of_innovations = score_whitenings(flows(residual)[0])[0]
-    if of_innovations.order or not flows.noise.correlation_time:
-        correlated = with_correlated_sensors(flows)
-        score_of_correlated, of_correlated = score_whitenings(correlated(residual)[0])[0]
-        if score_of_correlated + math.log(len(residual)) < score:  # the correlation is one more parameter
-            return replace(of_correlated, flows=correlated)
-    return replace(of_innovations, flows=flows)
-
-
-def _flow_filter(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation) -> FlowFilter | None:
     residual, interval = seen.steady_residual, usual_interval(seen.time)
     std, start = residual.square().nanmean(dim=0).sqrt(), start_uncertainty(network.description, residual)
+    estimate = partial(estimate_flow_filter, linear, gain, residual, std, start, interval)
     try:
-        return estimate_flow_filter(linear, gain, residual, std, start, interval)
+        flows, log_likelihood = estimate(0.0)
     except BuildError:
-        return None
+        return score_whitenings(residual)[0][1]
+    score, whitening = _scored(flows, log_likelihood, residual)
+    if whitening.order or not flows.noise.correlation_time:
+        score_of_correlated, of_correlated = _scored(*likeliest_correlation(estimate), residual)
+        if score_of_correlated + math.log(len(residual)) < score:  # the correlation is one more parameter
+            return of_correlated
+    return whitening
+
+
+def _scored(flows: FlowFilter, log_likelihood: float, residual: Tensor) -> tuple[float, Whitening]:
+    """-2 log-likelihood with the penalty for what whitens the innovations of a flow filter, and that whitening."""
+    fits = score_whitenings(flows(residual)[0])
+    without = next(score for score, whitening in fits if not whitening.order and not bool(whitening.mean.any()))
+    return fits[0][0] - without - 2.0 * log_likelihood, replace(fits[0][1], flows=flows)
 
 
 def operating_point(

@@ -162,11 +162,7 @@ class Observer:
 
     def _one_by_one(self, samples: Samples, levels: Tensor) -> Observation:
         """Run recordings with different inputs one after the other."""
-        rows = range(levels.shape[0])
-        seen = [
-            self.run(Samples(samples.time, samples.inputs[i], samples.readings[i], samples.hold), levels[i])
-            for i in rows
-        ]
+        seen = [self.run(samples.member(i), level) for i, level in enumerate(levels)]
         state, residual = torch.stack([s.state for s in seen]), torch.stack([s.residual for s in seen])
         return Observation(samples.time, state, residual, seen[0].inflation, seen[0].tanks)
 

@@ -44,6 +44,11 @@ class Samples:
             self, time=self.time[part], inputs=self.inputs[..., part, :], readings=self.readings[..., part, :]
         )
 
+    def member(self, i: int) -> Samples:
+        """One recording of a batch."""
+        inputs = self.inputs[i] if self.inputs.dim() > 2 else self.inputs
+        return replace(self, inputs=inputs, readings=self.readings[i])
+
     def input_at(self, k: int, share: float = 0.0) -> Tensor:
         """The inputs at `share` (0..1) of the interval from sample k to the next, (*batch, channels)."""
         left = self.inputs[..., k, :]

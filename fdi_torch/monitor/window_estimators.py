@@ -6,7 +6,7 @@ All take the same window and the previous estimate, and process a batch of runs.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -143,8 +143,3 @@ def _refined(window: WindowData, starts: Tensor) -> WindowEstimate:
     assert refined.curvature is not None
     held = None if refined.held is None else refined.held[rows, best]
     return WindowEstimate(refined.theta[rows, best], certainty(refined.curvature[rows, best], held=held).std)
-
-
-def cut(fitting: Fitting, samples: int) -> Fitting:
-    """The same problem on the first samples of its recording."""
-    return replace(fitting, recordings=(fitting.recordings[0].stretch(0, samples),))

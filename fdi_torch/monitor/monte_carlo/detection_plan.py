@@ -18,7 +18,6 @@ from fdi_torch.monitor.monte_carlo.isolation_trials import confusions, isolate_r
 from fdi_torch.monitor.monte_carlo.simulated_runs import FaultSchedule, SimulatedRig, fault_free_schedule
 from fdi_torch.monitor.monte_carlo.tasks import Numbers, ResultTable, Task, quantiles, seeded_generator
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
-from fdi_torch.monitor.samples import Samples
 
 RUNS_AT_ONCE = 50  # runs side by side
 NAME = "faults found"
@@ -53,7 +52,7 @@ class DetectionPlan:
         """Noise model from an hour without a fault, and the detectors for it."""
         rig = self.rig
         training = rig.run(fault_free_schedule(rig.space, 1), 3601, seeded_generator(self.seed, 3))
-        noise, _ = learn_noise(rig.network, _one(training, 0), levels=rig.levels)
+        noise, _ = learn_noise(rig.network, training.member(0), levels=rig.levels)
         sensors = training.readings.shape[-1]
         return noise, detectors(self.every, rig.sampling, sensors, learnt=noise.whitening)
 
@@ -71,7 +70,7 @@ class DetectionPlan:
             monitor = Monitor(rig.network, rig.space, noise, detector, self.monitor)
             share = -(-self.named * count // self.runs)
             numbers[f"{detector.chart} named"] = [
-                " + ".join(isolate_run(monitor, _one(seen, r), rig.space.nominal(), rig.levels, self.onset).last)
+                " + ".join(isolate_run(monitor, seen.member(r), rig.space.nominal(), rig.levels, self.onset).last)
                 for r in range(share)
             ]
         return numbers
@@ -113,11 +112,6 @@ class DetectionPlan:
         header = ("size", "detector", "runs", "delay, s (5 .. 95 %)", "missed", "early", "named right", "mostly wrong")
         summary = f"{totals[0]} of {totals[1]} faults missed, {totals[2]} of {totals[3]} named right"
         return ResultTable("faults found", header, tuple(rows), summary if rows else "")
-
-
-def _one(samples: Samples, run: int) -> Samples:
-    inputs = samples.inputs[run] if samples.inputs.dim() > 2 else samples.inputs
-    return Samples(samples.time, inputs, samples.readings[run])
 
 
 def _short(names: str) -> str:

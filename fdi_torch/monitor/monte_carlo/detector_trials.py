@@ -18,11 +18,9 @@ from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.whitening import Whitening
 
 
-def detectors(
-    every: float, sampling: float, channels: int, seed: int = 0, learnt: Whitening | None = None
-) -> list[Detector]:
+def detectors(every: float, sampling: float, channels: int, learnt: Whitening | None = None) -> list[Detector]:
     """One detector of each kind, all with the mean time `every` s between false alarms."""
-    peaks = _peaks(channels, seed)
+    peaks = _peaks(channels)
     return [
         make_detector(chart, every, sampling, channels, torch.Generator(), learnt=learnt, peaks=peaks)
         for chart in CHARTS
@@ -30,10 +28,10 @@ def detectors(
 
 
 @lru_cache(maxsize=8)
-def _peaks(channels: int, seed: int) -> Tensor:
+def _peaks(channels: int) -> Tensor:
     """Simulated block maxima for the GLR's threshold, kept for further detectors."""
     lengths = window_lengths(LONGEST_WINDOW)
-    return block_maxima(lambda white: glr(white, lengths), channels, torch.Generator().manual_seed(seed))
+    return block_maxima(lambda white: glr(white, lengths), channels, torch.Generator().manual_seed(0))
 
 
 def white_residuals(rig: SimulatedRig, noise: NoiseModel, samples: Samples) -> Tensor:
@@ -51,14 +49,6 @@ class Delays:
     chart: str
     delay: Tensor
     early: Tensor
-
-    def quantile(self, q: float) -> float:
-        """Quantile of the delay, s; missed faults count as infinite."""
-        order = self.delay.sort().values
-        return float(order[min(int(q * len(order)), len(order) - 1)])
-
-    def missed(self) -> int:
-        return int(torch.isinf(self.delay).sum())
 
 
 def delays(

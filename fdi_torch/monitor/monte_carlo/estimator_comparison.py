@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -14,9 +14,9 @@ from torch import Tensor
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.information import certainty, fisher_information
 from fdi_torch.monitor.adaptive_observer import LEVEL_NOISE, JointModel, adaptive_gain, adaptive_observer, joint_filter
-from fdi_torch.monitor.monte_carlo.tasks import Numbers, ResultTable, Task, seeded_generator
+from fdi_torch.monitor.monte_carlo.tasks import Numbers, ResultTable, Task, quantiles, seeded_generator
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.window_estimators import ESTIMATORS, WindowData, cut
+from fdi_torch.monitor.window_estimators import ESTIMATORS, WindowData
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.scales import length_scale
 from fdi_torch.simulate.simulated_recording import noise_level
@@ -106,14 +106,6 @@ def draw_runs(fitting: Fitting, count: int, snr_db: float, generator: torch.Gene
     return RandomFaultRuns(fitting, truth, faulty, torch.cat(readings), torch.cat(stds), torch.cat(bounds))
 
 
-def compare(
-    runs: RandomFaultRuns, snr_db: float, sample_counts: Sequence[int], names: Sequence[str] = ESTIMATOR_NAMES
-) -> Iterator[ComparisonRow]:
-    """One row for each estimator, as soon as it is computed."""
-    for name in names:
-        yield comparison_row(name, snr_db, runs, track_estimates(name, runs, sample_counts))
-
-
 def track_estimates(name: str, runs: RandomFaultRuns, sample_counts: Sequence[int]) -> EstimateTracks:
     """The estimates of one estimator. Raises ValueError for an unknown name."""
     if name not in ESTIMATOR_NAMES:
@@ -140,11 +132,10 @@ def comparison_row(name: str, snr_db: float, runs: RandomFaultRuns, tracks: Esti
     first = torch.where(stays.any(1), stays.to(torch.int8).argmax(1), -1)
     step = float(torch.diff(runs.samples.time).median())
     times = torch.where(first >= 0, step * tracks.sample_counts[first].to(torch.float64), torch.inf)
-    order = times.sort().values
-    quartiles = tuple(float(order[min(int(q * len(order)), len(order) - 1)]) for q in (0.25, 0.5, 0.75))
+    low_quarter, middle, high_quarter = quantiles(times.tolist(), (0.25, 0.5, 0.75))
     return ComparisonRow(
         name, snr_db, len(failed), mean**0.5, (low, high), int(failed.sum()), int((first < 0).sum()),
-        (quartiles[0], quartiles[1], quartiles[2]), tracks.cost,
+        (low_quarter, middle, high_quarter), tracks.cost,
     )  # fmt: skip
 
 
@@ -158,7 +149,8 @@ def _in_windows(name: str, runs: RandomFaultRuns, sample_counts: Sequence[int]) 
     estimator, estimates = ESTIMATORS[name], []
     before = runs.fitting.space.nominal().expand(len(runs.truth), -1)
     for number, last in enumerate(sample_counts):
-        window = WindowData(cut(runs.fitting, last + 1), runs.readings[:, : last + 1], runs.std)
+        seen = replace(runs.fitting, recordings=(runs.fitting.recordings[0].stretch(0, last + 1),))
+        window = WindowData(seen, runs.readings[:, : last + 1], runs.std)
         before = estimator(window, before, number).value
         estimates.append(before)
     return torch.stack(estimates, dim=1)

@@ -12,7 +12,6 @@ from fdi_torch.monitor.monte_carlo.detector_trials import detectors, white_resid
 from fdi_torch.monitor.monte_carlo.simulated_runs import SimulatedRig, fault_free_schedule
 from fdi_torch.monitor.monte_carlo.tasks import Numbers, ResultTable, Task, seeded_generator
 from fdi_torch.monitor.noise_model import learn_noise
-from fdi_torch.monitor.samples import Samples
 from fdi_torch.quantities import significant
 
 NORMAL = 1.96  # of a 95 % interval
@@ -43,7 +42,7 @@ class FalseAlarmPlan:
     def _count(self, kind: str, number: int) -> Numbers:
         rig, row = self.rigs[kind], list(self.rigs).index(kind)
         training = rig.run(fault_free_schedule(rig.space, 1), self.samples, seeded_generator(self.seed, 1, row, number))
-        one = Samples(training.time, training.inputs, training.readings[0])
+        one = training.member(0)
         noise, _ = learn_noise(rig.network, one, levels=rig.levels)
         sensors = one.readings.shape[-1]
         charts = detectors(self.every, rig.sampling, sensors, learnt=noise.whitening)

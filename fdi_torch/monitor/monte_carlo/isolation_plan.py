@@ -21,7 +21,6 @@ from fdi_torch.monitor.monte_carlo.simulated_runs import (
 )
 from fdi_torch.monitor.monte_carlo.tasks import Numbers, ResultTable, Task, quantiles, seeded_generator
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
-from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.state_update import advance_observer
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.scales import time_scale
@@ -61,7 +60,7 @@ class IsolationPlan:
         """
         rig = self.rig
         nominal = rig.space.nominal()
-        training = _one(rig.run(fault_free_schedule(rig.space, 1), 3600, seeded_generator(self.seed, 6)), 0)
+        training = rig.run(fault_free_schedule(rig.space, 1), 3600, seeded_generator(self.seed, 6)).member(0)
         noise, _ = learn_noise(rig.network, training, rig.space, nominal, levels=rig.levels)
         sensors = training.readings.shape[-1]
         detector = make_detector(
@@ -95,7 +94,7 @@ class IsolationPlan:
         onset = torch.full((count,), self.onset, dtype=theta.dtype)
         ramp = torch.tensor([end - self.onset if scenarios[k].incipient else 0.0 for k in chosen], dtype=theta.dtype)
         seen = rig.run(FaultSchedule(theta, onset, ramp), self.samples, seeded_generator(self.seed, 8, first))
-        results = [isolate_run(monitor, _one(seen, r), nominal, rig.levels, self.onset) for r in range(count)]
+        results = [isolate_run(monitor, seen.member(r), nominal, rig.levels, self.onset) for r in range(count)]
         names = [rig.space.names[scenarios[k].fault.size] for k in chosen]
         return {
             "fault": [
@@ -137,8 +136,3 @@ class IsolationPlan:
         title = f"faults of {self.times:g} times the smallest isolable size"
         title += f", drawn from {results[0]['ways']:.0f}" if results else ""
         return ResultTable(title, header, tuple(rows) if results else (), summary)
-
-
-def _one(samples: Samples, run: int) -> Samples:
-    inputs = samples.inputs[run] if samples.inputs.dim() > 2 else samples.inputs
-    return Samples(samples.time, inputs, samples.readings[run])
