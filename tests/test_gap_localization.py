@@ -180,11 +180,19 @@ def delivering(command: Tensor, delivered: Tensor, seed: int) -> tuple[Fitter, F
     return fitter, null, likely.noise
 
 
-def test_a_stiction_with_a_band_between_those_of_the_grid_is_one_regressor() -> None:
+@pytest.fixture(scope="module")
+def sticking() -> tuple[Fitter, Fit, StateNoise]:
+    """A pump that holds its flow until the command has moved by more than a band between those of the grid."""
     command = 15e-6 + 60e-6 * torch.rand(30, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     command = command.repeat_interleave(70)
     band = 0.363 * (command.max() - command.min()).reshape(1, 1)
-    fitter, fit, noise = delivering(command, stiction(command, band)[0], 3)
+    return delivering(command, stiction(command, band)[0], 3)
+
+
+def test_a_stiction_with_a_band_between_those_of_the_grid_is_one_regressor(
+    sticking: tuple[Fitter, Fit, StateNoise],
+) -> None:
+    fitter, fit, noise = sticking
     found = localize(fitter, fit, noise, ("Q1", "T1", "P13")).discrepancies
     assert found[0].location == "Q1" and found[0].parameters == 1
     assert found[0].gain > found[1].gain + 50.0
@@ -205,15 +213,14 @@ def test_a_law_with_many_changes_is_found_although_random_flows_explain_each_of_
 
 
 def test_the_regressors_of_a_selection_are_the_same_about_the_same_levels(
-    far_from_the_plant: tuple[Fitter, Fit, StateNoise],
+    sticking: tuple[Fitter, Fit, StateNoise],
 ) -> None:
-    fitter, fit, noise = far_from_the_plant
+    fitter, fit, noise = sticking
     regression = DiscrepancyRegression(fitter, fit, None, 20)
-    ascent = Ascent(fitter, fit, noise, 0.0)
-    found = ascent.with_finer_positions(ascent.evaluate(regression, regression.of("T2"), "T2", noise))
+    found = Ascent(fitter, fit, noise, 0.0).under_less_and_less_noise(regression, "Q1", noise)
     used, selection = found.regressed.used, found.selection
     assert len(selection.positions) > 0
-    again = regression.of("T2", selection.positions)
+    again = regression.of("Q1", selection.positions)
     kept = torch.isfinite(selection.precision)
     assert torch.equal(again.columns[kept], found.discrepancy.columns[used])
     assert torch.equal(selection.precision[kept], found.regressed.precision[used])

@@ -51,6 +51,8 @@ class HypothesisSearch:
         # By the explanation's id, and the place; and the explanations' ids.
         self._evaluated: dict[tuple[int, str], list[CauseHypothesis]] = {}
         self._at_all_places: set[int] = set()
+        # Unknowns at whose place the effects of the library were fitted: the causes beside each, and its place.
+        self._with_names: set[tuple[frozenset[CauseName], str]] = set()
 
     @property
     def plant(self) -> PlantDescription:
@@ -199,17 +201,23 @@ class HypothesisSearch:
         return [each for h in [*hypotheses, *added] for each in (self._among_known(h) if h.weight > least else [h])]
 
     def _named(self, h: CauseHypothesis) -> list[RankedExplanation]:
-        """Explanations with one effect in place of the unknown of a hypothesis; the most promising are fitted now."""
+        """Explanations with one effect in place of the unknown of a hypothesis; the most promising are fitted once."""
         if h.unknown is None:
             return []
-        noise = replace(h.unknown.noise, wander=None)
+        if (unknown := (frozenset(h.causes), h.unknown.location)) not in self._with_names:
+            self._with_names.add(unknown)
+            self._fit_effects_at(h, h.unknown)
+        return [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
+
+    def _fit_effects_at(self, h: CauseHypothesis, unknown: LocalizedDiscrepancy) -> None:
+        """Fit and evaluate the most promising effects at the place of the unknown of a hypothesis."""
+        noise = replace(unknown.noise, wander=None)
         under = with_disturbances(h.explanation.fitter, h.fit, noise)
-        at_place = [o for o in self.options if o.placement.location == h.unknown.location]
+        at_place = [o for o in self.options if o.placement.location == unknown.location]
         others = tuple(p for p in h.fit.candidate.placements if (p.effect.name, p.location) in h.causes)
         base = under.fit(Candidate(others, (h.fit.values_of(others),)), h.fit)
         for fit in self.pool.fits_beside(under, base, at_place):
             self.pool.evaluate(fit, noise)
-        return [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
 
     def _among_known(self, h: CauseHypothesis) -> list[CauseHypothesis]:
         """The hypothesis, and those of single effects in place of its unknown, with its weight divided among them."""

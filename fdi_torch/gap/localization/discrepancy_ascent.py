@@ -144,15 +144,17 @@ class Ascent:
         """The likeliest discrepancy at a place under this noise or under ones with smaller random flows.
 
         Random flows that absorb a law with many changes hide each of them, so that neither one more regressor nor
-        smaller flows gain anything, but both together do. Each regression starts from the regressors of the one before.
+        smaller flows gain anything, but both together do. Each regression starts from the regressors of the one before;
+        the flows are lowered until two in succession were worse.
         """
-        best = current = self.with_finer_positions(self.evaluate(regression, regression.of(place), place, noise))
+        evaluated = [self.with_finer_positions(self.evaluate(regression, regression.of(place), place, noise))]
         for share in LESS_NOISE:
-            less = replace(noise, intensity=share * noise.intensity)
-            at, precision = current.discrepancy, current.regressed.precision
-            current = self.with_finer_positions(self.evaluate(regression, at, place, less, precision))
-            best = max(best, current, key=gain_of)
-        return best
+            last, less = evaluated[-1], replace(noise, intensity=share * noise.intensity)
+            current = self.evaluate(regression, last.discrepancy, place, less, last.regressed.precision)
+            evaluated.append(self.with_finer_positions(current))
+            if len(evaluated) > 2 and evaluated[-3].gain > max(evaluated[-2].gain, evaluated[-1].gain):
+                break
+        return max(evaluated, key=gain_of)
 
     def climbed(self, best: EvaluatedDiscrepancy, needed: float) -> EvaluatedDiscrepancy:
         """Noise, regressors and parameters of the fit in turn, until nothing gains or `needed` is out of reach."""
