@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import cast
 
 import pytest
+import torch
 
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import effect
@@ -61,6 +63,20 @@ def test_the_density_ratio_at_zero_is_the_ratio_of_evidences(sound: tuple[Fitter
         expected = log_evidence(fitter, fit, CHOICES)
         assert fewer[causes_in_order(fit)] == pytest.approx(expected, abs=0.2)
         assert expected > h.weight + 3.0
+
+
+@pytest.mark.parametrize("mean", [0.4, -2.0, 5.0])
+def test_the_density_of_an_estimate_is_that_of_a_normal_distribution_between_its_bounds(mean: float) -> None:
+    estimate = Estimate(torch.tensor([mean]).double(), torch.tensor([0.7]).double())
+    x = torch.linspace(-0.5, 1.5, 2001).double()
+    density = [math.exp(estimate.log_density(0, value, (-0.5, 1.5))) for value in x.tolist()]
+    assert torch.trapezoid(torch.tensor(density).double(), x) == pytest.approx(1.0, abs=1e-5)
+    assert density[1500] / density[500] == pytest.approx(math.exp(((mean**2) - (1.0 - mean) ** 2) / (2 * 0.7**2)))
+
+
+def test_an_estimate_without_information_is_uniform_between_its_bounds() -> None:
+    estimate = Estimate(torch.tensor([3.0]).double(), torch.tensor([1e9]).double())
+    assert estimate.log_density(0, 0.0, (-0.5, 1.5)) == pytest.approx(-math.log(2.0), abs=1e-6)
 
 
 def test_an_effect_that_the_readings_need_is_not_left_out() -> None:

@@ -18,6 +18,7 @@ from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
 from fdi_torch.gap.localization.breakpoints import Relays
+from fdi_torch.gap.localization.discrepancy_ascent import Ascent
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.fine_positions import Positions
 from fdi_torch.gap.localization.localize import localize
@@ -67,7 +68,10 @@ def test_a_relay_keeps_its_state_between_its_thresholds() -> None:
     x = torch.tensor([0.0, 0.5, 0.9, 0.5, 0.1, 0.5])
     thresholds = torch.tensor([[0.2, 0.8], [0.05, 0.4]])
     assert relay(x, thresholds).int().tolist() == [[0, 0, 1, 1, 0, 0], [0, 1, 1, 1, 1, 1]]
-    assert stiction(x, 0.45).tolist() == pytest.approx([0.0, 0.5, 0.5, 0.5, 0.5, 0.5])
+    assert stiction(x, torch.tensor([[0.45], [0.85]])).tolist() == [
+        pytest.approx([0.0, 0.5, 0.5, 0.5, 0.5, 0.5]),
+        pytest.approx([0.0, 0.0, 0.9, 0.9, 0.9, 0.9]),
+    ]
     assert relay_thresholds((0.0, 1.0), 3).flatten().tolist() == pytest.approx([1 / 6, 0.5, 1 / 6, 5 / 6, 0.5, 5 / 6])
 
 
@@ -165,6 +169,61 @@ def test_the_thresholds_of_a_relay_are_found_between_those_of_the_grid(nearest: 
 
     assert gain(regression.influence("OUT2", 0, relays.functions_at(relays.thresholds))) < gain(influence) - 1.0
     assert gain(found.columns.blocks[-1]) > gain(influence) - 0.5
+
+
+def delivering(command: Tensor, delivered: Tensor, seed: int) -> tuple[Fitter, Fit, StateNoise]:
+    """A pump Q1 with commands (K,) delivers other flows (K,): the fitter of its recording, the fit, and their noise."""
+    both = [torch.stack([flow, torch.full_like(command, 40e-6)], dim=1) for flow in (command, delivered)]
+    run = replace(recorded({}, seed, samples=len(command), inputs=both[1]), inputs=both[0])
+    plain, null, _ = recalibrate(problem_of(nominal_plant(), (run,), (), Settings()).data)
+    fitter, likely = with_estimated_noise(plain, null)
+    return fitter, null, likely.noise
+
+
+@pytest.fixture(scope="module")
+def sticking() -> tuple[Fitter, Fit, StateNoise]:
+    """A pump that holds its flow until the command has moved by more than a band between those of the grid."""
+    command = 15e-6 + 60e-6 * torch.rand(30, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    command = command.repeat_interleave(70)
+    band = 0.363 * (command.max() - command.min()).reshape(1, 1)
+    return delivering(command, stiction(command, band)[0], 3)
+
+
+def test_a_stiction_with_a_band_between_those_of_the_grid_is_one_regressor(
+    sticking: tuple[Fitter, Fit, StateNoise],
+) -> None:
+    fitter, fit, noise = sticking
+    found = localize(fitter, fit, noise, ("Q1", "T1", "P13")).discrepancies
+    assert found[0].location == "Q1" and found[0].parameters == 1
+    assert found[0].gain > found[1].gain + 50.0
+
+
+def test_a_law_with_many_changes_is_found_although_random_flows_explain_each_of_them() -> None:
+    """A pump that delivers less now and then, at random."""
+    generator = torch.Generator().manual_seed(5)
+    command = (30e-6 + 30e-6 * torch.rand(25, generator=generator, dtype=torch.float64)).repeat_interleave(100)
+    less = torch.rand(20, generator=generator, dtype=torch.float64).repeat_interleave(125) < 0.5
+    fitter, fit, noise = delivering(command, command * torch.where(less, 0.8, 1.0), 5)
+    regression = DiscrepancyRegression(fitter, fit, None, 120)
+    ascent = Ascent(fitter, fit, noise, 0.0)
+    under_all = ascent.with_finer_positions(ascent.evaluate(regression, regression.of("Q1"), "Q1", noise))
+    assert ascent.under_less_and_less_noise(regression, "Q1", noise).gain > under_all.gain + 100.0
+    found = localize(fitter, fit, noise, ("Q1", "T1", "P13")).discrepancies
+    assert found[0].location == "Q1" and found[0].gain > found[1].gain + 50.0
+
+
+def test_the_regressors_of_a_selection_are_the_same_about_the_same_levels(
+    sticking: tuple[Fitter, Fit, StateNoise],
+) -> None:
+    fitter, fit, noise = sticking
+    regression = DiscrepancyRegression(fitter, fit, None, 20)
+    found = Ascent(fitter, fit, noise, 0.0).under_less_and_less_noise(regression, "Q1", noise)
+    used, selection = found.regressed.used, found.selection
+    assert len(selection.positions) > 0
+    again = regression.of("Q1", selection.positions)
+    kept = torch.isfinite(selection.precision)
+    assert torch.equal(again.columns[kept], found.discrepancy.columns[used])
+    assert torch.equal(selection.precision[kept], found.regressed.precision[used])
 
 
 def test_every_sample_counts_in_the_weight_of_a_discrepancy(far_from_the_plant: tuple[Fitter, Fit, StateNoise]) -> None:

@@ -51,6 +51,8 @@ class HypothesisSearch:
         # By the explanation's id, and the place; and the explanations' ids.
         self._evaluated: dict[tuple[int, str], list[CauseHypothesis]] = {}
         self._at_all_places: set[int] = set()
+        # Unknowns at whose place the effects of the library were fitted: the causes beside each, and its place.
+        self._with_names: set[tuple[frozenset[CauseName], str]] = set()
 
     @property
     def plant(self) -> PlantDescription:
@@ -129,12 +131,14 @@ class HypothesisSearch:
 
     def _climbed(self, best: CauseHypothesis) -> list[CauseHypothesis]:
         """Hypotheses with an effect fewer or more than the best, or else with a discrepancy at another place, while
-        that improves it."""
+        that improves it. The discrepancy moves beside the same effects, or beside one more in its former place."""
         evaluated: list[CauseHypothesis] = []
         while True:
             trials = [*self._with_fewer_effects(best), *self._with_more_effects(best)]
             if best.discrepancy and all(h.weight <= best.weight for h in trials):
                 trials += self._everywhere(best.explanation, best)
+                if named := self._named(best):
+                    trials += self._everywhere(max(named, key=lambda e: e.log_weight), best)
             evaluated += trials
             if not trials or likeliest(trials).weight <= best.weight:
                 return evaluated
@@ -192,15 +196,28 @@ class HypothesisSearch:
         least = max([rival, *(h.weight for h in hypotheses)]) + math.log(RARE)
         for h in hypotheses:
             if h.unknown and h.weight > least:
-                under = with_disturbances(h.explanation.fitter, h.fit, replace(h.unknown.noise, wander=None))
-                at_place = [o for o in self.options if o.placement.location == h.unknown.location]
-                others = tuple(p for p in h.fit.candidate.placements if (p.effect.name, p.location) in h.causes)
-                base = under.fit(Candidate(others, (h.fit.values_of(others),)), h.fit)
-                for fit in self.pool.fits_beside(under, base, at_place):
-                    self.pool.evaluate(fit, replace(h.unknown.noise, wander=None))
-                named = [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
+                named = self._named(h)
                 added += [law for e in named for law in self._with_discrepancies(e, [h.unknown.location], h)]
         return [each for h in [*hypotheses, *added] for each in (self._among_known(h) if h.weight > least else [h])]
+
+    def _named(self, h: CauseHypothesis) -> list[RankedExplanation]:
+        """Explanations with one effect in place of the unknown of a hypothesis; the most promising are fitted once."""
+        if h.unknown is None:
+            return []
+        if (unknown := (frozenset(h.causes), h.unknown.location)) not in self._with_names:
+            self._with_names.add(unknown)
+            self._fit_effects_at(h, h.unknown)
+        return [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
+
+    def _fit_effects_at(self, h: CauseHypothesis, unknown: LocalizedDiscrepancy) -> None:
+        """Fit and evaluate the most promising effects at the place of the unknown of a hypothesis."""
+        noise = replace(unknown.noise, wander=None)
+        under = with_disturbances(h.explanation.fitter, h.fit, noise)
+        at_place = [o for o in self.options if o.placement.location == unknown.location]
+        others = tuple(p for p in h.fit.candidate.placements if (p.effect.name, p.location) in h.causes)
+        base = under.fit(Candidate(others, (h.fit.values_of(others),)), h.fit)
+        for fit in self.pool.fits_beside(under, base, at_place):
+            self.pool.evaluate(fit, noise)
 
     def _among_known(self, h: CauseHypothesis) -> list[CauseHypothesis]:
         """The hypothesis, and those of single effects in place of its unknown, with its weight divided among them."""
@@ -268,10 +285,11 @@ class HypothesisSearch:
         for p in at.fit.candidate.placements:
             cause, name = (p.effect.name, p.location), p.full_name(p.effect.parameters(p.location, self.plant)[0].name)
             if cause in h.causes and p.location != at.location and name in at.fit.space:
-                i = at.fit.space.index(name)
-                std = float(at.estimate.std[i])
-                z = (float(at.estimate.values[i]) - at.fit.space.parameters[i].nominal) / std
-                ratio = log_width(self.pool.fitter, at.fit.space, i) - math.log(std) - 0.5 * z * z
+                i, fitter = at.fit.space.index(name), self.pool.fitter
+                low, high, _ = fitter.box(at.fit.space)
+                nothing = at.fit.space.parameters[i].nominal
+                density = at.estimate.log_density(i, nothing, (float(low[i]), float(high[i])))
+                ratio = density + log_width(fitter, at.fit.space, i) + 0.5 * math.log(2.0 * math.pi)
                 key, without = h.explanation.key - left_out, left_out | {cause}
                 odds = log_prior(key - {cause}, self.pool.choices) - log_prior(key, self.pool.choices)
                 others = tuple(c for c in h.causes if c != cause)

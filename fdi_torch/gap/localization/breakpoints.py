@@ -1,4 +1,4 @@
-"""Functions of a signal with a kink or a jump, at many breakpoints, and relays with many pairs of thresholds.
+"""Functions of a signal with a kink or a jump, at many breakpoints, relays with many pairs of thresholds, and others.
 
     factor * max(x - c, 0)        factor where x >= c, otherwise 0        factor where a relay of x is on, otherwise 0
 
@@ -64,6 +64,21 @@ class Relays:
     def functions_at(self, thresholds: Tensor) -> Tensor:
         """The functions (M, K) with other thresholds (M, 2)."""
         return self.factor * relay(self.x, thresholds)
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Functions of time, such as a signal with memory of its past. values (N, K)."""
+
+    values: Tensor
+
+    def function(self, i: int) -> Tensor:
+        """The i-th function (K,)."""
+        return self.values[i]
+
+    def products(self, weights: Tensor) -> Tensor:
+        """Products (N, W) of all functions with weights (W, K)."""
+        return self.values @ weights.T
 
 
 def _sums_from(x: Tensor) -> Tensor:

@@ -14,12 +14,16 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.forcing import Forcing
-from fdi_torch.gap.localization.breakpoints import Breakpoints, Relays
+from fdi_torch.gap.localization.breakpoints import Breakpoints, Curves, Relays
 from fdi_torch.gap.localization.regressors import (
+    BACKLASH_BANDS,
+    FINE_STICTION_BANDS,
     LAGS,
     RAMPS,
+    TRAVEL_TIMES,
     backlashes,
     fatigues,
+    finer,
     hinges,
     lagged,
     lags_and_decays,
@@ -36,7 +40,7 @@ from fdi_torch.plant.scales import time_scale
 
 Signals = dict[str, Tensor]
 RELAYS = 6  # thresholds of relays
-FINER = 8  # factor by which kinks and jumps may be placed more closely than in the first grid
+FINER = 8  # factor by which kinks, jumps, bands and travel times may lie more closely than in the first grid
 FINER_RELAYS = 4  # the same for thresholds of relays, of which there are as many as pairs of these
 SLOW = (100.0, 300.0)  # time constants (s) of a side chamber of a tank
 
@@ -82,11 +86,14 @@ class SignalRanges:
         one = torch.ones_like(s[name]) if factor is None else factor
         return Relays(s[name], one, relay_thresholds(self(name), FINER_RELAYS * RELAYS))
 
+    def fine_backlashes(self, s: Signals, name: str) -> Curves:
+        return Curves(torch.stack(backlashes(s[name], self(name), finer(BACKLASH_BANDS, FINER))))
+
 
 # Local signals (K,), step lengths (K,) s -> regressors (K,) each
 RegressorFunction = Callable[[Signals, Tensor, SignalRanges], list[Tensor]]
-FineRegressors = list[Breakpoints | Relays]
-FineFunction = Callable[[Signals, SignalRanges], FineRegressors]
+FineRegressors = list[Breakpoints | Relays | Curves]
+FineFunction = Callable[[Signals, Tensor, SignalRanges], FineRegressors]
 
 
 @dataclass(frozen=True)
@@ -128,8 +135,8 @@ def reading_regressors(s: Signals, step: Tensor, ends: SignalRanges, scale: floa
 
 
 def fine_reading_regressors(s: Signals, ends: SignalRanges) -> FineRegressors:
-    """The kinks among `reading_regressors` on a finer grid."""
-    return [ends.kinks(s, "reading", 12)]
+    """The kinks and the backlashes among `reading_regressors` on finer grids."""
+    return [ends.kinks(s, "reading", 12), ends.fine_backlashes(s, "reading")]
 
 
 def _commanded(component: FlowComponent, plant: PlantDescription) -> DiscrepancyModel:
@@ -150,8 +157,11 @@ def _commanded(component: FlowComponent, plant: PlantDescription) -> Discrepancy
         regressors += stictions(s["flow"], ends("flow"))
         return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
 
-    def fine(s: Signals, ends: SignalRanges) -> FineRegressors:
-        return [ends.kinks(s, "command", 9), ends.kinks(s, "level", 6, s["flow"])]
+    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
+        slow = Curves(torch.stack(rate_limits(s["flow"], step, ends("flow"), scale, finer(TRAVEL_TIMES, FINER))))
+        sticking = Curves(torch.stack(stictions(s["flow"], ends("flow"), FINE_STICTION_BANDS)))
+        kinks = [ends.kinks(s, "command", 9), ends.kinks(s, "level", 6, s["flow"])]
+        return [*kinks, slow, sticking, ends.fine_backlashes(s, "flow")]
 
     return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
 
@@ -173,10 +183,10 @@ def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyMo
             regressors += lags_and_decays(s["root"] * s["opening"], step, scale)
         return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
 
-    def fine(s: Signals, ends: SignalRanges) -> FineRegressors:
+    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
         of_opening = [ends.kinks(s, "opening", 9, s["root"])] if has_valve else []
         jumps, relays = ends.jumps(s, "root", 24, s["flow"]), ends.fine_relays(s, "root", s["flow"])
-        return [ends.kinks(s, "root", 16), jumps, relays, *of_opening]
+        return [ends.kinks(s, "root", 16), jumps, relays, ends.fine_backlashes(s, "flow"), *of_opening]
 
     return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
 
@@ -196,7 +206,7 @@ def _pair(place: str, plant: PlantDescription) -> DiscrepancyModel:
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
         return [*ends.hinges(s, "head", 10), *ends.hinges(s, "root", 10)]
 
-    def fine(s: Signals, ends: SignalRanges) -> FineRegressors:
+    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
         return [ends.kinks(s, "head", 10), ends.kinks(s, "root", 10)]
 
     return DiscrepancyModel(signals, flows, fine, "root", first, second)
@@ -220,9 +230,9 @@ def _tank(place: str, plant: PlantDescription) -> DiscrepancyModel:
     def areas(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
         return [s["rate"] * b for b in ends.hinges(s, "level", 12)]
 
-    def fine(s: Signals, ends: SignalRanges) -> FineRegressors:
+    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
         relays = [ends.fine_relays(s, "level"), ends.fine_relays(s, "level", _root(s["level"]))]
-        return [ends.kinks(s, "level", 12), ends.jumps(s, "level", 24), *relays]
+        return [ends.kinks(s, "level", 12), ends.jumps(s, "level", 24), *relays, ends.fine_backlashes(s, "level")]
 
     return DiscrepancyModel(signals, flows, fine, "one", OUTSIDE, place, areas)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.localization.discrepancy_columns import Discrepancy
+from fdi_torch.gap.localization.discrepancy_columns import Discrepancy, Selection
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.fine_positions import CONVERGED, Positions, with_best_frequency
 from fdi_torch.gap.localization.localized_discrepancy import (
@@ -26,6 +26,7 @@ from fdi_torch.gap.marginal_likelihood import LinearParameters, estimate_disturb
 from fdi_torch.gap.trajectory_problem import SHARE
 
 STEPS = 120  # step functions of time
+LESS_NOISE = (0.3, 0.1, 0.03, 0.01)  # random flows in successive regressions, as shares of the likeliest without one
 MOST_TURNS = 12  # alternations between the disturbance noise, one more regressor, and the parameters of the fit
 
 
@@ -59,6 +60,10 @@ class EvaluatedDiscrepancy:
         used = self.regressed.used
         return self.discrepancy.columns[used] @ self.regressed.mean[used]
 
+    @property
+    def selection(self) -> Selection:
+        return self.discrepancy.selection(self.regressed.precision)
+
     def localized(self, fitter: Fitter) -> LocalizedDiscrepancy:
         """The result. fitter: that of the explanation, whose sensor noise is the unit of the size."""
         explained, at, used, fit = self.explained, self.discrepancy, self.regressed.used, self.regression.fit
@@ -72,7 +77,7 @@ class EvaluatedDiscrepancy:
             explained,
             at.linearised.readings[0] + explained,
             size,
-            at.frequency,
+            self.selection,
             fit,
             self.noise,
             Estimate.beside(self.under, fit, at.linearised, at.columns[used], precision),
@@ -101,38 +106,67 @@ class Ascent:
         noise: StateNoise,
         start: Tensor | None = None,
     ) -> EvaluatedDiscrepancy:
-        """The discrepancy under one noise. start (M,): precisions of its columns from which the regression starts."""
+        """The discrepancy under one noise.
+
+        start (M,): precisions of its columns from which the regression starts. Without it, the regression starts from
+        nothing, and the regressor at the best of all positions is one more column: a stiction whose band lies between
+        two of the grid would need ten of its regressors, after which no position gains any more.
+        """
         fit = regression.fit
         under = with_disturbances(self.fitter, fit, noise, discrepancy.linearised)
+        if start is None:
+            nothing = torch.zeros(len(discrepancy.columns), dtype=torch.bool)
+            positions = Positions(regression, place, under, discrepancy, nothing, self.generator)
+            discrepancy = positions.best(discrepancy, nothing) or discrepancy
         whitened = WhitenedDiscrepancy(under, fit, discrepancy)
         regressed = whitened.sparse_fit(column_costs(discrepancy.choices, self.largest), start)
         without = log_likelihood(under, fit, discrepancy.linearised) + noise.log_prior() - self.base
         return EvaluatedDiscrepancy(place, noise, under, regression, discrepancy, whitened, regressed, without)
 
     def about(
-        self, fit: Fit, explained: Tensor, noise: StateNoise, place: str, frequency: float | None
+        self, fit: Fit, explained: Tensor, noise: StateNoise, place: str, selection: Selection
     ) -> EvaluatedDiscrepancy:
         """The discrepancy about a fit beside it, with the levels that are predicted from the readings of right sensors.
 
-        explained: part of the readings (S, C) that the discrepancy explains.
+        explained: part of the readings (S, C) that the discrepancy explains. selection: the regressors from which the
+        regression starts. From nothing, it would use a hundred where little noise is left.
         """
         data, right = self.fitter.data, Fitter(self.fitter.data, self.fitter.noise)
         if any(s.name == place for s in data.plant.sensors):
             right = Fitter(replace(data, readings=data.readings - explained), self.fitter.noise)
         along = with_disturbances(right, fit, self.noise) if self.fitter.whitening else right
-        regression = DiscrepancyRegression(along, fit, frequency, STEPS)
-        return self.evaluate(regression, regression.of(place), place, noise)
+        regression = DiscrepancyRegression(along, fit, selection.frequency, STEPS)
+        return self.evaluate(regression, regression.of(place, selection.positions), place, noise, selection.precision)
+
+    def under_less_and_less_noise(
+        self, regression: DiscrepancyRegression, place: str, noise: StateNoise
+    ) -> EvaluatedDiscrepancy:
+        """The likeliest discrepancy at a place under this noise or under ones with smaller random flows.
+
+        Random flows that absorb a law with many changes hide each of them, so that neither one more regressor nor
+        smaller flows gain anything, but both together do. Each regression starts from the regressors of the one before;
+        the flows are lowered until two in succession were worse.
+        """
+        evaluated = [self.with_finer_positions(self.evaluate(regression, regression.of(place), place, noise))]
+        for share in LESS_NOISE:
+            last, less = evaluated[-1], replace(noise, intensity=share * noise.intensity)
+            current = self.evaluate(regression, last.discrepancy, place, less, last.regressed.precision)
+            evaluated.append(self.with_finer_positions(current))
+            if len(evaluated) > 2 and evaluated[-3].gain > max(evaluated[-2].gain, evaluated[-1].gain):
+                break
+        return max(evaluated, key=gain_of)
 
     def climbed(self, best: EvaluatedDiscrepancy, needed: float) -> EvaluatedDiscrepancy:
         """Improve noise, regressors and fit parameters in turn, until nothing gains or `needed` is out of reach."""
+        refitted: EvaluatedDiscrepancy | None = None  # a refit of this one gained nothing
         for turn in range(MOST_TURNS):
             before, best = best.gain, max(best, self._with_likely_noise(best, turn == 0), key=gain_of)
             best = self.with_finer_positions(best)
             if turn == 0 or bool((best.regressed.used & best.discrepancy.sinusoids).any()):
                 best = max(best, self._with_finer_frequency(best), key=gain_of)
-            if best.gain < SHARE * (needed - best.gain):
+            if best is refitted or best.gain < SHARE * (needed - best.gain):
                 break
-            best = max(best, self._refitted(best), key=gain_of)
+            refitted, best = best, max(best, self._refitted(best), key=gain_of)
             if best.gain - before < max(CONVERGED, SHARE * (needed - best.gain)):
                 break
         return best
@@ -179,4 +213,4 @@ class Ascent:
         held = fit.values_of([p for p in fit.candidate.placements if p.location == current.location])
         candidate = Candidate(fit.candidate.placements, (fit.effect_values,))
         new = current.under.of(corrected).fit(candidate, fit, held=held)
-        return self.about(new, current.explained, current.noise, current.location, current.discrepancy.frequency)
+        return self.about(new, current.explained, current.noise, current.location, current.selection)

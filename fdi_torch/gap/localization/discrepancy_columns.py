@@ -26,11 +26,35 @@ class Columns:
 
 
 @dataclass(frozen=True)
+class Position:
+    """A regressor between those of the grid. index: among those of its family. choices: number of regressors among
+    which it was selected. thresholds: of a relay that lies between those of its family."""
+
+    family: int
+    index: int
+    choices: int
+    thresholds: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The regressors that a discrepancy uses, about whatever trajectory.
+
+    precision (M,): of their priors, infinite for those that are not used. positions: of those between the grid's, which
+    come last. frequency: of the sinusoids, Hz, or None if there are none.
+    """
+
+    precision: Tensor
+    positions: tuple[Position, ...]
+    frequency: float | None
+
+
+@dataclass(frozen=True)
 class Discrepancy:
     """Influence of a component's regressors on the readings, columns (S, C, M), about a linearised trajectory.
 
     choices (M,): number of regressors among which each was selected. frequency: of the sinusoids, Hz, or None if there
-    are none. sinusoids (M,) bool: which columns they are.
+    are none. sinusoids (M,) bool: which columns they are. positions: of the last columns.
     """
 
     columns: Columns
@@ -38,15 +62,23 @@ class Discrepancy:
     choices: Tensor
     frequency: float | None
     sinusoids: Tensor
+    positions: tuple[Position, ...] = ()
 
-    def with_column(self, column: Tensor, choices: int) -> Discrepancy:
-        """The same with one more column (S, C)."""
+    def with_column(self, column: Tensor, position: Position) -> Discrepancy:
+        """The same with one more column (S, C), that of a regressor at a position between those of the grid."""
         return replace(
             self,
             columns=Columns((*self.columns.blocks, column.unsqueeze(-1))),
-            choices=torch.cat([self.choices, self.choices.new_tensor([choices])]),
+            choices=torch.cat([self.choices, self.choices.new_tensor([position.choices])]),
             sinusoids=torch.cat([self.sinusoids, self.sinusoids.new_zeros(1)]),
+            positions=(*self.positions, position),
         )
+
+    def selection(self, precision: Tensor) -> Selection:
+        """The regressors in use. precision (M,): infinite for those that are not."""
+        used, grid = torch.isfinite(precision), len(precision) - len(self.positions)
+        positions = tuple(p for p, kept in zip(self.positions, used[grid:].tolist(), strict=True) if kept)
+        return Selection(torch.cat([precision[:grid], precision[grid:][used[grid:]]]), positions, self.frequency)
 
     def with_sinusoids(self, frequency: float, columns: Tensor) -> Discrepancy:
         """The same with sinusoids of another frequency; columns (S, C, W): their influence."""

@@ -16,7 +16,7 @@ from torch import Tensor
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.forcing import Forcing
-from fdi_torch.gap.localization.breakpoints import Breakpoints
+from fdi_torch.gap.localization.breakpoints import Breakpoints, Relays
 from fdi_torch.gap.localization.component_regressors import (
     DiscrepancyModel,
     FineRegressors,
@@ -26,7 +26,7 @@ from fdi_torch.gap.localization.component_regressors import (
     fine_reading_regressors,
     reading_regressors,
 )
-from fdi_torch.gap.localization.discrepancy_columns import Columns, Discrepancy
+from fdi_torch.gap.localization.discrepancy_columns import Columns, Discrepancy, Position
 from fdi_torch.gap.localization.regressors import harmonics, step_functions, time_functions
 from fdi_torch.gap.marginal_likelihood import predicted_levels
 from fdi_torch.plant.description import OUTSIDE, Sensor
@@ -61,6 +61,17 @@ class Regressors:
     def steps_in_time(self) -> Breakpoints:
         """Steps at all times."""
         return Breakpoints(self.time, self.factor, self.time, jump=True)
+
+    def at(self, position: Position, recording: int) -> Tensor:
+        """The regressor (K,) at a position, along this recording."""
+        if position.family < len(self.fine):
+            family = self.fine[position.family]
+            if position.thresholds and isinstance(family, Relays):
+                return family.functions_at(self.time.new_tensor([position.thresholds]))[0]
+            return family.function(position.index)
+        if position.family == len(self.fine) + recording:
+            return self.steps_in_time.function(position.index)
+        return torch.zeros_like(self.factor)  # a step in time of another recording
 
     def sinusoids(self, frequency: Tensor) -> Tensor:
         """Harmonics of each frequency (F,), Hz, times the factor: (F, W, K)."""
@@ -121,7 +132,8 @@ class DiscrepancyRegression:
         self._last: tuple[str, list[Regressors], Linearised] | None = None
         self.steps = step_functions(steps, len(fitter.data.readings), len(self.pieces))
 
-    def of(self, place: str) -> Discrepancy:
+    def of(self, place: str, positions: Sequence[Position] = ()) -> Discrepancy:
+        """The discrepancy of all regressors of the grid, and of those at some positions between them."""
         regressors, linearised = self.at(place)
         shared = [self.influence(place, k, r.functions) for k, r in enumerate(regressors)]
         for k, r in enumerate(regressors):
@@ -137,7 +149,15 @@ class DiscrepancyRegression:
         # A sinusoid is one of those of all frequencies: 1 / (2 dt) over the width sqrt(2 pi) s of the posterior,
         # s = sqrt(6 / G) / (2 pi T) with a gain of G nats (Rife and Boorstyn, 1974), is 2 S if it is just worth it.
         choices[sinusoids] *= 2 * len(grid)
-        return Discrepancy(columns, linearised, choices, frequency, sinusoids)
+        discrepancy = Discrepancy(columns, linearised, choices, frequency, sinusoids)
+        for position in positions:
+            discrepancy = discrepancy.with_column(self.column(place, position), position)
+        return discrepancy
+
+    def column(self, place: str, position: Position) -> Tensor:
+        """Influence (S, C) of the regressor at a position."""
+        functions = [r.at(position, k).unsqueeze(0) for k, r in enumerate(self.at(place)[0])]
+        return with_blanks([self.influence(place, k, f) for k, f in enumerate(functions)], dim=0)[..., 0]
 
     def sinusoids(self, place: str, frequency: Tensor) -> Tensor:
         """Influence (S, C, F, W) of harmonics of each frequency (F,), with separate amplitudes in each recording."""
@@ -202,7 +222,7 @@ class DiscrepancyRegression:
         ends, regressors = SignalRanges(signals), []
         for piece, s in zip(self.pieces, signals, strict=True):
             step, factor = piece.engine.experiment.steps, s[component.in_time]
-            functions, fine = torch.stack(component.flows(s, step, ends)), component.fine(s, ends)
+            functions, fine = torch.stack(component.flows(s, step, ends)), component.fine(s, step, ends)
             areas = torch.stack(component.areas(s, step, ends)) if component.areas else None
             in_time = factor * self._functions_of_time(piece, piece.middle)
             regressors.append(Regressors(functions, fine, in_time, piece.middle, factor, areas))

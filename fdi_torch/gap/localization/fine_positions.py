@@ -12,7 +12,8 @@ half a turn at its ends, which may cost hundreds of nats.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -21,7 +22,7 @@ from fdi_torch.estimate.linear_parameters import without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.breakpoints import Relays
-from fdi_torch.gap.localization.discrepancy_columns import Discrepancy
+from fdi_torch.gap.localization.discrepancy_columns import Discrepancy, Position
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.single_regressor_gain import (
     adjoints_of,
@@ -79,28 +80,31 @@ class Positions:
         tried = sorted(highest, reverse=True)[:TRIED]
         if not tried or tried[0][0] < self._cost:
             return None
-        columns = torch.stack([self._column(family, position) for _, family, position in tried], dim=-1)
+        positions = [Position(family, index, self._choices) for _, family, index in tried]
+        columns = torch.stack([self.regression.column(self.place, p) for p in positions], dim=-1)
         best = int(self._exact_gains(columns, basis).argmax())
-        _, family, position = tried[best]
-        if self._relays(family):
-            return self._with_best_thresholds(discrepancy, basis, family, position)
-        return discrepancy.with_column(columns[..., best], self._choices)
+        if self._relays(positions[best].family):
+            return self._with_best_thresholds(discrepancy, basis, positions[best])
+        return discrepancy.with_column(columns[..., best], positions[best])
 
-    def _with_best_thresholds(self, discrepancy: Discrepancy, basis: Tensor, family: int, position: int) -> Discrepancy:
+    def _with_best_thresholds(self, discrepancy: Discrepancy, basis: Tensor, position: Position) -> Discrepancy:
         """The discrepancy with a relay, its thresholds moved to where it explains most."""
-        relays = self._relays(family)
-        spacing = float(relays[0].thresholds[0, 1] - relays[0].thresholds[0, 0])
+        relays = self._relays(position.family)
+        first = relays[0].thresholds
+        spacing = float(first[0, 1] - first[0, 0])
 
         def columns(thresholds: Tensor) -> Tensor:
-            return self._influence([r.functions_at(thresholds) for r in relays])
+            functions = [r.functions_at(thresholds) for r in relays]
+            influences = [self.regression.influence(self.place, k, f) for k, f in enumerate(functions)]
+            return with_blanks(influences, dim=0)
 
         def gains(thresholds: Tensor) -> Tensor:
             return self._exact_gains(columns(thresholds), basis)
 
-        best = best_thresholds(gains, relays[0].thresholds[position], spacing)
-        return discrepancy.with_column(
-            columns(best.unsqueeze(0))[..., 0], self._choices + len(relays[0].thresholds) * 4**HALVINGS
-        )
+        best = best_thresholds(gains, first[position.index], spacing)
+        low, high = best.tolist()
+        moved = replace(position, choices=self._choices + len(first) * 4**HALVINGS, thresholds=(low, high))
+        return discrepancy.with_column(columns(best.unsqueeze(0))[..., 0], moved)
 
     def _relays(self, family: int) -> list[Relays]:
         """The relays of a family along each recording; none if it is no family of relays."""
@@ -111,23 +115,6 @@ class Positions:
         """Gains (M,) of influences (S, C, M) in addition to those in the basis."""
         white = without(basis, self.under.whiten(columns).flatten(0, 1))
         return gains_of((white.T @ self._residual).squeeze(1), white.square().sum(dim=0))
-
-    def _influence(self, functions: Sequence[Tensor]) -> Tensor:
-        """Influence (S, C, M) of functions (M, K) along each recording."""
-        return with_blanks([self.regression.influence(self.place, k, f) for k, f in enumerate(functions)], dim=0)
-
-    def _column(self, family: int, position: int) -> Tensor:
-        """Influence (S, C) of one regressor."""
-        functions = []
-        for k, r in enumerate(self.regression.at(self.place)[0]):
-            if family < len(r.fine):
-                function = r.fine[family].function(position)
-            elif family == len(r.fine) + k:
-                function = r.steps_in_time.function(position)
-            else:
-                function = torch.zeros_like(r.factor)  # a step in time of another recording
-            functions.append(function.unsqueeze(0))
-        return self._influence(functions)[..., 0]
 
     def _products(self, white: Tensor, basis: Tensor) -> list[Tensor]:
         """Products of all regressors with whitened columns (S C + P, W), what the basis explains projected out, by the

@@ -83,8 +83,11 @@ def localize(
     for place, first in sorted(first_order.items(), key=lambda item: -item[1].expected):
         if examined >= CALIBRATION_PLACES and first.expected + growth * first.gain < needed:
             continue
-        best = ascent.evaluate(regression, regression.of(place), place, first.noise)
-        best = ascent.climbed(ascent.with_finer_positions(best), needed)
+        best = ascent.under_less_and_less_noise(regression, place, likely)
+        if first.noise is not likely:
+            other = ascent.evaluate(regression, regression.of(place), place, first.noise)
+            best = max(best, ascent.with_finer_positions(other), key=gain_of)
+        best = ascent.climbed(best, needed)
         examined += 1
         growth = max(growth, (best.gain - first.expected) / max(first.gain, 1.0))
         selected = bool(best.regressed.used.any())
@@ -112,7 +115,8 @@ def _under_the_noise_of_the_likeliest(
         before = likeliest.gain
         for place, earlier in best_of.items():
             if earlier is not likeliest:
-                about = ascent.about(earlier.fit, earlier.explained, likeliest.noise, place, earlier.frequency)
+                assert earlier.selection is not None
+                about = ascent.about(earlier.fit, earlier.explained, likeliest.noise, place, earlier.selection)
                 climbed = ascent.climbed(ascent.with_finer_positions(about), needed)
                 best_of[place] = max(earlier, climbed.localized(ascent.fitter), key=gain_of)
     return best_of
@@ -135,14 +139,14 @@ def localize_beside(
     explains of them. needed: gain in log evidence below which it is irrelevant.
     """
     base = log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
-    if at.noise.wander or at.noise.apart is not None:
+    if at.selection is None:
         regression = DiscrepancyRegression(fitter, fit, None, STEPS)
         likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
         processes = [*drifting_sensors(regression, likely, [at.location], base, needed)]
         processes += random_flows(regression, likely, [at.location], base, needed)
         return max(processes, key=gain_of, default=None)
     ascent = Ascent(fitter, fit, noise, base)
-    first = ascent.about(fit, at.explained, at.noise, at.location, at.frequency)
+    first = ascent.about(fit, at.explained, at.noise, at.location, at.selection)
     return ascent.climbed(ascent.with_finer_positions(first), needed).localized(fitter)
 
 

@@ -12,6 +12,7 @@ from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.estimate.linear_parameters import decomposed, without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.localization.discrepancy_columns import Selection
 from fdi_torch.gap.localization.regressors import HARMONICS
 from fdi_torch.gap.marginal_likelihood import occam, with_disturbances
 from fdi_torch.parameters import ParameterSpace
@@ -39,6 +40,17 @@ class Estimate:
         right = torch.cat([residual.flatten(), -off, torch.zeros_like(precision)])
         return Estimate(fit.theta + scale * (inverse @ (basis.T @ right)), scale * inverse.norm(dim=1))
 
+    def log_density(self, i: int, value: float, bounds: tuple[float, float]) -> float:
+        """Log density of parameter i at a value: normal, and zero outside its bounds.
+
+        If the readings tell nothing of the parameter, it is uniform between them.
+        """
+        low, z, high = ((x - float(self.values[i])) / float(self.std[i]) for x in (bounds[0], value, bounds[1]))
+        below, above = (torch.tensor([low, high]) if low + high < 0.0 else torch.tensor([-high, -low])).double()
+        above, below = torch.special.log_ndtr(above), torch.special.log_ndtr(below)
+        mass = float(above + torch.log(-torch.expm1(below - above)))
+        return -0.5 * z * z - math.log(float(self.std[i]) * math.sqrt(2.0 * math.pi)) - mass
+
 
 @dataclass(frozen=True)
 class LocalizedDiscrepancy:
@@ -47,8 +59,9 @@ class LocalizedDiscrepancy:
     gain: in log evidence against the fit alone, without prior odds. log_likelihood: gain in it against the fit alone,
     by this number of parameters. explained: its influence on the readings (S, C); none of a random process.
     predicted (S, C): the readings with it; None of a random process. size: norm of the part of it that no parameter of
-    the fit explains, in units of the sensor noise. frequency: of its sinusoids, Hz, if any. fit, noise: the fit
-    refitted, and the most likely disturbance noise, with the discrepancy. estimate: of the fit's parameters beside it.
+    the fit explains, in units of the sensor noise. selection: its regressors; None of a random process. fit, noise: the
+    fit refitted, and the most likely disturbance noise, with the discrepancy. estimate: of the fit's parameters beside
+    it.
     """
 
     location: str
@@ -58,7 +71,7 @@ class LocalizedDiscrepancy:
     explained: Tensor
     predicted: Tensor | None
     size: float
-    frequency: float | None
+    selection: Selection | None
     fit: Fit
     noise: StateNoise
     estimate: Estimate
@@ -66,7 +79,8 @@ class LocalizedDiscrepancy:
     @property
     def periods(self) -> tuple[float, ...]:
         """Periods of the sinusoids, s."""
-        return () if self.frequency is None else tuple(1.0 / (k * self.frequency) for k in range(1, HARMONICS + 1))
+        frequency = self.selection.frequency if self.selection else None
+        return () if frequency is None else tuple(1.0 / (k * frequency) for k in range(1, HARMONICS + 1))
 
 
 def log_likelihood(fitter: Fitter, fit: Fit, linearised: Linearised) -> float:

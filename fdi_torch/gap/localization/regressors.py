@@ -9,7 +9,9 @@ Times are those of three_tank; `scale` multiplies them for other plants (`plant.
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -22,6 +24,7 @@ DELAYS = (4.0, 8.0, 16.0, 32.0)  # s; neighbours together make a delay between t
 DECAY_TIMES = (10.0, 40.0, 160.0)  # s, of the decay after a step up or down
 BACKLASH_BANDS = (0.03, 0.08, 0.16, 0.3)  # backlash, as shares of the signal's range
 STICTION_BANDS = (0.1, 0.2, 0.3, 0.4)  # as shares of the signal's range
+FINE_STICTION_BANDS = tuple(0.005 * j for j in range(2, 101))  # the output is no continuous function of the band
 TRAVEL_TIMES = (8.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # s, through the full range at the rate limit
 FATIGUE_TIMES = (150.0, 500.0)  # s, of the mean of a flow's recent past that changes it
 RAMPS = 12  # ramps in time, at equal distances
@@ -50,20 +53,29 @@ def lags_and_decays(x: Tensor, step: Tensor, scale: float) -> list[Tensor]:
     return [*lagging, *decays]
 
 
-def backlashes(x: Tensor, ends: tuple[float, float]) -> list[Tensor]:
+def finer(values: Sequence[float], factor: int) -> list[float]:
+    """The values (ascending) and `factor` - 1 at equal ratios between neighbours."""
+    between = [a * (b / a) ** (j / factor) for a, b in itertools.pairwise(values) for j in range(factor)]
+    return [*between, values[-1]]
+
+
+def backlashes(x: Tensor, ends: tuple[float, float], bands: Sequence[float] = BACKLASH_BANDS) -> list[Tensor]:
     """Difference between x after a backlash and x, for each band."""
-    band = x.new_tensor(BACKLASH_BANDS).unsqueeze(1) * (ends[1] - ends[0])
+    band = x.new_tensor(bands).unsqueeze(1) * (ends[1] - ends[0])
     return list((backlash(x, band) - x).unbind())
 
 
-def rate_limits(x: Tensor, step: Tensor, ends: tuple[float, float], scale: float) -> list[Tensor]:
+def rate_limits(
+    x: Tensor, step: Tensor, ends: tuple[float, float], scale: float, times: Sequence[float] = TRAVEL_TIMES
+) -> list[Tensor]:
     """Difference between x after a rate limit and x, for each travel time."""
-    return [rate_limited(x, step, (ends[1] - ends[0]) / (scale * time)) - x for time in TRAVEL_TIMES]
+    return [rate_limited(x, step, (ends[1] - ends[0]) / (scale * time)) - x for time in times]
 
 
-def stictions(x: Tensor, ends: tuple[float, float]) -> list[Tensor]:
+def stictions(x: Tensor, ends: tuple[float, float], bands: Sequence[float] = STICTION_BANDS) -> list[Tensor]:
     """Difference between x after stiction and x, for each band."""
-    return [stiction(x, share * (ends[1] - ends[0])) - x for share in STICTION_BANDS]
+    band = x.new_tensor(bands).unsqueeze(1) * (ends[1] - ends[0])
+    return list((stiction(x, band) - x).unbind())
 
 
 def relay_thresholds(ends: tuple[float, float], count: int) -> Tensor:
@@ -133,13 +145,14 @@ def backlash(x: Tensor, band: Tensor) -> Tensor:
     return torch.minimum(torch.maximum(x[0], low), high)
 
 
-def stiction(x: Tensor, band: float) -> Tensor:
-    """Stiction: the output holds its value until x is more than the band away, then jumps to x."""
-    held, output = float(x[0]), []
-    for value in x.tolist():
-        held = value if abs(value - held) > band else held
+def stiction(x: Tensor, band: Tensor) -> Tensor:
+    """Stiction: the output (B, K) holds its value until x (K,) is more than the band (B, 1) away, then jumps to x."""
+    values, index = torch.unique_consecutive(x, return_inverse=True)
+    held, output = values[0].expand_as(band), []
+    for value in values:
+        held = torch.where((value - held).abs() > band, value, held)
         output.append(held)
-    return x.new_tensor(output)
+    return torch.cat(output, dim=1)[:, index]
 
 
 def relay(x: Tensor, thresholds: Tensor) -> Tensor:
