@@ -97,7 +97,9 @@ def test_a_discrepancy_is_tried_at_other_places_beside_the_same_effects(monkeypa
     search = HypothesisSearch(cast(ExplanationPool, SimpleNamespace()), (), ("T1", "OUT1"))
     explanation = SimpleNamespace()
     at_tank, at_outlet = (
-        cast(CauseHypothesis, SimpleNamespace(weight=weight, explanation=explanation, discrepancy=object()))
+        cast(
+            CauseHypothesis, SimpleNamespace(weight=weight, explanation=explanation, discrepancy=object(), unknown=None)
+        )
         for weight in (3.0, 5.0)
     )
     tried = []
@@ -111,3 +113,38 @@ def test_a_discrepancy_is_tried_at_other_places_beside_the_same_effects(monkeypa
     monkeypatch.setattr(HypothesisSearch, "_with_discrepancies", with_discrepancies)
     assert at_outlet in search._climbed(at_tank)
     assert tried == [(explanation, ("T1", "OUT1"))], "once for each explanation"
+
+
+def test_a_discrepancy_is_tried_at_other_places_beside_the_effect_that_names_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The largest of two causes, a sensor that lags and a pump that stalls, may be taken for both."""
+    lag = frozenset({("sensor_lag", "h1")})
+    alone, lagging, slower = (
+        SimpleNamespace(key=key, log_weight=weight) for key, weight in [(frozenset(), 1.0), (lag, 2.0), (lag, 0.0)]
+    )
+    pool = SimpleNamespace(explanations={0: alone, 1: slower, 2: lagging})
+    search = HypothesisSearch(cast(ExplanationPool, pool), (), ("h1", "Q1"))
+    best, moved = (
+        cast(
+            CauseHypothesis,
+            SimpleNamespace(
+                weight=weight,
+                explanation=explanation,
+                causes=tuple(explanation.key),
+                discrepancy=object(),
+                unknown=SimpleNamespace(location=place),
+                unknown_at=place,
+            ),
+        )
+        for weight, explanation, place in [(3.0, alone, "h1"), (5.0, lagging, "Q1")]
+    )
+
+    def with_discrepancies(self: HypothesisSearch, explanation: object, at: object, best: object) -> list[object]:
+        return [moved] if explanation is lagging else []
+
+    for name in ("_with_fewer_effects", "_with_more_effects"):
+        monkeypatch.setattr(HypothesisSearch, name, lambda self, best: [])
+    monkeypatch.setattr(HypothesisSearch, "_fit_effects_at", lambda self, h, unknown: None)
+    monkeypatch.setattr(HypothesisSearch, "_with_discrepancies", with_discrepancies)
+    assert moved in search._climbed(best)

@@ -96,7 +96,10 @@ def test_a_plant_that_does_not_explain_the_recording_is_said_first(
     assert main([*words, "--picture", "run.svg"]) == NOT_EXPLAINED
     shown = capsys.readouterr().out
     warning = "Unreliable: the model does not explain the recording (residuals 19 times the sensors' noise)"
-    assert shown.startswith(f"{warning}.\n- next: fdi gap tells") and warning[:40] in (folder / "run.svg").read_text()
+    assert (
+        shown.startswith(f"{warning}.\n- next: fdi gap distinguishes")
+        and warning[:40] in (folder / "run.svg").read_text()
+    )
     run = fdi_torch.predict("rig.yaml", "novalve.csv", start_samples=3)
     assert run.headline == f"{warning}; free run of rig along {folder / 'novalve.csv'}"
 

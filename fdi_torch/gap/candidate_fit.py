@@ -23,7 +23,7 @@ from fdi_torch.gap.channel_noise import Noise, low_frequency_excess
 from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.gap.start_choice import Start, likeliest_starts, vector_of
-from fdi_torch.gap.trajectory_problem import CAP, DescentResult, TrajectoryProblem, descend
+from fdi_torch.gap.trajectory_problem import CAP, DescentResult, TrajectoryProblem, descend, first_lowest
 from fdi_torch.parameters import ParameterSpace, common_name, name_in_recording
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
@@ -93,7 +93,7 @@ class Fitter:
         fits: list[Fit] = []
         for free, starts in by_free.items():
             fits.append(self._fit(candidate, free, starts, base, min([target, *(f.cost for f in fits)]), cap, held))
-        return min(fits, key=lambda f: f.cost)
+        return fits[first_lowest(torch.tensor([f.cost for f in fits], dtype=torch.float64))]
 
     def _starts(self, candidate: Candidate, base: Fit | None, target: float) -> list[Start]:
         """The starts of a candidate; of those about the base, only the one with the best prospects."""
@@ -118,7 +118,7 @@ class Fitter:
         initial = base.values if base else self.first_levels()
         theta = torch.stack([vector_of(engine.space, {**initial, **s.values}) for s in starts])
         descents = self.descend(engine, theta, target, cap, held)
-        best = int(torch.nan_to_num(descents.cost, nan=torch.inf).argmin())
+        best = first_lowest(descents.cost)
         lane = slice(best, best + 1)
         linearised = descents.linearised.lanes(torch.tensor([best]))
         trajectory = partial(engine.linearise, descents.theta[lane], linearised.origin)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from fdi_torch.estimate.linear_parameters import decomposed
 from fdi_torch.gap.candidate import Fit
-from fdi_torch.gap.trajectory_problem import Objective, TrajectoryProblem, descend
+from fdi_torch.gap.trajectory_problem import Objective, TrajectoryProblem, descend, first_lowest
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.joint_collocation import JointCollocation
@@ -74,7 +74,7 @@ def likeliest_starts(
     own = theta[:, varied]
     box = torch.where(fixed, own, low[varied]), torch.where(fixed, own, high[varied])
     end = descend(TrajectoryProblem(projected, reduced), own, len(projected.basis), target, decrement=NEAR, box=box)
-    best = int(end.cost.nan_to_num(nan=torch.inf).argmin())
+    best = first_lowest(end.cost)
     change = projected.change(objective.residual(end.linearised.readings[best : best + 1])) * scale[of_shared]
     shares = torch.tensor(SHARES, dtype=theta.dtype)
     tried = theta[best].repeat(len(SHARES), 1)
@@ -83,7 +83,7 @@ def likeliest_starts(
     tried = torch.minimum(torch.maximum(tried, low), high)
     readings = engine.read(engine.trajectories(tried), tried)
     cost = objective.chi_square(engine.space, tried, objective.residual(readings))
-    likeliest = int(cost.nan_to_num(nan=torch.inf).argmin())
+    likeliest = first_lowest(cost)
     values = dict(zip(engine.space.names, tried[likeliest].tolist(), strict=True))
     return [Start(about[best].free, values), *others]
 

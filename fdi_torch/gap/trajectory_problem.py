@@ -22,6 +22,15 @@ CAP = 200  # evaluations, a guard against descents without an end
 BEHIND, SHARE = 30.0, 0.25
 
 
+def first_lowest(cost: Tensor) -> int:
+    """Index of the first of the costs (L,) that exceed the lowest by less than a converged descent may.
+
+    Rounding decides between descents that end at the same cost, as where an effect shows nowhere; their evidence may
+    differ.
+    """
+    return int((cost <= cost.nan_to_num(nan=torch.inf).min() + DECREMENT).nonzero()[0])
+
+
 class Objective(Protocol):
     """Chi-square of a data set, with the priors of the parameters; `candidate_fit.Fitter` is one."""
 
