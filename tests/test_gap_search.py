@@ -20,6 +20,7 @@ from fdi_torch.gap.cause_hypothesis import CauseHypothesis
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.hypothesis_search import HypothesisSearch
+from fdi_torch.gap.trajectory_problem import first_lowest
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
@@ -148,3 +149,10 @@ def test_a_discrepancy_is_tried_at_other_places_beside_the_effect_that_names_it(
     monkeypatch.setattr(HypothesisSearch, "_fit_effects_at", lambda self, h, unknown: None)
     monkeypatch.setattr(HypothesisSearch, "_with_discrepancies", with_discrepancies)
     assert moved in search._climbed(best)
+
+
+def test_of_descents_that_end_at_the_same_cost_the_first_is_taken() -> None:
+    """An effect that shows nowhere has one chi-square at all its values; rounding must not choose among them."""
+    cost = torch.tensor([910.0, math.nan, 899.88 + 2e-12, 899.88, 899.9], dtype=torch.float64)
+    assert first_lowest(cost) == 2
+    assert first_lowest(cost[:2]) == 0 and first_lowest(torch.tensor([math.nan, math.inf, 3.0])) == 2
