@@ -1,4 +1,4 @@
-"""Functions of a signal with a kink or a jump, at many breakpoints, relays with many pairs of thresholds, and others.
+"""Functions of a signal with a kink or a jump, at many breakpoints, relays, and functions of a signal's past.
 
     factor * max(x - c, 0)        factor where x >= c, otherwise 0        factor where a relay of x is on, otherwise 0
 
@@ -68,7 +68,7 @@ class Relays:
 
 @dataclass(frozen=True)
 class Curves:
-    """Functions of time, such as a signal with memory of its past. values (N, K)."""
+    """Functions that depend on the past of a signal, as their values (N, K)."""
 
     values: Tensor
 

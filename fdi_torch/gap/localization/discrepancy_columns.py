@@ -27,8 +27,11 @@ class Columns:
 
 @dataclass(frozen=True)
 class Position:
-    """A regressor between those of the grid. index: among those of its family. choices: number of regressors among
-    which it was selected. thresholds: of a relay that lies between those of its family."""
+    """A regressor that lies between two of the grid.
+
+    family, index: which of `Regressors.fine`, or of the steps in time that follow them, and its number there. choices:
+    number of regressors among which it was selected. thresholds: lower and upper one of a relay that was moved.
+    """
 
     family: int
     index: int
@@ -38,10 +41,10 @@ class Position:
 
 @dataclass(frozen=True)
 class Selection:
-    """The regressors that a discrepancy uses, about whatever trajectory.
+    """Which regressors a discrepancy uses, whatever the trajectory about which the plant is linearised.
 
-    precision (M,): of their priors, infinite for those that are not used. positions: of those between the grid's, which
-    come last. frequency: of the sinusoids, Hz, or None if there are none.
+    precision (M,): of their priors, infinite for those that are not used. positions: of the last regressors, which lie
+    between those of the grid. frequency: of the sinusoids, Hz, or None if there are none.
     """
 
     precision: Tensor
