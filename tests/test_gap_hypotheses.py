@@ -16,7 +16,7 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.cause_hypothesis import CauseHypothesis, causes_in_order
 from fdi_torch.gap.diagnose import recalibrate
 from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
-from fdi_torch.gap.hypothesis_search import HypothesisSearch
+from fdi_torch.gap.hypothesis_weights import HypothesisWeights
 from fdi_torch.gap.localization.localized_discrepancy import Estimate, LocalizedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import log_evidence
 from fdi_torch.gap.problem import PLAIN, problem_of
@@ -56,7 +56,7 @@ def test_the_density_ratio_at_zero_is_the_ratio_of_evidences(sound: tuple[Fitter
     both = fitter.fit(Candidate((GAIN, BIAS), ({"h1.sensor_gain.factor": 1.01, "h3.sensor_bias.bias": 1e-3},)), null)
     pool = cast(ExplanationPool, SimpleNamespace(fitter=fitter, choices=CHOICES))
     h = hypothesis_of(fitter, both)
-    fewer = {r.causes: r.weight for r in HypothesisSearch(pool, (), ("P13",))._without_small_effects(h)}
+    fewer = {r.causes: r.weight for r in HypothesisWeights(pool, (), 1).without_small_effects(h)}
     for placements in [(GAIN,), (BIAS,), ()]:
         start = {k: v for k, v in both.effect_values.items() if any(k.startswith(p.prefix) for p in placements)}
         fit = fitter.fit(Candidate(placements, (start,)), null)
@@ -84,7 +84,7 @@ def test_an_effect_that_the_readings_need_is_not_left_out() -> None:
     fitter, null, _ = recalibrate(problem_of(THREE_TANK, [recording], [], PLAIN).data)
     h = hypothesis_of(fitter, fitter.fit(Candidate((GAIN,), ({"h1.sensor_gain.factor": 1.01},)), null))
     pool = cast(ExplanationPool, SimpleNamespace(fitter=fitter, choices=CHOICES))
-    assert all(r.weight < h.weight - 20.0 for r in HypothesisSearch(pool, (), ("P13",))._without_small_effects(h))
+    assert all(r.weight < h.weight - 20.0 for r in HypothesisWeights(pool, (), 1).without_small_effects(h))
 
 
 @pytest.mark.parametrize("factor", [0.95, 1.05])
