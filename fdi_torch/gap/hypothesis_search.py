@@ -31,7 +31,6 @@ from fdi_torch.gap.localization.localized_discrepancy import (
 from fdi_torch.gap.marginal_likelihood import log_prior, with_disturbances
 from fdi_torch.gap.screening import Option
 from fdi_torch.gap.structure_search import SearchResult
-from fdi_torch.plant.description import PlantDescription
 
 
 class HypothesisSearch:
@@ -48,10 +47,6 @@ class HypothesisSearch:
         self._at_all_places: set[int] = set()
         # Unknowns at whose place the effects of the library were fitted: the causes beside each, and its place.
         self._with_names: set[tuple[frozenset[CauseName], str]] = set()
-
-    @property
-    def plant(self) -> PlantDescription:
-        return self.pool.fitter.data.plant
 
     def search(self, result: SearchResult, named: Sequence[CauseHypothesis]) -> list[CauseHypothesis]:
         """All hypotheses that were examined. named: those without a discrepancy."""
