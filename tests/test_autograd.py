@@ -104,6 +104,24 @@ def test_what_has_no_gradient_refuses_instead_of_losing_it(kind: str) -> None:
     assert not engine.readings(THETA).requires_grad
 
 
+@pytest.mark.parametrize("kind", ["reference", "traced", "compiled"])
+@pytest.mark.parametrize(
+    ("theta", "got"),
+    [
+        ([0.1, 0.1, 0.1, 0.1, 0.1], "got list"),
+        (torch.ones(5, dtype=torch.int64), "got torch.int64 of shape \\(5,\\)"),
+        (torch.ones(2, 6, dtype=torch.float64), "got torch.float64 of shape \\(2, 6\\)"),
+        (torch.tensor(0.1), "got torch.float32 of shape \\(\\)"),
+    ],
+    ids=["list", "whole numbers", "too wide", "scalar"],
+)
+def test_parameters_that_do_not_fit_are_named_with_the_remedy(kind: str, theta: object, got: str) -> None:
+    engine = engine_of(kind)
+    for call in (engine.readings, engine.levels, engine.linearise):
+        with pytest.raises(ValueError, match=f"theta: expected .* {got}; write torch.tensor"):
+            call(theta)
+
+
 def test_the_second_derivative_exists_on_the_reference_engine() -> None:
     theta = THETA[:1].clone().requires_grad_()
     (slope,) = torch.autograd.grad(loss(engine_of("reference", 3).readings(theta)).sum(), theta, create_graph=True)

@@ -83,7 +83,7 @@ class CompiledEngine(EngineText):
         return out
 
     def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
-        if is_differentiated(theta):
+        if is_differentiated(self, theta):
             return readings_with_gradient(self, theta)
         out = self._empty(theta, self._sensors)
         self._run("readings", theta, out)
@@ -184,9 +184,6 @@ class CompiledEngine(EngineText):
                 f"expected theta in float64 or float32 on the CPU, got {theta.dtype} on {theta.device}; "
                 "use the traced engine there"
             )
-        if theta.shape[-1] != len(self.space):
-            columns = f"{len(self.space)} columns ({', '.join(map(str, self.space.names))})"
-            raise ValueError(f"expected theta with {columns}, got {tuple(theta.shape)}")
         return theta.detach().reshape(theta.shape[:-1].numel(), len(self.space)).contiguous()
 
     def _experiment(self, like: Tensor) -> dict[str, Tensor | None]:

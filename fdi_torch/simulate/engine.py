@@ -110,6 +110,23 @@ class EngineText:
         )
 
 
+def expect_columns(engine: EngineText, theta: object) -> None:
+    """Raises ValueError unless theta is a floating-point tensor (*batch, P) with the columns of the engine's space."""
+    names = engine.space.names
+    if isinstance(theta, Tensor):
+        if theta.is_floating_point() and theta.shape[-1:] == (len(names),):
+            return
+        got = f"{theta.dtype} of shape {tuple(theta.shape)}"
+    else:
+        got = type(theta).__name__
+    columns = f"the {len(names)} columns {', '.join(map(str, names))}" if len(names) > 1 else f"the column {names[0]}"
+    example = f"[[{', '.join(['0.1'] * len(names))}]]" if len(names) < 5 else "rows"
+    raise ValueError(
+        f"theta: expected a tensor of floating-point numbers with {columns}, got {got}; "
+        f"write torch.tensor({example}, dtype=torch.float64)"
+    )
+
+
 def expect_problems(theta: Float[Tensor, "*problems N P"], data: Readings) -> None:
     """Raises ValueError if theta (*problems, N, P) and the data have different problem dimensions."""
     problems = data.values.shape[:-2]

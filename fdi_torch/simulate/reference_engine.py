@@ -16,7 +16,7 @@ from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.operating_point import Constants
 from fdi_torch.plant.signals import Clock
-from fdi_torch.simulate.engine import EngineText, Readings, expect_problems, gram_of, moments_of
+from fdi_torch.simulate.engine import EngineText, Readings, expect_columns, expect_problems, gram_of, moments_of
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.forward_mode import ZeroSlopes, directions, stack_with_slope, value_and_slope, with_slope
 from fdi_torch.simulate.gradient import expect_no_gradient
@@ -52,8 +52,9 @@ class ReferenceEngine(EngineText):
 
     def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
         """theta (*batch, P) -> readings (*batch, S, sensors) in SI."""
+        expect_columns(self, theta)
         batch = theta.shape[:-1]
-        lanes = theta.reshape(theta.shape[:-1].numel(), theta.shape[-1])
+        lanes = theta.reshape(batch.numel(), theta.shape[-1])
         if self.method == "rk4":
             result = self._run(lanes)
         else:
@@ -62,6 +63,7 @@ class ReferenceEngine(EngineText):
 
     def levels(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S tanks"]:
         """theta (*batch, P) -> tank levels at the samples (*batch, S, tanks), m."""
+        expect_columns(self, theta)
         lanes = theta.reshape(theta.shape[:-1].numel(), theta.shape[-1])
         states = self._sample(*self._integrate(self.network.bind(self.space, lanes), len(lanes)))
         levels = states[..., : len(self.network.description.tanks)]

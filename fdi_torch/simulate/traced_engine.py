@@ -39,7 +39,7 @@ class TracedEngine(EngineText):
         return self._simulate(theta, tangent=False, levels=True)[0]
 
     def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
-        if is_differentiated(theta):
+        if is_differentiated(self, theta):
             return readings_with_gradient(self, theta)
         return self._simulate(theta, tangent=False)[0]
 
