@@ -35,10 +35,23 @@ BOTH = Answer(
 )
 
 
-@pytest.mark.parametrize(("most_closed", "warned"), [(-0.1, True), (0.1, False)])
-def test_the_verdict_says_that_causes_make_the_holdout_worse(most_closed: float, warned: bool) -> None:
-    said = verdict_sentence(replace(BOTH, closure={"closed": -0.5, "closed_ci95": [-0.9, most_closed]}).to_dict())
-    assert said.endswith("On the hold-out, these causes make the prediction worse: do not adopt them.") is warned
+@pytest.mark.parametrize(
+    ("closed", "most_closed", "warning"),
+    [
+        (-0.5, -0.1, "Do not adopt these causes: they make the prediction of the hold-out worse. The gap comes"),
+        (-0.5, 0.1, "These causes do not close the gap of the hold-out. The gap comes"),
+        (0.5, 0.9, "The gap comes"),
+        (None, None, "The gap comes"),
+    ],
+)
+def test_causes_that_do_not_carry_over_to_the_holdout_are_said_first(
+    closed: float | None, most_closed: float | None, warning: str
+) -> None:
+    interval = None if most_closed is None else [-0.9, most_closed]
+    answer = replace(BOTH, closure={"closed": closed, "closed_ci95": interval})
+    assert verdict_sentence(answer.to_dict()).startswith(warning)
+    promised = any("no longer take the gap for a fault" in s for s in next_steps(answer, True, None, None, "new.yaml"))
+    assert promised is warning.startswith("The gap")
 
 
 def test_the_terminal_prints_the_unknown_and_the_named_causes(capsys: pytest.CaptureFixture[str]) -> None:

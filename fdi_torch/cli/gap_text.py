@@ -14,6 +14,7 @@ from fdi_torch.gap.verdict_words import (
     cause_words,
     causes_of,
     explanation_words,
+    holdout_warning,
     probability_words,
     rounds,
     verdict_sentence,
@@ -82,7 +83,12 @@ def next_steps(
             "--named-only reports the best named effect instead of `unknown`, which helps if several things are "
             "wrong at once; --adopt can then write it, and the next diagnosis continues from there"
         )
-    if any(c.effect != UNKNOWN and not rounds(c.effect) for c in answer.causes):
+    if holdout_warning(answer.to_dict()):
+        steps.append(
+            "compare dimensions and constants of the plant file with the rig, calibrate it with a fault-free recording "
+            "(fdi refit --adopt), and repeat the diagnosis before you adopt anything"
+        )
+    elif any(c.effect != UNKNOWN and not rounds(c.effect) for c in answer.causes):
         benefit = "train and monitor no longer take the gap for a fault"
         written = f"with {adopted} as their plant, {benefit}" if adopted else ""
         steps.append(f"{written or f'--adopt FILE writes the plant file with the causes; with it {benefit}'}")

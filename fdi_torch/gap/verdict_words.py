@@ -75,17 +75,21 @@ def verdict_sentence(answer: Named, best: str = "") -> str:
 
     best: the likeliest explanation in words, for example with sizes; by default without.
     """
-    sentences = _verdict(answer, best), _holdout_words(answer), rounding_words(answer.get("causes") or [])
+    sentences = holdout_warning(answer), _verdict(answer, best), rounding_words(answer.get("causes") or [])
     return " ".join(filter(None, sentences))
 
 
-def _holdout_words(answer: Named) -> str:
-    """A warning if the causes surely make the prediction of a hold-out worse."""
+def holdout_warning(answer: Named) -> str:
+    """A sentence if the error of a hold-out grows with the causes; empty otherwise."""
     closure = answer.get("closure")
-    interval = closure.get("closed_ci95") if isinstance(closure, Mapping) else None
+    if not isinstance(closure, Mapping):
+        return ""
+    interval = closure.get("closed_ci95")
     most = interval[-1] if isinstance(interval, list | tuple) and interval else None
-    worse = isinstance(most, int | float) and most < 0.0
-    return "On the hold-out, these causes make the prediction worse: do not adopt them." if worse else ""
+    if isinstance(most, int | float) and most < 0.0:
+        return "Do not adopt these causes: they make the prediction of the hold-out worse."
+    closed = closure.get("closed")
+    return "These causes do not close the gap of the hold-out." if isinstance(closed, int | float) and closed < 0 else ""
 
 
 def _verdict(answer: Named, best: str) -> str:
