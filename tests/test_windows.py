@@ -100,6 +100,29 @@ def test_a_leak_that_opens_halfway_is_in_the_windows_after_it(tmp_path: Path) ->
     assert found.log.is_file()
 
 
+def test_levels_at_rest_do_not_tell_four_faults_apart(tmp_path: Path) -> None:
+    """Three levels at rest are three equations: a leak of T1 and wider pipes explain them as well as no fault."""
+    rest = {
+        "plant": "three_tank",
+        "seed": 2,  # with this noise the best size of the leak is 0, the end of its range
+        "simulate": {
+            "inputs": {"Q1": "50 cm^3/s", "Q2": "40 cm^3/s"},
+            "duration": "400 s",
+            "noise": {"std": {"h1": "1 mm", "h2": "1 mm", "h3": "1 mm"}},
+            "start_levels": {"T1": "47.74 cm", "T2": "29.58 cm", "T3": "38.48 cm"},
+        },
+        "estimate": {
+            "parameters": ["T1.leak", "P13.plugging", "P32.plugging", "OUT2.plugging"],
+            "calibrate": [],
+            "windows": "400 s",
+        },
+        "output": {"folder": str(tmp_path)},
+    }
+    found = fit_windows(build_run(rest, tmp_path, "rest.yaml"))
+    (window,) = found.windows
+    assert window.faults[0].size == 0.0 and all(f.std > 0.08 for f in window.faults) and not found.stretches
+
+
 def test_a_sensor_without_noise_counts_as_off_by_a_share_of_its_span_in_whatever_unit() -> None:
     """The same still levels read in metres and in volts (10 V over 0.5 m): the noise scales with the reading."""
     tank = {"tanks": {"T": {"area": "100 cm^2", "height": "50 cm"}}, "sensors": {"h": {"tank": "T"}}}

@@ -144,7 +144,8 @@ def window_of(fitting: Fitting, std: Float[Tensor, " C"], suspects: Collection[s
     theta = refined.theta[best]
     residual = (data.values - engine.readings(theta.unsqueeze(0))[0]) * data.weight / std
     misfit = float(torch.sqrt((residual**2).sum() / data.weight.sum()))
-    errors = certainty(refined.curvature[best], held=refined.held[best]).std * max(1.0, misfit)
+    # A fault whose estimate is its bound is not known exactly: another one may grow with it at the same misfit.
+    errors = certainty(refined.curvature[best]).std * max(1.0, misfit)
     levels = torch.stack([_mean_level(fitting, tank.name, data) for tank in fitting.plant.tanks])
     channels = recording.inputs[:, [recording.input_names.index(c) for c in fitting.plant.channels()]].mean(dim=0)
     faults = []
