@@ -16,12 +16,8 @@ def show_windows(fit: WindowedFit, screen: Screen) -> None:
     """Print one line per window and per period. Sizes without a unit are relative, flows hold at the mean levels."""
     names = [_name(fault) for fault in fit.windows[0].faults] if fit.windows else []
     rows = [[f"{w.start:g}", f"{w.stop:g}", *(_cell(fault) for fault in w.faults)] for w in fit.windows]
-    screen.table(
-        "windows (?: not determined, for example with levels at rest or an empty tank)",
-        ["from, s", "to, s", *names],
-        rows,
-        left=0,
-    )
+    title = "windows (?: not determined, for example with levels at rest or an empty tank)"
+    screen.table(title, ["from, s", "to, s", *names], rows, left=0)
     screen.say()
     rows, (flow_unit, flow_scale) = [], display_unit("m^3/s")
     for s in fit.stretches:
