@@ -89,7 +89,8 @@ def holdout_warning(answer: Named) -> str:
     if isinstance(most, int | float) and most < 0.0:
         return "Do not adopt these causes: they make the prediction of the hold-out worse."
     closed = closure.get("closed")
-    return "These causes do not close the gap of the hold-out." if isinstance(closed, int | float) and closed < 0 else ""
+    fails = isinstance(closed, int | float) and closed < 0.0
+    return "These causes do not close the gap of the hold-out." if fails else ""
 
 
 def _verdict(answer: Named, best: str) -> str:
