@@ -164,6 +164,6 @@ def keep_memory() -> bool:
 
 
 def release_memory() -> None:
-    """Return freed memory to the system: what one stage of a diagnosis needs is no measure of the next."""
+    """Return freed memory to the system, because later stages of a diagnosis may need less."""
     with suppress(AttributeError, OSError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)

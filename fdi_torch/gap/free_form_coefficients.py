@@ -44,7 +44,7 @@ def coefficients_of(
     reach: OperatingRange,
     returned: Sequence[Placement] = (),
 ) -> Coefficients:
-    """Coefficients of free forms, fitted to the residual of a fit plus the influence of its causes `returned`.
+    """Coefficients of free forms, fitted to the residual that a fit has without its causes `returned`.
 
     The amplitude of the coefficients' normal prior maximises the evidence.
     """

@@ -136,7 +136,7 @@ def _log_evidence(terms: Tensor, rounding: float) -> float:
 def _regression(sums: Tensor, rounding: float) -> tuple[Tensor, Tensor, Tensor]:
     """Eigenvalues (2) and eigenvectors (2, 2) of the information of b, and b - 1 (2), by sums (GROUPS, SUMS, 3).
 
-    In steady state without noise, the sums differ by rounding only, and their scatter is no measure of their errors;
+    In steady state without noise, the sums differ by rounding only, and their scatter does not measure their errors;
     each counts as uncertain by `rounding`, m^3, at least. Whether a direction is determined is asked of flows scaled to
     their root mean square, so that the answer does not depend on units; the smaller eigenvalue is then the determinant
     divided by the larger one.

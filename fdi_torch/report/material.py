@@ -136,7 +136,7 @@ class Material:
 
     @property
     def clock_zeros(self) -> list[float | None]:
-        """Time 0 of each recording as its clock showed it, s since 1970; None for a clock without dates."""
+        """Date and time of time 0 of each recording by its clock, s since 1970; None for a clock without dates."""
         about = self.about("data")
         numbers = [key.removesuffix(".path") for key in about if key.endswith(".path")]
         zeros = [_clock_zero(about.get(f"{k}.began")) for k in numbers]
@@ -152,7 +152,7 @@ class Material:
 
 
 def _clock_zero(began: str | None) -> float | None:
-    """The stamp of a log's metadata as its own clock shows it, s since 1970; None without one."""
+    """Begin of a recording in its own time zone, s since 1970; None if it has no date."""
     try:
         return None if began is None else sum(of_stamp(began))
     except ValueError:

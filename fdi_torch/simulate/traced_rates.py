@@ -149,7 +149,7 @@ def traced_rates(network: TankNetwork, names: Sequence[str]) -> TracedRates:
 
 
 class _Structure:
-    """A network with all that its equations depend on, by which it is compared."""
+    """A network as the key of a cache: two are equal if all that their equations depend on is equal."""
 
     def __init__(self, key: tuple[object, ...], network: TankNetwork) -> None:
         self.key, self.network = key, network

@@ -181,7 +181,7 @@ def _starts(plant: PlantDescription, measured: Mapping[str, float]) -> list[dict
 class LeftOutRun:
     """A free run along one recording from start to stop (s): root mean square errors by sensor (SI).
 
-    as_is: of the plant as it is. refitted: of the plant fitted to all files but that of this recording.
+    as_is: of the plant file as given. refitted: of the plant fitted to all files but that of this recording.
     """
 
     source: str
@@ -200,8 +200,8 @@ def leave_one_file_out(
     progress: Callable[[float, str], None] = lambda share, text: None,
     settle: float | None = None,
 ) -> list[LeftOutRun]:
-    """Predict each trial by the plant as it is, and by the plant that `fit` returns for the recordings of all other
-    files.
+    """Predict each trial by the plant file as given, and by the plant that `fit` returns for the recordings of
+    all other files.
 
     Files are identified by the hash of their contents. settle: as in `predict`, s. Raises ValueError if no recording
     would be left to fit.

@@ -1,10 +1,10 @@
 """The decision whether a recording has a fault, such as a wrong unit or a clock offset.
 
-    P(fault) = sum of the weights of all faults / (that sum + weights of the recording as it is)
+    P(fault) = sum of the weights of all faults / (that sum + weights of the unchanged recording)
 
-The recording as it is competes without an effect and with one or two effects of the library, so that an unusual plant
-does not pass for a wrong recording. A fault is reported if P(fault) exceeds 95 %. Single effects are fitted before any
-fault: with most deviations of a plant, one of them leaves no room for a fault.
+The unchanged recording is explained without an effect and with one or two effects of the library, so that an unusual
+plant is not mistaken for a wrong recording. A fault is reported if P(fault) exceeds 95 %. Single effects are fitted
+first, because in most recordings one of them explains the gap so well that no fault need be tried.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def recording_fault(
 def _weighed(suspected: Sequence[Suspicion], base: float, rival: float) -> list[WeightedFault]:
     """The fitted faults, without those that cannot be relevant against the likeliest fault or the likeliest rival.
 
-    base: log-likelihood of the recording as it is. A fit may gain more than its first-order estimate, by the largest
+    base: log-likelihood of the unchanged recording. A fit may gain more than its first-order estimate, by the largest
     factor among all faults that were fitted so far.
     """
     faults: list[WeightedFault] = []

@@ -9,7 +9,7 @@ Another, commands that move faster than their samples, shows in the readings alo
 A hypothesis undoes its fault in the recording; only the clock offset has a parameter to fit. Its weight is the
 log-likelihood of the corrected recording (`blockwise_likelihood.py`) plus the log prior. A hypothesis is fitted only if
 its gain in log-likelihood, to first order in the constants, exceeds the cost of its prior.
-`recording_fault_decision.py` compares the weights with those of the recording as it is.
+`recording_fault_decision.py` compares the weights with those of the unchanged recording.
 """
 
 from __future__ import annotations
