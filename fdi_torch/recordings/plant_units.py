@@ -1,12 +1,12 @@
 """Units that are wrong for a whole kind of number: all areas, all flows, all levels, or the area of a tank.
 
 A correction divides these numbers by the ratio of the unit in which they were written to another usual unit. The volume
-balance of the tanks (`volume_balance.py`) gives the likelihood of the recording under the unchanged plant file and under each
-correction, and Bayes' theorem their probabilities. The corrections that together have the probability CONFIDENCE are
-named, unless the unchanged file is among them. A recording without metered flows has no absolute scale: a valve that
-hardly opens looks like tanks that are too small.
+balance of the tanks (`volume_balance.py`) gives the likelihood of the recording under the unchanged plant file and
+under each correction, and Bayes' theorem their probabilities. The corrections that together have the probability
+CONFIDENCE are named, unless the unchanged file is among them. A recording without metered flows has no absolute scale:
+a valve that hardly opens looks like tanks that are too small.
 
-An unusual plant does not pass for a wrong unit: a leak or a plugged pipe changes a coefficient of the balance by some
+An unusual plant is not mistaken for a wrong unit: a leak or a plugged pipe changes a coefficient of the balance by some
 factor, but rarely by one that is close to the ratio of two units. What has one channel alone is left to
 `gap.preprocess.channel_assignment`, where effects of the plant compete.
 """
