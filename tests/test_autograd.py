@@ -63,10 +63,11 @@ def differences(function: Callable[[Tensor], Tensor], theta: Tensor) -> Tensor:
 @pytest.mark.parametrize("kind", ["reference", "adaptive", "traced", "compiled", "own traced", "own compiled"])
 def test_gradients_equal_differences(kind: str) -> None:
     engine = engine_of(kind, 4 if kind == "adaptive" else 13)
-    theta = THETA.clone().requires_grad_()
+    at = THETA[:1] if kind == "adaptive" else THETA  # the adaptive solver runs lane by lane
+    theta = at.clone().requires_grad_()
     (slope,) = torch.autograd.grad(loss(engine.readings(theta)).sum(), theta)
     with torch.no_grad():
-        wanted = differences(lambda t: loss(engine.readings(t)), THETA)
+        wanted = differences(lambda t: loss(engine.readings(t)), at)
     # Four samples see nothing of one of the parameters: its slope is a rounding error of the others' 1e-3 to 1e3.
     scale = wanted.abs().amax(dim=0).clamp(min=1e-12)
     assert float(((slope - wanted).abs() / scale).max()) < 1e-6

@@ -305,22 +305,21 @@ def test_every_effect_survives_every_engine(name: str) -> None:
     theta = torch.where(own, anywhere, space.nominal()).reshape(-1, len(space))
     theta = torch.cat([theta, space.nominal().expand(1, -1)])
     reference = ReferenceEngine(network, space, e)
-    truth = reference.readings(theta)
+    nearby = theta * (1.0 + 1e-15)
+    truth, nearly = reference.readings(torch.stack([theta, nearby])).unbind()
     compiled, traced = CompiledEngine(network, space, e), TracedEngine(network, space, e)
 
     def error(readings: Tensor) -> Tensor:
         return ((readings - truth).abs() / truth.abs().amax((1, 2), keepdim=True)).amax((1, 2))
 
     # a lane that chatters at its rim magnifies the last bit: the reference itself does, when theta moves by one
-    tame = error(reference.readings(theta * (1.0 + 1e-15))) < 1e-12
+    tame = error(nearly) < 1e-12
     assert float(tame.double().mean()) > 0.9
     for engine in (compiled, traced):
         wrong = torch.where(tame, error(engine.readings(theta)), 0.0)
         assert float(wrong.max()) < 1e-10, placed[int(wrong.argmax()) % len(placed)].prefix
-    nearby = theta[tame] * (1.0 + 1e-15)
-    jacobian, other, moved = (
-        engine.linearise(at)[1] for engine, at in ((compiled, theta[tame]), (traced, theta[tame]), (traced, nearby))
-    )
+    jacobian = compiled.linearise(theta[tame])[1]
+    other, moved = traced.linearise(torch.stack([theta[tame], nearby[tame]]))[1].unbind()
     assert torch.equal(torch.isfinite(jacobian), torch.isfinite(other))
     scale = other.nan_to_num(posinf=0.0, neginf=0.0).abs().amax((0, 1, 2)) + 1e-300
     # at a kink the last bit decides on which side the slope is taken
