@@ -223,6 +223,26 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
     assert cli.main(["new", "run", "--recording", "trend.csv"]) != cli.DONE
 
 
+def test_a_recording_with_a_row_per_value_is_mapped_by_tags(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fdi("new", "plant", "--out", "rig.yaml", "--quiet")
+    levels = {"FIC1": 20, "LI101": 155, "LI102": 153}
+    rows = [f"{tag};{k};{value + k % 3};Good" for k in range(60) for tag, value in levels.items()]
+    Path("long.csv").write_text("\n".join(["Tag Name;t_s;Value;Quality", *rows]) + "\n")
+    assert cli.main(["new", "plant", "--recording", "long.csv", "--out", "b.yaml"]) == cli.MISUSE
+    assert "let fdi check --plant FILE --recording" in capsys.readouterr().err
+    assert cli.main(["check", "--plant", "rig.yaml", "--recording", "long.csv"]) == cli.MISUSE
+    lines = capsys.readouterr().err.partition("recordings:\n")[2]
+    assert "    tags: {tag: Tag Name, value: Value, quality: Quality}" in lines
+    for name, column, unit in (("Q", "FIC1", "l/min"), ("hA", "LI101", "mm"), ("hB", "LI102", "mm")):
+        lines = lines.replace(f"{name}: {{column: TAG, unit: ...}}", f"{name}: {{column: {column}, unit: {unit}}}")
+    Path("runs.yaml").write_text("recordings:\n" + lines)
+    fdi("check", "--plant", "rig.yaml", "--recording", "runs.yaml")
+    assert "long.csv: 60 samples" in capsys.readouterr().out
+
+
 def test_a_recording_without_a_header_is_mapped_by_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -143,7 +143,8 @@ def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()
     """Lines for a recording file, to be completed, that map the channels without a column of their name in the table.
 
     Each is mapped to the next column with a unit of its kind, if there is one. A file whose rows have more cells than
-    its first line has no header: its columns are numbered. Empty if no channel lacks a column.
+    its first line has no header: its columns are numbered. A file with a row per value is mapped by its tags. Empty if
+    no channel lacks a column.
     """
     kinds, missing = _units(plant), _missing(path, plant, also_known)
     if not missing:
@@ -152,6 +153,12 @@ def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()
     if width > len(header):
         lines = ["header: false", f"columns:    # by number, 1 to {width}", "  t: {column: 1, unit: s}"]
         return [*lines, *(f"  {name}: {{column: ..., unit: ...}}" for name in missing)]
+    names = {column.lower().replace(" ", ""): column for column in header}
+    tag = next((names[word] for word in ("tag", "tagname", "point", "variable") if word in names), None)
+    if tag and "value" in names:
+        quality = f", quality: {names['quality']}" if "quality" in names else ""
+        lines = [f"tags: {{tag: {tag}, value: {names['value']}{quality}}}    # one row per value", "columns:"]
+        return [*lines, *(f"  {name}: {{column: TAG, unit: ...}}" for name in missing)]
     found = {column: si_unit_of(pair[1]) for column in header if (pair := header_unit(column)) and pair[0] not in kinds}
     lines = ["columns:    # units only where the header has none"]
     for name in missing:

@@ -70,7 +70,8 @@ def plant_from_recording(path: Path, name: str) -> str:
     if not sensors:
         raise ValueError(
             f"{path}: expected a column of a level with its unit in the header, such as LT-101 (cm), got "
-            f"{', '.join(named)}; add units to the header, or map the columns to the plant of fdi new plant"
+            f"{', '.join(named)}; add units to the header, or describe the plant with fdi new plant, then let "
+            f"fdi check --plant FILE --recording {path} print the lines that map the columns"
         )
     tanks = [f"T{k + 1}" for k in range(len(sensors))] if len(sensors) > 26 else list(ascii_uppercase[: len(sensors)])
     pipes = [(f"{a}_{b}", a, b) for a, b in pairwise(tanks)] + [("outlet", tanks[-1], OUTSIDE)]
