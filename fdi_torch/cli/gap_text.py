@@ -13,6 +13,7 @@ from fdi_torch.gap.answer import UNKNOWN, Answer
 from fdi_torch.gap.verdict_words import (
     cause_words,
     causes_of,
+    closed_sentence,
     explanation_words,
     holdout_warning,
     probability_words,
@@ -155,14 +156,7 @@ def _closure(closure: Mapping[str, Any], screen: Screen) -> None:
     files = ", ".join(Path(source).name for source in closure["holdouts"])
     header = sensors if len(set(closure["units"].values())) == 1 else [f"{s}, {closure['units'][s]}" for s in sensors]
     screen.table(f"error of free runs on {files}, {closure['unit']}", ("plant", "all", *header), rows)
-    if closure["closed"] is None:
-        screen.say("The hold-out's gap is too small, compared with its standard error, to say how much of it closes.")
-    elif closure["closed"] < 0.0:
-        screen.say("The gap does not close on data not used for fitting: the causes do not carry over to them.")
-    else:
-        low, high = closure["closed_ci95"]
-        between = f"95 % interval {100 * low:.1f} to {100 * high:.1f} %"
-        screen.say(f"{100 * closure['closed']:.1f} % of the gap closes on data not used for fitting ({between}).")
+    screen.say(closed_sentence(closure))
     for one in closure.get("per_holdout", []):
         closed = "undefined" if one["closed"] is None else f"{100 * one['closed']:.1f} %"
         screen.say(

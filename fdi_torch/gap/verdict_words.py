@@ -93,6 +93,21 @@ def holdout_warning(answer: Named) -> str:
     return "These causes do not close the gap of the hold-out." if fails else ""
 
 
+def closed_sentence(closure: Named) -> str:
+    """How much of the gap that recalibration leaves on the hold-outs the causes close."""
+    closed, interval = closure.get("closed"), closure.get("closed_ci95")
+    if not isinstance(closed, int | float):
+        return (
+            "After recalibration, too little of the hold-out's gap is left, compared with its standard error, to say "
+            "how much of it the causes close."
+        )
+    if closed < 0.0:
+        return "The gap does not close on data not used for fitting: the causes do not carry over to them."
+    known = isinstance(interval, list | tuple) and all(isinstance(end, int | float) for end in interval)
+    between = " to ".join(f"{100.0 * end:.1f}" for end in interval) if known else "unknown"
+    return f"{100.0 * closed:.1f} % of the gap closes on data not used for fitting (95 % interval {between} %)."
+
+
 def _verdict(answer: Named, best: str) -> str:
     verdict = answer.get("verdict", "")
     first: Named = next(iter(answer.get("posterior") or []), {})

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import Any
 
+from fdi_torch.gap.verdict_words import closed_sentence
 from fdi_torch.report.html import table
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, axis, number, percent, shown_unit, with_error
@@ -34,7 +35,7 @@ def closure_section(material: Material) -> Section | None:
     texts = [f"{number(v, 3)} {unit}".rstrip() for v in values]
     label = axis("free-run error on hold-outs (rms)", unit)
     figure = bar_panel("", label, names, values, texts, [name == "augmented" for name in stages])
-    return Section("How far it closes", [_closed(closure), [Picture("gap_closure", figure)]], lead=True)
+    return Section("How far it closes", [closed_sentence(closure), [Picture("gap_closure", figure)]], lead=True)
 
 
 def errors_section(material: Material) -> Section | None:
@@ -87,20 +88,6 @@ def constants_section(material: Material) -> Section | None:
         header, rows = header[:-1], [row[:-1] for row in rows]
     words = "Constants with a tolerance are always refitted; a value far outside it compensates for a model error."
     return Section("Calibration constants", [words, table(header, rows)])
-
-
-def _closed(closure: Mapping[str, Any]) -> str:
-    share, interval = closure.get("closed"), list(closure.get("closed_ci95") or [])
-    if isinstance(share, int | float) and share < 0.0:
-        return "The gap does not close on data not used for fitting: the causes do not carry over to them."
-    if not isinstance(share, int | float):
-        return "The closed share of the gap is undefined: the gap is too small compared with its standard error."
-    between = f" (95 % interval {percent(interval[0])} to {percent(interval[1])})" if _is_interval(interval) else ""
-    return f"{percent(share)} of the gap is closed on data not used for fitting{between}."
-
-
-def _is_interval(interval: Any) -> bool:
-    return len(interval) == 2 and all(isinstance(end, int | float) for end in interval)
 
 
 def _headed(closure: Mapping[str, Any]) -> list[str]:
