@@ -78,18 +78,20 @@ class Screen:
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> None:
         """Print a table whose first `left` columns are left-aligned; not with JSON.
 
-        On a narrow terminal words are folded and numbers stay whole; elsewhere lines are not folded.
+        A column whose cells are all empty is left out. On a narrow terminal words are folded and numbers stay whole;
+        elsewhere lines are not folded.
         """
         if self.json:
             return
         if title:
             self.say(title)
         table = Table(box=None, pad_edge=False, header_style="bold")
-        for i, name in enumerate(header):
-            is_word = i < left
-            table.add_column(_shown(name), justify="left" if is_word else "right", overflow="fold", no_wrap=not is_word)
+        filled = [i for i in range(len(header)) if not rows or any(row[i] for row in rows)]
+        for i in filled:
+            word = i < left
+            table.add_column(_shown(header[i]), justify="left" if word else "right", overflow="fold", no_wrap=not word)
         for row in rows:
-            table.add_row(*map(_shown, row))
+            table.add_row(*(_shown(row[i]) for i in filled))
         self._out.print(table, soft_wrap=False)
 
     def result(self, data: Any) -> None:

@@ -48,17 +48,18 @@ def join(parts: Sequence[Any], between: str = "") -> Markup:
 def table(header: Sequence[Any], rows: Sequence[Sequence[Any]], left: int = 1, most: int = MOST_ROWS) -> Markup:
     """A table whose first `left` columns are left-aligned; very long tables are cut, with a note.
 
+    A column whose cells are all empty is left out.
     A table of more than NARROW columns is `wide`: on a phone its rows become cards, each cell with its `data-label`.
     """
     labels = [_TAGS.sub("", name) if isinstance(name, Markup) else clean(name) for name in header]
     sides = ["l" if i < left else "r" for i in range(len(header))]
-    head = tag("tr", *(tag("th", name, class_=side) for name, side in zip(header, sides, strict=True)))
+    filled = [i for i in range(len(header)) if not rows or any(row[i] != "" for row in rows)]
+    head = tag("tr", *(tag("th", header[i], class_=sides[i]) for i in filled))
     shown = [
-        tag("tr", *(tag("td", c, class_=s, data_label=n) for c, s, n in zip(row, sides, labels, strict=True)))
-        for row in rows[:most]
+        tag("tr", *(tag("td", row[i], class_=sides[i], data_label=labels[i]) for i in filled)) for row in rows[:most]
     ]
     cut = [] if len(rows) <= most else [tag("p", f"and {len(rows) - most} more rows", class_="note")]
-    width = {"class_": "wide"} if len(header) > NARROW else {}
+    width = {"class_": "wide"} if len(filled) > NARROW else {}
     return join([tag("div", tag("table", tag("thead", head), tag("tbody", *shown), **width), class_="scroll"), *cut])
 
 

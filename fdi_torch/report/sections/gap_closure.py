@@ -84,8 +84,6 @@ def constants_section(material: Material) -> Section | None:
     if not rows:
         return None
     header = ["constant", "nominal", "recalibrated", "tolerances off", "with the cause", "tolerances off", "unit"]
-    if not any(row[-1] for row in rows):
-        header, rows = header[:-1], [row[:-1] for row in rows]
     words = "Constants with a tolerance are always refitted; a value far outside it compensates for a model error."
     return Section("Calibration constants", [words, table(header, rows)])
 
