@@ -17,8 +17,8 @@ from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of, with_simulated_levels
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
+from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import Experiment, divided, lay_out
-from fdi_torch.simulate.reference_engine import ReferenceEngine
 from tests.rigs import constant_inputs, three_tank
 from tests.test_gap import nominal_plant, recorded
 
@@ -78,7 +78,7 @@ def test_steps_in_which_a_level_moves_fast_are_divided() -> None:
     blank, network = constant_inputs(plant, 200.0, sample=1.0), build_network(plant, [notch])
     space = ParameterSpace([network.constants["P13.discharge_coefficient"]])
     theta = space.nominal().unsqueeze(0)
-    exact = ReferenceEngine(network, space, lay_out(blank, plant.channels(), 0.02)).readings(theta)[0]
+    exact = make_engine(network, space, lay_out(blank, plant.channels(), 0.02)).readings(theta)[0]
     std = 1e-3  # m
     noise = std * torch.randn(exact.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     data = with_accurate_steps(data_set_of(plant, (), replace(blank, outputs=exact + noise, mask=None), 1.0))
@@ -114,7 +114,7 @@ def test_steps_are_accurate_for_a_tank_that_exchanges_its_water_fast() -> None:
     network = build_network(plant, [])
     space = ParameterSpace([network.constants["P13.discharge_coefficient"]])
     theta = space.nominal().unsqueeze(0)
-    exact = ReferenceEngine(network, space, lay_out(recording, plant.channels(), 0.02)).readings(theta)[0]
+    exact = make_engine(network, space, lay_out(recording, plant.channels(), 0.02)).readings(theta)[0]
     std = 2e-4  # m
     noise = std * torch.randn(exact.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     data = data_set_of(plant, (), replace(recording, outputs=exact + noise, mask=None), 1.0)
@@ -139,7 +139,7 @@ def test_a_sound_rig_with_a_small_tank_has_no_gap() -> None:
     recording, network = recorded({}, 7, samples=1200), build_network(plant, [])
     space = ParameterSpace([network.constants["P13.discharge_coefficient"]])
     fine = lay_out(recording, plant.channels(), 0.02)
-    exact = ReferenceEngine(network, space, fine).readings(space.nominal().unsqueeze(0))[0]
+    exact = make_engine(network, space, fine).readings(space.nominal().unsqueeze(0))[0]
     noise = 3e-4 * torch.randn(exact.shape, generator=torch.Generator().manual_seed(8), dtype=torch.float64)
     library = ("pump_gain", "pump_lag", "laminar_flow", "leak", "sensor_bias", "flow_exponent")
     found = diagnose(plant, replace(recording, outputs=exact + noise, mask=None), settings=Settings(library=library))
