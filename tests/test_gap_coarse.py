@@ -59,16 +59,18 @@ def test_samples_far_apart_are_simulated_in_shorter_steps() -> None:
     assert steps == pytest.approx([1.0, 2.5, 2.5, 2.4], abs=1e-12)
 
 
-@pytest.mark.parametrize("every", [1, 2])
-def test_the_error_of_a_step_follows_from_third_differences(every: int) -> None:
-    """Samples `every` steps apart, of a cubic: h = 0.1 + 2e-4 t^3, so that dt^3 h''' / 24 = 5e-5 dt^3."""
-    blank = constant_inputs(nominal_plant(), 8.0, sample=every)
+@pytest.mark.parametrize(("sample", "step"), [(1.0, 1.0), (2.0, 0.5)])
+def test_the_error_of_a_step_follows_from_third_differences(sample: float, step: float) -> None:
+    """Samples of a cubic: h = 0.1 + 2e-4 t^3, so that dt^3 h''' / 24 = 5e-5 dt^3."""
+    blank = constant_inputs(nominal_plant(), 8.0, sample=sample)
     cubic = (0.1 + 2e-4 * blank.time**3).unsqueeze(1).expand(-1, 3)
     flat = torch.full_like(cubic, 0.1)
     noise = torch.tensor([1e-3, 1e-3, 2e-3], dtype=torch.float64)
     for readings, error in ((torch.stack([flat[:, 0], flat[:, 1], cubic[:, 2]], dim=1), 5e-5 / 2e-3), (flat, 0.0)):
-        part = data_set_of(nominal_plant(), (), replace(blank, outputs=readings, mask=None), 1.0).parts[0]
-        assert errors_by_readings(part, noise).tolist() == pytest.approx([error] * len(part.experiment.steps), abs=1e-9)
+        part = data_set_of(nominal_plant(), (), replace(blank, outputs=readings, mask=None), step).parts[0]
+        assert errors_by_readings(part, noise).tolist() == pytest.approx(
+            [step**3 * error] * len(part.experiment.steps), abs=1e-9
+        )
 
 
 def test_steps_in_which_a_level_moves_fast_are_divided() -> None:
