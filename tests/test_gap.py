@@ -211,7 +211,7 @@ def test_the_answer_follows_the_protocol() -> None:
     assert set(found["disturbances"]) == {"T1", "T2", "T3"}
 
 
-def test_the_library_offers_62_effects_at_places_of_the_three_tanks() -> None:
+def test_the_library_offers_65_effects_at_places_of_the_three_tanks() -> None:
     assert len(library_of(nominal_plant(), STANDARD)) == 65
     assert canonical(("plugging", "OUT2"), nominal_plant()) == ("leak", "T2")
 

@@ -213,8 +213,10 @@ def test_a_plant_without_tolerances_is_reported() -> None:
 
 
 def test_a_plant_file_with_an_effect_outside_its_range_is_reported() -> None:
-    slow = replace(nominal_plant(), effects=(PlacedEffect("pump_lag", "Q1", {"time_constant": 400.0}),))
-    answer = diagnose(slow, recorded(LAMINAR, 3, samples=300), settings=Settings(("leak",)))
+    lag = {"time_constant": 400.0}
+    slow = replace(nominal_plant(), effects=(PlacedEffect("pump_lag", "Q1", lag),))
+    recording = recorded({f"Q1.pump_lag.{name}": value for name, value in lag.items()}, 3, samples=300)
+    answer = diagnose(slow, recording, settings=Settings(("leak",)))
     assert any("Q1.pump_lag.time_constant at 400 s, outside its sensible range" in r for r in answer.remarks)
 
 
