@@ -159,6 +159,7 @@ def test_a_rig_in_code_from_simulation_to_report(tmp_path: Path) -> None:
     assert abs(estimate_of - 0.3) < 4.0 * error_of < 0.2
     assert found.headline.startswith("single fault: leak at A (size 0.") and "A.leak.size" in repr(found)
     assert "<table>" in found._repr_html_()
+    assert repr(found.estimate).startswith("Estimate: converged\nparameter") and "A.leak.size" in repr(found.estimate)
     # 200 cm^2 x 60 cm are 12 l, which leave in 2 A sqrt(H) / (0.6 * 0.5e-4 * sqrt(2 g)) = 233.17 s
     assert "<td>A</td><td>12</td><td>233.1" in RIG._repr_html_()
     for html in (found._repr_html_(), RIG._repr_html_(), fdi_torch.predict(RIG, recording)._repr_html_()):
@@ -296,6 +297,8 @@ def test_an_effect_without_a_field_means_its_size() -> None:
     assert fitting.space.names == ("A.leak.size", "Q.gain")
     with pytest.raises(ValueError, match=r"got 'A.heigt'; the nearest is 'A.height'"):
         fdi_torch.set_up(RIG, [simulated()], ["A.heigt"])
+    with pytest.raises(ValueError, match=r"parameters: expected .* got 'A.leek'; the nearest is 'A.leak'"):
+        fdi_torch.set_up(RIG, [simulated()], ["A.leek"])
 
 
 def test_an_initial_level_that_is_free_needs_no_mention() -> None:

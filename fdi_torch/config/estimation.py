@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field
 
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity
-from fdi_torch.effects import all_placements, build_network, full_name, placements_for
+from fdi_torch.effects import all_placements, build_network, full_name, placements_for, unknown_parameter
 from fdi_torch.estimate.evolution_settings import STRATEGIES, EvolutionSettings
 from fdi_torch.names import shortened, unknown
 from fdi_torch.parameters import Parameter, ParameterSpace
@@ -127,7 +127,7 @@ def names_in_full(names: Iterable[str], plant: PlantDescription, field: str) -> 
         raise ConfigError([f"{field}: {error}"]) from error
     for name, name_in_full in zip(short, full, strict=True):
         if name_in_full not in constants:
-            raise ConfigError([f"{field}: {_unknown_parameter(name, constants, plant)}"])
+            raise ConfigError([f"{field}: {unknown_parameter(name, constants, plant)}"])
     return full
 
 
@@ -161,7 +161,7 @@ def _chosen(
     config: ParameterConfig, place: str, name: str, constants: ParameterSpace, plant: PlantDescription
 ) -> Parameter:
     if name not in constants:
-        raise ConfigError([f"{place}: {_unknown_parameter(name, constants, plant)}"])
+        raise ConfigError([f"{place}: {unknown_parameter(name, constants, plant)}"])
     unit = constants[name].unit
     try:
         given = {field: getattr(config, field) for field in ("nominal", "low", "high", "std")}
@@ -180,20 +180,9 @@ def _calibrated(
     for pattern in config.calibrate:
         matched = [name for name in constants.names if fnmatchcase(name, pattern)]
         if not matched:
-            raise ConfigError([f"estimate.calibrate: {_unknown_parameter(pattern, constants, plant)}"])
+            raise ConfigError([f"estimate.calibrate: {unknown_parameter(pattern, constants, plant)}"])
         names += [name for name in matched if name not in names]
     return names
-
-
-def _unknown_parameter(name: str, constants: ParameterSpace, plant: PlantDescription) -> str:
-    faults = [p.prefix for p in all_placements(plant)]
-    prefix = name.rpartition(".")[0]
-    fields = [known for known in constants.names if known.startswith(f"{prefix}.")]
-    if prefix in faults and fields:
-        return f"expected {' or '.join(fields)}, got '{shortened(name)}'; the size is {fields[0]}"
-    candidates = (*constants.names, *faults)
-    sentence = unknown("a parameter of the plant or its faults", name, candidates)
-    return sentence.replace(f" ({', '.join(candidates)})", "")
 
 
 def parameter_values(values: dict[str, Amount], constants: ParameterSpace, plant: PlantDescription) -> dict[str, float]:
@@ -202,7 +191,7 @@ def parameter_values(values: dict[str, Amount], constants: ParameterSpace, plant
     for given, value in values.items():
         name = full_name(given, plant)
         if name not in constants:
-            raise ConfigError([f"simulate.faults: {_unknown_parameter(name, constants, plant)}"])
+            raise ConfigError([f"simulate.faults: {unknown_parameter(name, constants, plant)}"])
         try:
             si[name] = quantity(value, constants[name].unit)
         except ValueError as error:

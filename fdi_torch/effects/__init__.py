@@ -8,7 +8,8 @@ from difflib import get_close_matches
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from fdi_torch.parameters import ParameterName
+from fdi_torch.names import shortened, unknown
+from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.description import PlantDescription, with_tolerances
 from fdi_torch.plant.effect import Effect, Placement, fits, place_kind, place_kinds_of
 
@@ -129,6 +130,18 @@ def full_name(name: str, plant: PlantDescription) -> str:
     if at.field or at.effect not in {e.name for e in EFFECTS}:
         return name
     return str(at.sibling(effect_at(at.effect, at.place, plant).parameters(at.place, plant)[0].name))
+
+
+def unknown_parameter(name: str, constants: ParameterSpace, plant: PlantDescription) -> str:
+    """The message for a name that is neither a constant of the plant nor a parameter of an effect."""
+    effects = [p.prefix for p in all_placements(plant)]
+    prefix = name.rpartition(".")[0]
+    fields = [known for known in constants.names if known.startswith(f"{prefix}.")]
+    if prefix in effects and fields:
+        return f"expected {' or '.join(fields)}, got '{shortened(name)}'; the size is {fields[0]}"
+    candidates = (*constants.names, *effects)
+    sentence = unknown("a parameter of the plant or its faults", name, candidates)
+    return sentence.replace(f" ({', '.join(candidates)})", "")
 
 
 def placements_for(names: Iterable[str]) -> tuple[Placement, ...]:

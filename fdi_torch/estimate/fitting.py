@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from fdi_torch.device import on_its_device, tensors_on
-from fdi_torch.effects import build_network, full_name, placements_for
+from fdi_torch.effects import build_network, full_name, placements_for, unknown_parameter
 from fdi_torch.estimate.objectives import Objective, Problem, Term
+from fdi_torch.names import counted
 from fdi_torch.parameters import Parameter, ParameterSpace, name_in_recording
 from fdi_torch.plant.description import PlantDescription, Tank
 from fdi_torch.plant.effect import Stage
@@ -61,9 +62,8 @@ class Fitting:
     engine: EngineKind = "auto"
 
     def __repr__(self) -> str:
-        return (
-            f"Fitting of {self.plant.name} to {len(self.recordings)} recordings; the columns of theta are\n{self.space}"
-        )
+        recordings = counted(len(self.recordings), "recording")
+        return f"Fitting of {self.plant.name} to {recordings}; the columns of theta are\n{self.space}"
 
     @property
     def plant(self) -> PlantDescription:
@@ -179,6 +179,9 @@ def set_up(
     with tensors_on(recordings[0].time.device):
         placements = placements_for(names)
         reference = build_network(plant, placements)
+        for p in requested:
+            if isinstance(p, str) and p not in reference.constants:
+                raise ValueError(f"parameters: {unknown_parameter(p, reference.constants, plant)}")
         common = [reference.constants[p] if isinstance(p, str) else p for p in requested]
         networks, own_spaces, columns, joint = [], [], [], list(common)
         starts = start if isinstance(start, Sequence) and not isinstance(start, str) else [start] * len(recordings)

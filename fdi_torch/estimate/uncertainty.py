@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from fdi_torch.estimate.combinations import Combination, undetermined_groups
 from fdi_torch.estimate.information import certainty
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.quantities import quantity_text
+from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
 
 if TYPE_CHECKING:
     from fdi_torch.estimate.posterior_draws import Draws
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
 _AT_BOUND, AT_END = 1e-9, 1e-3
 
 
-@dataclass(frozen=True)
-class Estimate:
+@dataclass(frozen=True, repr=False)
+class Estimate(Shown):
     """Estimate of one set of parameters, SI units.
 
     std (P,): standard errors, which include the tolerances of plant constants through their priors; infinite for
@@ -48,6 +49,19 @@ class Estimate:
     noise_std: torch.Tensor | None = None
     reached: Mapping[str, Any] = field(default_factory=dict)
     draws: Draws | None = field(default=None, repr=False)
+
+    @property
+    def headline(self) -> str:
+        """Whether the estimate has converged."""
+        return self.warning or self.status.replace("_", " ")
+
+    @in_its_units
+    def table(self) -> Table:
+        """One row per parameter, in its unit for display."""
+        columns = [c.tolist() for c in (self.value, self.std, *self.interval())]
+        by_parameter = zip(self.names, self.units, *columns, strict=True)
+        rows = [(name, *in_display_unit(name, unit, *numbers)) for name, unit, *numbers in by_parameter]
+        return Table.of_rows(["parameter", "unit", "estimate", "std error", "95 % low", "95 % high"], rows)
 
     @property
     def warning(self) -> str:
@@ -81,7 +95,8 @@ class Estimate:
         The covariance is flattened row by row; `covariance_shape` holds its shape.
         """
         separate = ("covariance", "draws", "combinations")
-        plain = {name: plain_value(value, name) for name, value in vars(self).items() if name not in separate}
+        names = [f.name for f in fields(self) if f.name not in separate]
+        plain = {name: plain_value(getattr(self, name), name) for name in names}
         flat = plain_value(self.covariance.flatten(), "covariance")
         shape = list(self.covariance.shape)
         combinations = [combination.to_dict() for combination in self.combinations]

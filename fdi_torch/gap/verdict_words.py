@@ -103,8 +103,8 @@ def closed_sentence(closure: Named) -> str:
         )
     if closed < 0.0:
         return "The gap does not close on data not used for fitting: the causes do not carry over to them."
-    known = isinstance(interval, list | tuple) and all(isinstance(end, int | float) for end in interval)
-    between = " to ".join(f"{100.0 * end:.1f}" for end in interval) if known else "unknown"
+    ends = interval if isinstance(interval, list | tuple) else ()
+    between = " to ".join(f"{100.0 * end:.1f}" for end in ends if isinstance(end, int | float))
     return f"{100.0 * closed:.1f} % of the gap closes on data not used for fitting (95 % interval {between} %)."
 
 

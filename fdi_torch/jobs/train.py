@@ -19,6 +19,7 @@ from fdi_torch.estimate.hybrid_settings import HybridSettings
 from fdi_torch.estimate.levenberg_marquardt import Progress
 from fdi_torch.estimate.posterior_draws import Draws
 from fdi_torch.estimate.profile import Profile
+from fdi_torch.estimate.uncertainty import Estimate
 from fdi_torch.jobs.estimate_uncertainty import profiled_names, profiles_of, with_draws
 from fdi_torch.jobs.log_paths import RESUMES, free_path, unfinished_search
 from fdi_torch.jobs.logged_recordings import log_prediction, log_recording
@@ -52,24 +53,28 @@ class TrainResult(Shown):
     profiles: tuple[Profile, ...] = ()
 
     @property
+    def estimate(self) -> Estimate:
+        """Values, standard errors and covariance of the parameters."""
+        return self.result.estimate
+
+    @property
     @in_its_units
     def headline(self) -> str:
         """The diagnosis in one sentence; it begins with a warning if the model does not explain the recording."""
-        warning = self.result.estimate.warning
+        warning = self.estimate.warning
         return f"{warning}. {self.result.diagnosis.headline}" if warning else self.result.diagnosis.headline
 
     @in_its_units
     def table(self) -> Table:
         """One row per parameter, in its unit for display."""
-        final = self.result.estimate
-        names = ["parameter", "unit", "estimate", "std error", "95 % low", "95 % high", "nominal"]
-        columns = [c.tolist() for c in (final.value, final.std, *final.interval(), self.fitting.space.nominal())]
+        columns = {"nominal": self.fitting.space.nominal().tolist()}
         if self.truth:
-            names.append("simulated")
-            columns.append([self.truth.get(p.name, math.nan) for p in self.fitting.space])
-        by_parameter = zip(self.fitting.space, *columns, strict=True)
-        rows = [(p.name, *in_display_unit(p.name, p.unit, *numbers)) for p, *numbers in by_parameter]
-        return Table.of_rows(names, rows)
+            columns["simulated"] = [self.truth.get(p.name, math.nan) for p in self.fitting.space]
+        shown = {
+            name: [in_display_unit(p.name, p.unit, v)[1] for p, v in zip(self.fitting.space, values, strict=True)]
+            for name, values in columns.items()
+        }
+        return Table({**self.estimate.table().columns, **shown})
 
     @in_its_units
     def picture(self) -> str:
