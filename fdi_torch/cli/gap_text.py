@@ -188,9 +188,9 @@ def _tolerances_off(constant: Mapping[str, Any], stage: str) -> float:
     return float(abs(constant[stage] - constant["nominal"]) / constant["tolerance"])
 
 
-def _confusability(impostors: Mapping[str, Any] | None) -> list[str]:
+def _confusability(confusability: Mapping[str, Any] | None) -> list[str]:
     """How often another cause would have been given this name under these inputs."""
-    simulated = impostors.get("simulated") if impostors else None
+    simulated = confusability.get("simulated") if confusability else None
     if not simulated:
         return []
     confused, passed, draws = simulated["confused"], simulated["passed"], simulated["draws"]

@@ -67,7 +67,7 @@ class SearchState:
         return torch.where(torch.isfinite(cost), cost, torch.inf).to(self.cost.dtype)
 
     def with_progress_counters(self, settings: EvolutionSettings) -> Self:
-        """The state with `scale`, `anchor` and `waited` of its sorted costs."""
+        """The state after a generation; `waited` counts those since the last improvement of the best cost."""
         best, median = self.cost[..., 0], self.cost[..., self.cost.shape[-1] // 2]
         difference = torch.where(torch.isfinite(median), median - best, 0.0)
         scale = torch.maximum(self.scale, difference)

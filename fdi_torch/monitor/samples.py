@@ -94,8 +94,10 @@ class Restart:
 
 @dataclass(frozen=True)
 class ClockState:
-    """Clock of the samples processed so far. last: time of the last one, s. unknown_since: when an input became
-    unknown, s. unread (sensors,): samples since the last reading of each sensor. restart: the one that is to come.
+    """Clock of the samples processed so far.
+
+    last: time of the last one, s. unknown_since: when an input became unknown, s. unread (sensors,): samples since the
+    last reading of each sensor. restart: the next one; None if none is due.
     """
 
     last: float

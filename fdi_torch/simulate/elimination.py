@@ -96,7 +96,7 @@ def eliminate(size: int, pattern: Sequence[tuple[int, int]]) -> Elimination:
 def _neighbours(
     size: int, entries: dict[tuple[int, int], int], orient: Callable[[tuple[int, int]], tuple[int, int]]
 ) -> list[set[int]]:
-    """The columns of the entries in each row. orient: maps each entry; exchanged, it gives the rows in each column."""
+    """The columns of the entries in each row; if `orient` exchanges row and column, the rows in each column."""
     columns: list[set[int]] = [set() for _ in range(size)]
     for row, column in map(orient, entries):
         columns[row].add(column)

@@ -129,7 +129,7 @@ class Ascent:
         """The discrepancy about a fit beside it, with the levels that are predicted from the readings of right sensors.
 
         explained: part of the readings (S, C) that the discrepancy explains. selection: the regressors from which the
-        regression starts. From nothing, it would use a hundred where little noise is left.
+        regression starts. Without any, it would select a hundred where little noise is left.
         """
         data, right = self.fitter.data, Fitter(self.fitter.data, self.fitter.noise)
         if any(s.name == place for s in data.plant.sensors):

@@ -92,7 +92,7 @@ def fatigues(x: Tensor, step: Tensor, ends: tuple[float, float], scale: float) -
 
 
 def step_functions(most: int, samples: int, recordings: int) -> int:
-    """Number of step functions of time in each recording. most: in all recordings, of so many samples, together."""
+    """Number of step functions of time in each recording. most, samples: of all recordings together."""
     return max(min(most, samples // SAMPLES_A_STEP) // recordings, 2)
 
 

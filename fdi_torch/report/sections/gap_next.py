@@ -38,8 +38,8 @@ def next_input_section(material: Material) -> Section | None:
 def limits_section(material: Material) -> Section | None:
     """Effects that these inputs hide or confuse, and how often another cause would have got this name."""
     excitation = material.answer.get("excitation") or {}
-    impostors = material.answer.get("impostors") or {}
-    blocks: list[Any] = [*_confusability_words(impostors)]
+    confusability = material.answer.get("impostors") or {}
+    blocks: list[Any] = [*_confusability_words(confusability)]
     hidden = [explanation_words([cause]) for cause in excitation.get("hidden") or []]
     pairs = [" and ".join(explanation_words([c]) for c in p["between"]) for p in excitation.get("inseparable") or []]
     small = "Effects that these inputs do not show at their typical size"
@@ -61,15 +61,15 @@ def _next_words(proposal: Mapping[str, Any]) -> str:
     return f"{words} They are expected to be distinguishable after {number(float(when))} s{count}."
 
 
-def _confusability_words(impostors: Mapping[str, Any]) -> list[str]:
+def _confusability_words(confusability: Mapping[str, Any]) -> list[str]:
     sentences = []
-    best, unexplained = impostors.get("best"), impostors.get("left_open")
+    best, unexplained = confusability.get("best"), confusability.get("left_open")
     if best and isinstance(unexplained, int | float):
         sentences.append(
             f"If the library had lacked the cause, the best explanation would have been {explanation_words(best)}, "
             f"with {percent(unexplained)} of the gap unexplained."
         )
-    simulated = impostors.get("simulated")
+    simulated = confusability.get("simulated")
     if isinstance(simulated, dict):
         passed_for = [explanation_words([c]) for c in simulated.get("passed_for") or []]
         mostly = f", mostly for {', '.join(passed_for[:3])}" if passed_for else ""
