@@ -78,10 +78,6 @@ class RowBuffer:
         self._held: dict[int, tuple[float, float]] = {}
         self._count, self._reported = 0, 1
 
-    @property
-    def tags(self) -> list[str]:
-        return list(self._places)
-
     def put(self, value: Value, now: float) -> None:
         """Add a value that arrived at `now`, s of any monotonic clock."""
         if not math.isfinite(value.stamp):

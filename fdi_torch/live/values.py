@@ -81,11 +81,6 @@ class BackOff:
         self.first, self.longest = first, longest
         self._next = first
 
-    @property
-    def fresh(self) -> bool:
-        """Whether no attempt has failed since the last success."""
-        return self._next == self.first
-
     def failed(self) -> float:
         """The time to wait before the next attempt."""
         wait, self._next = self._next, min(2.0 * self._next, self.longest)

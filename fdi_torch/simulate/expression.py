@@ -80,13 +80,6 @@ class Graph:
             varies |= self.nodes[a].varies
         return self._intern(Node(operation, tuple(arguments), varies))
 
-    def total(self, terms: Iterable[int]) -> int | None:
-        """The sum of the nodes, or None for no nodes."""
-        result = None
-        for term in terms:
-            result = term if result is None else self.apply("add", result, term)
-        return result
-
     def reach(self, outputs: Iterable[int], stop: Iterable[int] = ()) -> list[int]:
         """All nodes on which the outputs depend, in order; arguments of the nodes in `stop` are not followed."""
         ends = set(stop)
