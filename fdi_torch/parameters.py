@@ -153,9 +153,6 @@ class ParameterSpace:
     def __contains__(self, name: str) -> bool:
         return name in self._index
 
-    def __add__(self, other: ParameterSpace) -> ParameterSpace:
-        return ParameterSpace(self.parameters + other.parameters)
-
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(p.name for p in self.parameters)
