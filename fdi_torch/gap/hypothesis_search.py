@@ -51,7 +51,7 @@ class HypothesisSearch:
     def search(self, result: SearchResult, named: Sequence[CauseHypothesis]) -> list[CauseHypothesis]:
         """All hypotheses that were examined. named: those without a discrepancy."""
         hypotheses = list(named)
-        for explanation in {e.key: e for e in (likeliest(named).explanation, result.null)}.values():
+        for explanation in {e.key: e for e in (result.null, likeliest(named).explanation)}.values():
             hypotheses += self._everywhere(explanation, likeliest(hypotheses))
         hypotheses = self._after_fits_at_unknowns(hypotheses)
         trials = self._climbed(likeliest(hypotheses))

@@ -171,11 +171,12 @@ def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyMo
     has_valve = component.input_channel is not None
 
     def signals(trajectory: Forcing) -> Signals:
-        here = {"root": _root(trajectory.heads[name]), "flow": trajectory.flows[name]}
+        head = trajectory.heads[name]
+        here = {"head": head, "root": _root(head), "flow": trajectory.flows[name]}
         return here | ({"opening": trajectory.commands[_actuator(plant, name)]} if has_valve else {})
 
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        regressors = [*ends.hinges(s, "root", 16), *lags_and_decays(s["flow"], step, scale)]
+        regressors = [*ends.hinges(s, "root", 16), *ends.hinges(s, "head", 12), *lags_and_decays(s["flow"], step, scale)]
         regressors += [s["flow"] * j for j in ends.steps_in_value(s, "root", 24)]
         regressors += [s["flow"] * on for _, on in ends.relays(s, "root")]
         if has_valve:
@@ -186,7 +187,8 @@ def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyMo
     def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
         of_opening = [ends.kinks(s, "opening", 9, s["root"])] if has_valve else []
         jumps, relays = ends.jumps(s, "root", 24, s["flow"]), ends.fine_relays(s, "root", s["flow"])
-        return [ends.kinks(s, "root", 16), jumps, relays, ends.fine_backlashes(s, "flow"), *of_opening]
+        kinks = [ends.kinks(s, "root", 16), ends.kinks(s, "head", 12)]
+        return [*kinks, jumps, relays, ends.fine_backlashes(s, "flow"), *of_opening]
 
     return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
 

@@ -76,7 +76,6 @@ def localize(
         return Localization((), itself)
     ascent = Ascent(fitter, fit, noise, base)
     starts = [likely, nearly_without_disturbances(likely)]
-    starts += [replace(rival, wander=None, apart=None)] if rival else []
     first_order = _first_order_gains(regression, starts, fit, places, base)
     evaluated: dict[str, LocalizedDiscrepancy] = {}
     growth, examined = -math.inf, 0  # growth: largest ratio so far of what a first-order gain lacks to that gain
@@ -84,9 +83,6 @@ def localize(
         if examined >= CALIBRATION_PLACES and first.expected + growth * first.gain < needed:
             continue
         best = ascent.under_less_and_less_noise(regression, place, likely)
-        if first.noise is not likely:
-            other = ascent.evaluate(regression, regression.of(place), place, first.noise)
-            best = max(best, ascent.with_finer_positions(other), key=gain_of)
         best = ascent.climbed(best, needed)
         examined += 1
         growth = max(growth, (best.gain - first.expected) / max(first.gain, 1.0))
@@ -96,30 +92,9 @@ def localize(
         largest = float(best.explained.square().mean(dim=0).max().sqrt())
         if selected and not is_rounding_error(fitter, place, largest):
             needed, evaluated[place] = max(needed, best.gain + math.log(RARE)), best.localized(fitter)
-    evaluated = _under_the_noise_of_the_likeliest(ascent, evaluated, needed)
     processes = [*drifting_sensors(regression, likely, places, base, needed)]
     processes += random_flows(regression, likely, places, base, needed)
     return Localization(_likeliest_of_each_place([*evaluated.values(), *processes]), itself)
-
-
-def _under_the_noise_of_the_likeliest(
-    ascent: Ascent, evaluated: dict[str, LocalizedDiscrepancy], needed: float
-) -> dict[str, LocalizedDiscrepancy]:
-    """The discrepancies, each also evaluated under the noise that the likeliest one left.
-
-    A larger noise hides what another place explains as well.
-    """
-    best_of = dict(evaluated)
-    before = needed - CONVERGED  # nothing is compared about an irrelevant discrepancy
-    while best_of and (likeliest := max(best_of.values(), key=gain_of)).gain - before > CONVERGED:
-        before = likeliest.gain
-        for place, earlier in best_of.items():
-            if earlier is not likeliest:
-                assert earlier.selection is not None
-                about = ascent.about(earlier.fit, earlier.explained, likeliest.noise, place, earlier.selection)
-                climbed = ascent.climbed(ascent.with_finer_positions(about), needed)
-                best_of[place] = max(earlier, climbed.localized(ascent.fitter), key=gain_of)
-    return best_of
 
 
 def _likeliest_of_each_place(discrepancies: Sequence[LocalizedDiscrepancy]) -> tuple[LocalizedDiscrepancy, ...]:

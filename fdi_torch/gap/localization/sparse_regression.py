@@ -7,7 +7,8 @@ residual r, columns C, G = C'C, b = C'r and noise of unit variance,
 
 over the columns that are used, each of which has a cost (`column_costs`). Their difference is maximised one column at a
 time: the column whose addition, removal or re-estimation gains most is changed until nothing gains (Tipping and Faul,
-2003, "Fast marginal likelihood maximisation for sparse Bayesian models").
+2003, "Fast marginal likelihood maximisation for sparse Bayesian models"). Then a column in use is exchanged for another
+if that gains: of two nearly equal columns, the one that was added first is not always the one that suits the others.
 """
 
 from __future__ import annotations
@@ -70,19 +71,41 @@ def sparse_fit(gram: Tensor, score: Tensor, costs: Tensor, start: Tensor | None 
     if start is not None:
         known = slice(len(start))
         precision[known] = torch.where(visible[known], start / size[known].square(), math.inf)
+    costs = torch.where(visible, costs, math.inf)
+    precision = _ascended(unit, target, precision, costs)
+    while (better := _exchanged(unit, target, precision, costs)) is not None:
+        precision = better
+    posterior = _Posterior.of(unit, target, precision)
+    evidence, reduction = posterior.evidence(target, precision, costs), posterior.reduction(target)
+    return SparseFit(evidence, reduction, posterior.mean / size, precision * size.square())
+
+
+def _ascended(unit: Tensor, target: Tensor, precision: Tensor, costs: Tensor) -> Tensor:
+    """The precisions after all single changes that gain."""
+    precision = precision.clone()
     for _ in range(MOST_CHANGES if len(target) else 0):
         gain, updated = _changes(unit, target, precision, costs)
-        gain = torch.where(visible, gain, -math.inf)
         best = int(gain.argmax())
         if not float(gain[best]) > CONVERGED:
             break
         precision[best] = updated[best]
+    return precision
+
+
+def _exchanged(unit: Tensor, target: Tensor, precision: Tensor, costs: Tensor) -> Tensor | None:
+    """The precisions after the first exchange of a column in use that gains, and what follows; None if none does."""
+    least = _Posterior.of(unit, target, precision).evidence(target, precision, costs) + CONVERGED
     used = torch.isfinite(precision)
-    posterior = _Posterior.of(unit, target, precision)
-    reduction = 0.5 * float(target @ posterior.mean)
-    evidence = reduction - posterior.half_log_det
-    evidence += 0.5 * float(torch.log(precision[used]).sum()) - float(costs[used].sum())
-    return SparseFit(evidence, reduction, posterior.mean / size, precision * size.square())
+    for j in used.nonzero().flatten().tolist():
+        trial = precision.clone()
+        trial[j] = math.inf
+        gain, updated = _changes(unit, target, trial, costs)
+        best = int(torch.where(used, -math.inf, gain).argmax())
+        trial[best] = updated[best]
+        trial = _ascended(unit, target, trial, costs)
+        if _Posterior.of(unit, target, trial).evidence(target, trial, costs) > least:
+            return trial
+    return None
 
 
 def _changes(unit: Tensor, target: Tensor, precision: Tensor, costs: Tensor) -> tuple[Tensor, Tensor]:
@@ -119,6 +142,16 @@ class _Posterior:
     mean: Tensor
     sparsity: Tensor
     half_log_det: float
+
+    def reduction(self, target: Tensor) -> float:
+        """Reduction of half of chi-square, b'S b / 2."""
+        return 0.5 * float(target @ self.mean)
+
+    def evidence(self, target: Tensor, precision: Tensor, costs: Tensor) -> float:
+        """Log evidence less the costs."""
+        used = torch.isfinite(precision)
+        volume = 0.5 * float(torch.log(precision[used]).sum()) - self.half_log_det
+        return self.reduction(target) + volume - float(costs[used].sum())
 
     @staticmethod
     def of(unit: Tensor, target: Tensor, precision: Tensor) -> _Posterior:
