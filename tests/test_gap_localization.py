@@ -124,6 +124,19 @@ def test_the_evidence_is_the_largest_of_all_subsets_with_their_best_precisions()
         assert fit.evidence == pytest.approx(best, abs=0.02)
 
 
+@pytest.mark.parametrize(("slope", "knee"), [(10.0, 0.62), (10.0, 0.81), (20.0, 0.43)])
+def test_two_functions_of_one_variable_are_not_given_up_for_more_of_a_similar_one(slope: float, knee: float) -> None:
+    """A law in x, among functions of x and of its root: the evidence is that of the best of all pairs, or more."""
+    x = torch.linspace(0.05, 1.0, 400, dtype=torch.float64)
+    columns = torch.stack([f for v in (x.sqrt(), x) for f in hinges(v, (float(v[0]), float(v[-1])), 6)], dim=1)
+    readings = slope * ((x - x[0]) - (x - knee).clamp(min=0.0))
+    gram, score = columns.T @ columns, columns.T @ readings
+    costs = column_costs(torch.full((len(score),), len(score)).double(), 1e4)
+    pairs = map(list, combinations(range(len(score)), 2))
+    best = max(sparse_fit(gram[pair][:, pair], score[pair], costs[pair]).evidence for pair in pairs)
+    assert sparse_fit(gram, score, costs).evidence > best - 0.02
+
+
 @pytest.fixture(scope="module")
 def far_from_the_plant() -> tuple[Fitter, Fit, StateNoise]:
     """A recording that the recalibrated plant explains badly: its fitter, its fit, and the most likely noise."""
