@@ -20,7 +20,6 @@ from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_ascent import STEPS, Ascent, gain_of
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
-from fdi_torch.gap.localization.fine_positions import CONVERGED
 from fdi_torch.gap.localization.localized_discrepancy import (
     LocalizedDiscrepancy,
     is_rounding_error,
