@@ -176,11 +176,8 @@ def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyMo
         return here | ({"opening": trajectory.commands[_actuator(plant, name)]} if has_valve else {})
 
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        regressors = [
-            *ends.hinges(s, "root", 16),
-            *ends.hinges(s, "head", 12),
-            *lags_and_decays(s["flow"], step, scale),
-        ]
+        regressors = [*ends.hinges(s, "root", 16), *ends.hinges(s, "head", 12)]
+        regressors += lags_and_decays(s["flow"], step, scale)
         regressors += [s["flow"] * j for j in ends.steps_in_value(s, "root", 24)]
         regressors += [s["flow"] * on for _, on in ends.relays(s, "root")]
         if has_valve:
