@@ -134,7 +134,7 @@ def test_two_functions_of_one_variable_are_not_given_up_for_more_of_a_similar_on
     costs = column_costs(torch.full((len(score),), len(score)).double(), 1e4)
     pairs = map(list, combinations(range(len(score)), 2))
     best = max(sparse_fit(gram[pair][:, pair], score[pair], costs[pair]).evidence for pair in pairs)
-    assert sparse_fit(gram, score, costs).evidence > best - 0.02
+    assert sparse_fit(gram, score, costs, exchanges=True).evidence > best - 0.02
 
 
 @pytest.fixture(scope="module")

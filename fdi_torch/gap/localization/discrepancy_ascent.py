@@ -105,6 +105,7 @@ class Ascent:
         place: str,
         noise: StateNoise,
         start: Tensor | None = None,
+        exchanges: bool = False,
     ) -> EvaluatedDiscrepancy:
         """The discrepancy under one noise.
 
@@ -119,7 +120,8 @@ class Ascent:
             positions = Positions(regression, place, under, discrepancy, nothing, self.generator)
             discrepancy = positions.best(discrepancy, nothing) or discrepancy
         whitened = WhitenedDiscrepancy(under, fit, discrepancy)
-        regressed = whitened.sparse_fit(column_costs(discrepancy.choices, self.largest), start)
+        costs = column_costs(discrepancy.choices, self.largest)
+        regressed = whitened.sparse_fit(costs, start, exchanges=exchanges)
         without = log_likelihood(under, fit, discrepancy.linearised) + noise.log_prior() - self.base
         return EvaluatedDiscrepancy(place, noise, under, regression, discrepancy, whitened, regressed, without)
 
@@ -201,7 +203,9 @@ class Ascent:
         coefficients = LinearParameters(at.columns[used], torch.sqrt(current.regressed.precision[used]))
         fit = current.regression.fit
         likely = estimate_disturbances(self.fitter, fit, at.linearised, coefficients, current.noise, climb).noise
-        return self.evaluate(current.regression, at, current.location, likely, current.regressed.precision)
+        return self.evaluate(
+            current.regression, at, current.location, likely, current.regressed.precision, exchanges=True
+        )
 
     def _refitted(self, current: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
         """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew.

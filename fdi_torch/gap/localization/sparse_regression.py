@@ -59,10 +59,13 @@ def column_costs(choices: Tensor, largest: float) -> Tensor:
     return torch.log(choices) + math.log(max(math.log(largest) / math.sqrt(math.pi), 1.0))
 
 
-def sparse_fit(gram: Tensor, score: Tensor, costs: Tensor, start: Tensor | None = None) -> SparseFit:
+def sparse_fit(
+    gram: Tensor, score: Tensor, costs: Tensor, start: Tensor | None = None, *, exchanges: bool = False
+) -> SparseFit:
     """Solve the regression with gram (M, M) = C'C and score (M,) = C'r.
 
-    costs (M,): of using each column. start: precisions of the first columns from which the ascent starts.
+    costs (M,): of using each column. start: precisions of the first columns from which the ascent starts. exchanges:
+    whether columns are exchanged, which takes long if many are in use.
     """
     size = torch.diagonal(gram).clamp(min=0.0)
     visible, size = size > VISIBLE, torch.sqrt(size.clamp(min=VISIBLE))
@@ -73,7 +76,7 @@ def sparse_fit(gram: Tensor, score: Tensor, costs: Tensor, start: Tensor | None 
         precision[known] = torch.where(visible[known], start / size[known].square(), math.inf)
     costs = torch.where(visible, costs, math.inf)
     precision = _ascended(unit, target, precision, costs)
-    while (better := _exchanged(unit, target, precision, costs)) is not None:
+    while exchanges and (better := _exchanged(unit, target, precision, costs)) is not None:
         precision = better
     posterior = _Posterior.of(unit, target, precision)
     evidence, reduction = posterior.evidence(target, precision, costs), posterior.reduction(target)

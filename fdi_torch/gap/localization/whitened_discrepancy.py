@@ -84,11 +84,11 @@ class WhitenedDiscrepancy:
             self._products[b, a] = self._products[a, b].T
         return self._products[a, b]
 
-    def sparse_fit(self, costs: Tensor, start: Tensor | None = None) -> SparseFit:
+    def sparse_fit(self, costs: Tensor, start: Tensor | None = None, *, exchanges: bool = False) -> SparseFit:
         """Sparse regression on the columns. costs (M,): of using each. start: precisions of the first columns."""
         gram = torch.cat([torch.cat([self._product(a, b) for b in self._blocks], dim=1) for a in self._blocks])
         score = torch.cat([(b.remaining.T @ self._selecting.residual).squeeze(1) for b in self._blocks])
-        selected = sparse_fit(gram, score, costs, start)
+        selected = sparse_fit(gram, score, costs, start, exchanges=exchanges)
         used = selected.used
         in_use = Columns(tuple(b.columns for b in self._blocks))[used]
         columns = self._exact.remaining(self._under.whiten(in_use))
