@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+import pytest
 from sample_runs import material_of, write_study
 
 from fdi_torch.config.plant_file import load_plant
@@ -51,3 +53,5 @@ def test_an_unfinished_study_names_its_parameters(tmp_path: Path) -> None:
     made = report_of(material_of(tmp_path / "run.mcap", load_plant("three_tank")))
     axes = next(p for p in made.pictures if p.name == "errors_1").figure.axes[0]
     assert axes.get_title(loc="left") == "pump offset at Q1" and axes.get_ylabel() == "size of the error, cm³/s"
+    bar = next(line for line in axes.lines if line.get_linestyle() == "-").get_ydata()
+    assert bar == pytest.approx(0.1 * np.sqrt([7.5, 7.5])), "a bound limits the root mean square, not the median"
