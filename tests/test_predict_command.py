@@ -139,3 +139,12 @@ def test_a_hose_fills_once_and_is_full_where_a_run_was_cut_out_of_a_longer_one(
     (folder / "rests.csv").write_text("t_s,h_cm,Q_cm3_s\n" + "".join(f"{t},10,0\n" for t in (-2, -1)) + "\n".join(rows))
     whole, later = (said(capsys, "rests.csv", *words)["rmse"] for words in ((), ("--from", "15")))
     assert whole == {"h": pytest.approx(0.0, abs=2e-4)} and later == {"h": pytest.approx(0.0, abs=2e-4)}
+
+
+def test_a_plant_file_beside_that_is_not_there_is_said_before_any_result(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["predict", "--plant", "rig.yaml", "--start-samples", "3", "novalve.csv", "--beside", "before.yaml"]
+    assert main(words) == 2
+    told = capsys.readouterr()
+    assert not told.out and "before.yaml: file not found" in told.err

@@ -33,6 +33,7 @@ from fdi_torch.report.style import save
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     torch.set_num_threads(1)
     plant = chosen_plant(arguments.plant)
+    other = load_plant(arguments.beside) if arguments.beside else None
     names = [*arguments.recordings, *arguments.recording]
     if not names:
         raise ValueError("expected a recording, got none; name a CSV, MCAP or YAML file")
@@ -45,7 +46,6 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     say_first(worst, screen)
     first = f"{arguments.start_samples} samples" if arguments.settle is None else f"{arguments.settle:g} s"
     screen.say(f"free run of {plant.name}, initial levels from the first {first}")
-    other = load_plant(arguments.beside) if arguments.beside else None
     before = [_predict(other, recording, arguments, vary="") for recording in recordings] if other else []
     own_name, other_name = _names(plant, other, arguments)
     rows = [[own_name, *_row(plant, recording, prediction)] for recording, prediction in predictions]

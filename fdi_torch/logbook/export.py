@@ -27,11 +27,10 @@ def export(run: Run, topic: str, form: str, stream: BinaryIO) -> int:
     """
     if form not in _FORMS:
         raise ValueError(f"expected one of the formats {', '.join(_FORMS)}, got {form}")
-    count = _FORMS[form](run, topic, stream)
-    if not count:
+    if next(run.messages([topic]), None) is None:
         known = ", ".join(sorted({message.topic for message in run.messages()})) or "(none)"
         raise LogError(f"{run.path}: expected one of the topics {known}, got {topic}")
-    return count
+    return _FORMS[form](run, topic, stream)
 
 
 def export_attachment(run: Run, name: str, folder: str | Path) -> Path:
@@ -83,8 +82,7 @@ def _npz(run: Run, topic: str, stream: BinaryIO) -> int:
     payloads = list(_payloads(run, topic))
     arrays = {name: _array([payload.get(name) for payload in payloads]) for name in columns}
     usable = {name: array for name, array in arrays.items() if array is not None}
-    if payloads:
-        np.savez_compressed(stream, **usable)  # type: ignore[arg-type]
+    np.savez_compressed(stream, **usable)  # type: ignore[arg-type]
     return len(payloads)
 
 

@@ -112,13 +112,12 @@ def _beginning(path: Path) -> bytes:
 
 
 def _encoding(path: Path, start: bytes) -> str:
-    for magic, what in _FOREIGN.items():
-        if start.startswith(magic):
-            raise ValueError(f"{path}: expected a CSV, MCAP, Parquet, Feather, Excel, MATLAB or HDF5 file, got {what}")
+    foreign = next((what for magic, what in _FOREIGN.items() if start.startswith(magic)), None)
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
-    if b"\0" in start:
-        raise ValueError(f"{path}: expected a CSV or MCAP file, got something that is no text")
+    if foreign or b"\0" in start:
+        got = foreign or "something that is no text"
+        raise ValueError(f"{path}: expected a CSV, MCAP, Parquet, Feather, Excel, MATLAB or HDF5 file, got {got}")
     try:
         codecs.getincrementaldecoder("utf-8")().decode(start)
     except UnicodeDecodeError:

@@ -102,11 +102,9 @@ def _differences(compared: Comparison, runs: Sequence[Material]) -> str:
     several = len(set(kinds)) > 1  # their settings have different keys
     parts += [f"the kind of run ({'; '.join(kinds)})"] if several else []
     settings = {} if several else setting_differences(compared)
-    parts += [f"{key} ({'; '.join(texts)})" for key, texts in list(settings.items())[:MOST_LISTED]]
-    if len(settings) > MOST_LISTED:
-        parts.append(f"{len(settings) - MOST_LISTED} more settings")
     if any(compared.differences.get(section) for section in VERSIONS):
         parts.append("versions of the software")
+    parts += [f"{key} ({'; '.join(texts)})" for key, texts in settings.items()]
     return f"They differ in {_first(parts)}." if parts else "Recording, settings and versions are the same."
 
 
@@ -119,10 +117,12 @@ def setting_differences(compared: Comparison) -> dict[str, tuple[str, ...]]:
 
 
 def plain_text(text: str) -> str:
-    """The text of a setting; a JSON list or mapping in words, and 'none' for a missing one."""
-    if text[:1] in ("[", "{"):
-        with suppress(ValueError):
-            text = _in_words(orjson.loads(text))
+    """The text of a setting; a JSON list or mapping in words, a number without its rounding error, and 'none' for a
+    missing one.
+    """
+    with suppress(ValueError):
+        value = orjson.loads(text)
+        text = f"{value:.12g}" if isinstance(value, float) else _in_words(value) if text[0] in "[{" else text
     return short(text, MOST_LETTERS) if text not in ("", "null") else "none"
 
 

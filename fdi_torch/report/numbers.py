@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,8 @@ import numpy as np
 from fdi_torch import amounts
 from fdi_torch.amounts import RAISED
 from fdi_torch.quantities import display_unit, significant
+
+_NEGATIVE = re.compile(r"(?<![\w.])-(?=\d)")
 
 
 def shown_unit(si_unit: str, name: str = "") -> tuple[str, float]:
@@ -30,6 +33,11 @@ def raised(unit: str) -> str:
         digits = len(part) - len(part.lstrip("0123456789-"))
         head += part[:digits].translate(RAISED) + part[digits:]
     return head
+
+
+def sentence(message: str) -> str:
+    """A message with units and minus signs as elsewhere on the page; '2026-11-24', 'hA-hB' and '1e-05' stay."""
+    return _NEGATIVE.sub("−", raised(message))
 
 
 def amount(value: float, si_unit: str, digits: int = 4, name: str = "") -> str:

@@ -17,7 +17,7 @@ from fdi_torch.report.line_geometry import Point, arrow_head, direction, longest
 from fdi_torch.report.rig_layout import tank_places
 from fdi_torch.report.rig_overlay import Overlay, level_text, strength
 from fdi_torch.report.style import INK, MARK, MODEL, PAPER, SOFT, styled
-from fdi_torch.report.text_blocks import LINE, POINTS, Box, LetterStyle, TextBlock, separated, text_width
+from fdi_torch.report.text_blocks import GAP, LINE, POINTS, Box, LetterStyle, TextBlock, separated, text_width
 
 INCH = 0.8  # per unit of the drawing; a tank is one unit wide
 POINTS_PER_UNIT = 72 * INCH
@@ -41,7 +41,7 @@ class _Drawing:
         self.crossings = self.besides = 0
         self.blocks: list[TextBlock] = []
         counts = {c.name: len(self.lines(c.name)) for c in plant.components()}
-        self.tall = max(TALL, 0.4 + LINE * max(counts[t.name] for t in plant.tanks))
+        self.tall = max(TALL, 0.4 + LINE * (1 + max(counts[t.name] for t in plant.tanks)))
         most = max((counts[c.name] for c in plant.flow_components()), default=1)
         self.row = self.tall + BETWEEN + LINE * max(0, 2 * most - 4)  # words below a tank and above the next row
         beside = max((text_width(t, w) for x in plant.sensors for t, _, w in self.lines(x.name)), default=0.0)
@@ -131,18 +131,21 @@ class _Drawing:
             )
             self.axes.add_patch(fill)
         level = self.overlay.levels.get(tank.name, float("nan"))
+        first = self.tall - 0.08  # upper end of the tank's words
         if np.isfinite(level):
             height = self.tall * min(max(level / tank.height, 0.0), 1.0)
             water = Rectangle((x - 0.5, y), 1.0, height, facecolor=MODEL, alpha=0.22, edgecolor="none", zorder=3)
             self.axes.add_patch(water)
             self.axes.plot([x - 0.5, x + 0.5], [y + height] * 2, color=MODEL, lw=1.2, zorder=4)
+            lines, above = LINE * len(self.lines(tank.name)), first + GAP / 2 - height
+            if 0.0 < above < lines:  # the surface comes to lie between two lines
+                first -= above % LINE
             place = height + (0.05 if height < 0.3 else -0.24)
-            free = self.tall - 0.08 - LINE * len(self.lines(tank.name)) - 0.22  # below the words of the tank
-            place = max(min(place, free), 0.04)
+            place = max(min(place, first - lines - 0.22), 0.04)  # below the words of the tank
             self.axes.text(x, y + place, level_text(level), ha="center", color=INK, fontsize=9.0, zorder=6)
         walls = [(x - 0.5, y + self.tall), (x - 0.5, y), (x + 0.5, y), (x + 0.5, y + self.tall)]
         self.axes.plot(*np.array(walls).T, color=self.colour(tank.name), lw=2.0, zorder=5, solid_joinstyle="miter")
-        self.write_lines(self.block(tank.name, (x, y + self.tall - 0.08), "center"))
+        self.write_lines(self.block(tank.name, (x, y + first), "center"))
 
     def sensor(self, sensor: Sensor) -> None:
         x, y = self.corner(sensor.tank)

@@ -14,7 +14,7 @@ from fdi_torch.gap.verdict_words import verdict_sentence
 from fdi_torch.names import counted, listed
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import number
+from fdi_torch.report.numbers import number, sentence
 from fdi_torch.report.sections.rehearsal import rehearsal_tables
 from fdi_torch.report.sections.study import ESTIMATORS
 from fdi_torch.report.sections.windows import logged_windows
@@ -103,7 +103,7 @@ def monitor_words(material: Material) -> str:
     ended = [f"{m['headline']}" for n, m in last.items() if states[n] == "recovered"]
     parts = [_latest("open alarms", still_open)] if still_open else []
     parts += [f"recovered: {_latest('alarms', ended)}"] if ended else []
-    text = "; ".join(parts)
+    text = sentence("; ".join(parts))
     return text[:1].upper() + text[1:]
 
 

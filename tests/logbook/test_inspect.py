@@ -120,7 +120,8 @@ def test_npz_holds_numbers_and_texts(finished: Path) -> None:
 @pytest.mark.parametrize("form", ["csv", "ndjson", "npz"])
 def test_a_topic_that_is_not_there(finished: Path, form: str) -> None:
     with pytest.raises(LogError, match=r"expected one of the topics /diagnosis/fault, .*, got /no"):
-        export(read_run(finished), "/no", form, io.BytesIO())
+        export(read_run(finished), "/no", form, stream := io.BytesIO())
+    assert stream.getvalue() == b""
     with pytest.raises(ValueError, match=r"expected one of the formats .*, got xls"):
         export(read_run(finished), "/log", "xls", io.BytesIO())
 

@@ -85,6 +85,19 @@ def test_settings_are_told_in_words(tmp_path: Path) -> None:
     assert plain_text('[{"name":"T1.leak","low":null}]') == "T1.leak" and plain_text("[broken") == "[broken"
 
 
+def test_every_difference_that_is_not_listed_is_counted(tmp_path: Path) -> None:
+    a = write_fit(tmp_path / "a.mcap", 0.001, config={f"key{k}": 1 for k in range(9)})
+    b = write_fit(tmp_path / "b.mcap", 0.001, level=0.2, config={f"key{k}": 2 for k in range(9)})
+    listed = "the recording (simulated: other readings), key0 (1; 2), key1 (1; 2), key2 (1; 2)"
+    assert sentences(a, b)[-1] == f"They differ in {listed} and 6 more."
+
+
+def test_settings_that_differ_by_rounding_do_not_differ(tmp_path: Path) -> None:
+    percent = write_fit(tmp_path / "a.mcap", 0.001, config={"confidence": 95 * 0.01, "duration": 1000.0})
+    share = write_fit(tmp_path / "b.mcap", 0.001, config={"confidence": 0.95, "duration": 600.5})
+    assert setting_differences(compare([percent, share])) == {"duration": ("1000", "600.5")}
+
+
 def test_terminal_and_page_lead_with_the_headline(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     logs = [write_fit(tmp_path / "a.mcap", 0.004), write_fit(tmp_path / "b.mcap", 0.001, config={"seed": 3})]
     assert cli.main(["compare", *map(str, logs)]) == cli.DONE

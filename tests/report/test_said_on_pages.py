@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+import pytest
 from sample_runs import material_of, write_study
 
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.logbook import RunLog
 from fdi_torch.report.page import page, report_of
 from fdi_torch.report.sections.rehearsal import _texts
+from fdi_torch.report.verdict import headline
 
 
 def test_numbers_of_a_monitor_have_the_digits_that_their_standard_errors_justify(tmp_path: Path) -> None:
@@ -26,6 +29,14 @@ def test_an_interval_has_the_digits_of_its_estimate(tmp_path: Path) -> None:
         log.estimate(["T1.area"], [0.015441], [0.0002], [[0.0002**2]], "converged", units=["m^2"])
     text = page([report_of(material_of(tmp_path / "run.mcap"))])
     assert "154.4 ± 2.0" in text and ">150.5 … 158.3<" in text
+
+
+def test_the_headline_of_a_monitor_is_set_as_the_rest_of_its_page(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "run.mcap", "monitor", env={}, git={}) as log:
+        held = "pump offset at Q (-11.07 ± 0.87 cm^3/s), by hA-hB"
+        log.alarm(764.0, "isolated", "Q.pump_offset", held, alarm=1, state="isolated", headline=held)
+    made = headline(material_of(tmp_path / "run.mcap"))
+    assert made == "Pump offset at Q (−11.07 ± 0.87 cm³/s), by hA-hB (isolated)"
 
 
 def test_runs_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
@@ -51,3 +62,5 @@ def test_an_unfinished_study_names_its_parameters(tmp_path: Path) -> None:
     made = report_of(material_of(tmp_path / "run.mcap", load_plant("three_tank")))
     axes = next(p for p in made.pictures if p.name == "errors_1").figure.axes[0]
     assert axes.get_title(loc="left") == "pump offset at Q1" and axes.get_ylabel() == "size of the error, cm³/s"
+    bar = next(line for line in axes.lines if line.get_linestyle() == "-").get_ydata()
+    assert bar == pytest.approx(0.1 * np.sqrt([7.5, 7.5])), "a bound limits the root mean square, not the median"

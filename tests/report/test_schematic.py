@@ -10,6 +10,7 @@ import pytest
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.report.rig_layout import tank_places
+from fdi_torch.report.rig_overlay import level_text
 from fdi_torch.report.schematic import Overlay, schematic
 from fdi_torch.report.style import inline_svg
 
@@ -66,6 +67,24 @@ def test_no_word_within_a_tank_stands_on_another(level: float) -> None:
     assert len(boxes) == 5
     for lower, upper in pairwise(boxes):
         assert lower.y1 - upper.y0 < 0.25 * lower.height, "letters overlap"
+
+
+@pytest.mark.parametrize("level", [0.5, 0.63, 0.72, 0.8, 0.88, 0.93, 0.97, 1.0])
+@pytest.mark.parametrize(
+    "effects", [["leak 0.295"], ["leak 0.295", "outlet drop 12 mm", "laminar flow 49.8 ± 9.5 mm"], []]
+)
+def test_no_word_within_a_tank_stands_on_the_water_line(level: float, effects: list[str]) -> None:
+    plant = load_plant("three_tank")
+    figure = schematic(plant, Overlay({"T1": level}, {"T1": effects} if effects else {}))
+    figure.canvas.draw()
+    axes = figure.axes[0]
+    (surface,) = (line for line in axes.lines if line.get_zorder() == 4)
+    (left, height), (right, _) = axes.transData.transform(surface.get_xydata())
+    boxes = {t.get_text(): t.get_window_extent() for t in axes.texts}
+    within = {text: box for text, box in boxes.items() if left < (box.x0 + box.x1) / 2 < right}
+    assert {"T1", level_text(level)} <= within.keys()
+    for text, box in within.items():
+        assert not box.y0 + 0.2 * box.height < height < box.y1 - 0.2 * box.height, text
 
 
 @pytest.mark.parametrize(("name", "effects"), [*((name, 3) for name in PLANTS), ("quadruple_tank", 1)])

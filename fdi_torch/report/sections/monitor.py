@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from typing import Any
 
 import numpy as np
@@ -12,12 +11,11 @@ from fdi_torch.clock import clock_text
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import as_float, axis, number, raised, rounded_number, shown_unit
+from fdi_torch.report.numbers import as_float, axis, number, rounded_number, sentence, shown_unit
 from fdi_torch.report.section import Section, signals
 from fdi_torch.report.style import MARK, MODEL
 
 RESIDUAL, ALARM = "/observer/residual", "/observer/alarm"
-_NEGATIVE = re.compile(r"(?<![\w.])-(?=\d)")
 _SUFFIXES = ("_statistic", "_threshold")
 
 
@@ -67,7 +65,7 @@ def event_section(material: Material) -> Section | None:
             number(float(m["t"]), 6),
             *([_moment(float(m["t"]))] if dated else []),
             str(m.get("event", "")),
-            _sentence(str(m.get("message", ""))),
+            sentence(str(m.get("message", ""))),
             *_onset(m, dated),
         ]
         for m in events
@@ -83,11 +81,6 @@ def event_section(material: Material) -> Section | None:
     )
     listed = table(header, rows, left=len(header) - 1 - len(clock))
     return Section("Events", [listed])
-
-
-def _sentence(message: str) -> str:
-    """A message with units and minus signs as elsewhere on the page; '2026-11-24', 'hA-hB' and '1e-05' stay."""
-    return _NEGATIVE.sub("−", raised(message))
 
 
 def _onset(event: Payload, dated: bool) -> list[Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -79,12 +79,13 @@ def error_section(material: Material) -> Section | None:
             bounds.append(np.median([float(m["bound"][i]) if "bound" in m else np.nan for m in own]))
         unit, scale = _unit_of(material, name)
         errors, bounds = [scale * e for e in errors], [scale * b for b in bounds]
-        figure = group_panel(parameter_words(name), axis("size of the error", unit), groups, errors)
+        label = axis("size of the error", unit)
+        figure = group_panel(parameter_words(name), label, groups, errors, bar=_root_mean_square)
         if all(np.nanmax(e, initial=0.0) > 0 for e in errors):
             logarithmic(figure.axes[0])
         figure.axes[0].plot(range(len(groups)), bounds, "_", color=MARK, ms=22, mew=2.0)
         pictures.append(Picture(f"errors_{i + 1}", figure))
-    words = f"Estimator: {estimator}. Each point is a trial, blue is the median, orange the Cramér-Rao bound."
+    words = f"Estimator: {estimator}. Each point is a trial, blue their root mean square, orange its Cramér-Rao bound."
     return Section("Errors", [words, pictures])
 
 
@@ -144,15 +145,21 @@ def trials_section(material: Material) -> Section | None:
     return Section("Trials", blocks)
 
 
-def group_panel(title: str, label: str, groups: Sequence[str], values: Sequence[np.ndarray]) -> Figure:
-    """Points of every group side by side, with horizontal jitter, and the median as a bar."""
+def group_panel(
+    title: str,
+    label: str,
+    groups: Sequence[str],
+    values: Sequence[np.ndarray],
+    bar: Callable[[np.ndarray], float] = lambda points: float(np.median(points)),
+) -> Figure:
+    """Points of every group side by side, with horizontal jitter, and a bar at their median or another statistic."""
     figure, axes = panel(short(title), "", short(label))
     for k, points in enumerate(values):
-        points = points[np.isfinite(points)][:2000]
+        points = points[np.isfinite(points)]
+        height, points = bar(points) if len(points) else np.nan, points[:2000]
         jitter = 0.3 * (np.modf(np.arange(len(points)) * 0.6180339887)[0] - 0.5)
         axes.plot(k + jitter, points, ".", color=SOFT, ms=2.5, alpha=0.7)
-        if len(points):
-            axes.plot([k - 0.25, k + 0.25], [np.median(points)] * 2, color=MODEL, lw=2.0)
+        axes.plot([k - 0.25, k + 0.25], [height] * 2, color=MODEL, lw=2.0)
     turned = max((len(g) for g in groups), default=0) * len(groups) > 36
     axes.set_xticks(
         range(len(groups)),
@@ -161,6 +168,10 @@ def group_panel(title: str, label: str, groups: Sequence[str], values: Sequence[
         ha="right" if turned else "center",
     )
     return figure
+
+
+def _root_mean_square(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
 
 
 def _column(trials: Sequence[Payload], group: str, name: str) -> np.ndarray:
