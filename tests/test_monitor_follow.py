@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import threading
@@ -18,9 +19,12 @@ import yaml
 
 from fdi_torch.cli import INTERRUPTED, main
 from fdi_torch.config.growing_recordings import Row
+from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.jobs.live_batches import LARGEST_BATCH, DelayWatch, LiveBatches
+from fdi_torch.jobs.logged_monitor import MonitorCallbacks
+from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.jobs.monitor_rows import resumed_items, rows_until
 from fdi_torch.jobs.replay import repeat_run
 from fdi_torch.logbook import RunLog, content_hash, follow, read_run, series
@@ -105,6 +109,27 @@ def test_a_growing_csv_file_is_followed_row_by_row(tmp_path: Path, capsys: pytes
     assert "no samples for 41 s" in texts(events)
     whole = monitored(["--config", config(tmp_path, recording={"file": str(written(tmp_path / "all.csv"))})], capsys)
     assert [e["time"] for e in events if e["kind"] == "alarm"] == [e["time"] for e in whole if e["kind"] == "alarm"]
+
+
+def test_following_shows_the_last_sample_the_delay_and_the_events(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """There is no end yet, hence no share of it."""
+    written(tmp_path / "rig.csv")
+    assert main(["monitor", "--config", config(tmp_path), "--follow", "--idle", "0.2"]) == 0
+    progress = [line for line in capsys.readouterr().err.splitlines() if line.startswith("monitor ")]
+    assert re.search(r"^monitor (waiting for samples|last sample at \d+ s)", progress[1])
+    assert not any("%" in line for line in progress)
+
+
+def test_each_batch_is_told_with_its_last_sample_and_the_delay(tmp_path: Path) -> None:
+    written(tmp_path / "rig.csv")
+    told: list[tuple[float | None, str]] = []
+    run = load_monitor(config(tmp_path))
+    run_monitor(run, MonitorCallbacks(lambda *step: told.append(step), lambda e: None, lambda p: None), True, 0.2)
+    share, text = told[-1]
+    assert share is None
+    assert re.fullmatch(rf"last sample at {SAMPLES - 1} s, \d+\.\d s behind; [1-9]\d* events", text)
 
 
 def test_a_growing_log_is_followed_until_its_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -30,9 +30,9 @@ ENDLESS = 1 << 16  # characters per line of a pipe or a file
 
 
 class Advance(Protocol):
-    """Reports the progress of a stage (0 to 1) and one line about it."""
+    """Reports the progress of a stage (0 to 1; None if it has no known end) and one line about it."""
 
-    def __call__(self, share: float, text: str = "") -> None: ...
+    def __call__(self, share: float | None, text: str = "") -> None: ...
 
 
 def log_words(log: Path) -> str:
@@ -146,7 +146,9 @@ class Screen:
         elif self._err.is_terminal:
             with self._bar() as bar:
                 task = bar.add_task(printable(title), total=1.0, text="")
-                yield lambda share, text="": bar.update(task, completed=share, text=printable(text))
+                yield lambda share, text="": bar.update(
+                    task, total=None if share is None else 1.0, completed=share, text=printable(text)
+                )
         else:
             yield self._lines(title)
 
@@ -162,10 +164,11 @@ class Screen:
         self.note(f"{title} ...")
         last = -math.inf  # the first step of a job is shown at once
 
-        def advance(share: float, text: str = "") -> None:
+        def advance(share: float | None, text: str = "") -> None:
             nonlocal last
-            if share >= 1.0 or time.monotonic() - last >= SECONDS_BETWEEN_LINES:
+            if share == 1.0 or time.monotonic() - last >= SECONDS_BETWEEN_LINES:
                 last = time.monotonic()
-                self.note(f"{title} {share:4.0%} {text}".rstrip())
+                percent = "" if share is None else f" {share:4.0%}"
+                self.note(f"{title}{percent} {text}".rstrip())
 
         return advance

@@ -59,11 +59,12 @@ class LiveBatches(Iterator[list[T]]):
 class DelayWatch:
     """Compares the plant's clock with real time, and reports processing delays and bursts after a silence.
 
-    clock: real time in s. Each notice is given once, and again when the delay or the silence has doubled.
+    clock: real time in s. Each notice is given once, and again when the delay or the silence has doubled. delay: of the
+    last processed sample against the least delayed one, s.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
-        self._clock = clock
+        self._clock, self.delay = clock, 0.0
         self._smallest_difference: float | None = None
         self._last_batch: float | None = None
         self._interval = 1.0
@@ -88,10 +89,10 @@ class DelayWatch:
         difference = self._clock() - time
         smallest = self._smallest_difference
         self._smallest_difference = difference if smallest is None else min(smallest, difference)
-        delay = difference - self._smallest_difference
-        if delay > 2.0 * self._reported_delay:
-            self._reported_delay = delay
-            return [f"the monitor is {delay:.1f} s behind real time"]
+        self.delay = difference - self._smallest_difference
+        if self.delay > 2.0 * self._reported_delay:
+            self._reported_delay = self.delay
+            return [f"the monitor is {self.delay:.1f} s behind real time"]
         return []
 
     def clock_jumped(self) -> None:

@@ -44,7 +44,7 @@ class MonitorCallbacks:
     log: receives every log message.
     """
 
-    tell: Callable[[float, str], None]
+    tell: Callable[[float | None, str], None]
     event: Callable[[Event], None]
     ready: Callable[[PreparedMonitor], None]
     log: Listener | None = None

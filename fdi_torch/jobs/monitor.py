@@ -15,7 +15,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.clock import show_clock
+from fdi_torch.clock import clock_text, show_clock
 from fdi_torch.config.growing_recordings import Row, growing_rows
 from fdi_torch.config.live_source import LiveRows
 from fdi_torch.config.loaded_recordings import read_recording
@@ -127,7 +127,7 @@ def _follow(
     """Process samples as they come, after waiting for the end of the fault-free part."""
     run = monitor.run
     batches = LiveBatches(resumed_items(earlier, source) if _rows(earlier) else source)
-    callbacks.tell(0.0, "waiting for samples")
+    callbacks.tell(None, "waiting for samples")
     first = _until_fault_free_part_ends(run, callbacks, batches)
     zero = source.origin if isinstance(source, LiveRows) else next(iter(zeros), None)
     show_clock([zero])
@@ -143,7 +143,7 @@ def _follow(
             delay_watch.clock_jumped()
         if rows:
             monitor.process_items(delay_watch.processed(rows[-1][0]))
-            callbacks.tell(0.5, f"{rows[-1][0]:g} s")
+            callbacks.tell(None, f"{_last_sample(rows)}, {delay_watch.delay:.1f} s behind; {monitor.events} events")
 
 
 def _until_fault_free_part_ends(
@@ -155,10 +155,16 @@ def _until_fault_free_part_ends(
     for batch in batches:
         items += batch
         rows = _rows(items)
-        callbacks.tell(0.0, f"{rows[-1][0]:g} s, learning until {end:g} s" if rows else "waiting for samples")
+        callbacks.tell(None, f"{_last_sample(rows)}, learning until {end:g} s" if rows else "waiting for samples")
         if rows_until(rows, end):
             break
     return items
+
+
+def _last_sample(rows: Sequence[Row]) -> str:
+    """The time of the last sample, and the moment if the clock has dates."""
+    moment = clock_text(rows[-1][0])
+    return f"last sample at {rows[-1][0]:g} s" + (f" ({moment})" if moment else "")
 
 
 def _rows(items: Iterable[Row | str]) -> list[Row]:

@@ -43,7 +43,7 @@ AnyPlant = PlantDescription | str | Path
 AnyRecording = Recording | Mapping[str, Any] | str | Path
 
 
-def silent(share: float, text: str) -> None:
+def silent(share: float | None, text: str) -> None:
     """Ignore progress messages."""
 
 
@@ -128,10 +128,13 @@ def gap(
     return GapResult(answer, plant, log)
 
 
-def monitor(run: MonitorRun | Mapping[str, Any] | str | Path, *, tell: Tell = silent) -> MonitorResult:
+def monitor(
+    run: MonitorRun | Mapping[str, Any] | str | Path, *, tell: Callable[[float | None, str], None] = silent
+) -> MonitorResult:
     """Run a monitor along a recording, as `fdi monitor` does.
 
     run: a monitor file, or a mapping such as {"plant": plant, "recording": recording, "fault_free": ["0 s", "300 s"]}.
+    tell(share, text): progress; share is None along a live source.
     """
     if isinstance(run, str | Path):
         run = load_monitor(run)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +21,13 @@ from fdi_torch.jobs.logged_recordings import logged_recording
 from fdi_torch.jobs.monitor_rows import logged_items, recording_of_rows, rows_until
 from fdi_torch.jobs.run_setup import fitting_of, requested_space
 from fdi_torch.jobs.study import TRIAL, log_summary, log_trials
-from fdi_torch.jobs.train import STATE, Tell, estimate_logged, log_recordings, origin_of, state_is_due
+from fdi_torch.jobs.train import STATE, estimate_logged, log_recordings, origin_of, state_is_due
 from fdi_torch.logbook import LogError, Message, RunLog, series
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook.replay import Select
 from fdi_torch.study.monte_carlo import Trial, run_blocks
 
+Tell = Callable[[float | None, str], None]
 # A replay uses the log's data, so configuration keys of the data cannot be changed.
 _DATA_KEYS = ("simulate", "recordings")
 
