@@ -74,15 +74,14 @@ def localize(
     if hopeless or not places:
         return Localization((), itself)
     ascent = Ascent(fitter, fit, noise, base)
-    starts = [likely, nearly_without_disturbances(likely)]
-    first_order = _first_order_gains(regression, starts, fit, places, base)
+    noises = likely, nearly_without_disturbances(likely)
+    first_order = _first_order_gains(regression, noises, fit, places, base)
     evaluated: dict[str, LocalizedDiscrepancy] = {}
     growth, examined = -math.inf, 0  # growth: largest ratio so far of what a first-order gain lacks to that gain
     for place, first in sorted(first_order.items(), key=lambda item: -item[1].expected):
         if examined >= CALIBRATION_PLACES and first.expected + growth * first.gain < needed:
             continue
-        best = ascent.under_less_and_less_noise(regression, place, likely)
-        best = ascent.climbed(best, needed)
+        best = ascent.climbed(ascent.under_less_and_less_noise(regression, place, likely), needed)
         examined += 1
         growth = max(growth, (best.gain - first.expected) / max(first.gain, 1.0))
         selected = bool(best.regressed.used.any())
@@ -127,31 +126,30 @@ def localize_beside(
 @dataclass(frozen=True)
 class _FirstOrder:
     """expected: gain in log evidence of the best single regressor of a place, with that of the noise. gain: of the
-    regressor alone, without the cost of its selection. noise: under which the expected gain is largest."""
+    regressor alone, without the cost of its selection."""
 
     expected: float
     gain: float
-    noise: StateNoise
 
 
 def _first_order_gains(
     regression: DiscrepancyRegression,
-    starts: Sequence[StateNoise],
+    noises: Sequence[StateNoise],
     fit: Fit,
     places: Sequence[str],
     base: float,
 ) -> dict[str, _FirstOrder]:
     """First-order gains of each place, under the best of the noises."""
     under_each = []
-    for noise in starts:
+    for noise in noises:
         under = with_disturbances(regression.fitter, fit, noise, regression.linearised)
         without = log_likelihood(under, fit, regression.linearised) + noise.log_prior() - base
         gains = SingleRegressorGains(regression, under, fit, torch.Generator().manual_seed(0))
-        under_each.append((without, gains, noise))
+        under_each.append((without, gains))
     first_order = {}
     for place in places:  # the regression keeps the regressors of one place only
-        each = [(without, gains.at(place), noise) for without, gains, noise in under_each]
-        first_order[place] = max((_FirstOrder(w + g.net, g.gain, n) for w, g, n in each), key=lambda f: f.expected)
+        each = [(without, gains.at(place)) for without, gains in under_each]
+        first_order[place] = max((_FirstOrder(w + g.net, g.gain) for w, g in each), key=lambda f: f.expected)
     return first_order
 
 
