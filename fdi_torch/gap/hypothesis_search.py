@@ -150,7 +150,7 @@ class HypothesisSearch:
         return hypotheses
 
     def _needed(self, explanation: RankedExplanation, best: CauseHypothesis) -> float:
-        """Log-likelihood that a discrepancy must add to an explanation to have RARE of the weight of the best one."""
+        """Log evidence that a discrepancy must add to an explanation, for the share RARE of the best one's weight."""
         return best.weight + math.log(RARE) - explanation.log_weight - self.weights.log_odds
 
     def _after_fits_at_unknowns(

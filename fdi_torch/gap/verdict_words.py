@@ -103,9 +103,10 @@ def closed_sentence(closure: Named) -> str:
         )
     if closed < 0.0:
         return "The gap does not close on data not used for fitting: the causes do not carry over to them."
-    ends = interval if isinstance(interval, list | tuple) else ()
-    between = " to ".join(f"{100.0 * end:.1f}" for end in ends if isinstance(end, int | float))
-    return f"{100.0 * closed:.1f} % of the gap closes on data not used for fitting (95 % interval {between} %)."
+    between = ""
+    if isinstance(interval, list | tuple) and len(interval) == 2:
+        between = f" (95 % interval {100.0 * interval[0]:.1f} to {100.0 * interval[1]:.1f} %)"
+    return f"{100.0 * closed:.1f} % of the gap closes on data not used for fitting{between}."
 
 
 def _verdict(answer: Named, best: str) -> str:

@@ -15,7 +15,7 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.build import load_library
 from fdi_torch.simulate.cpp_source import emit
-from fdi_torch.simulate.engine import EngineText, Readings, expect_problems
+from fdi_torch.simulate.engine import EngineText, Readings, expect_columns, expect_problems
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.gradient import expect_no_gradient, is_differentiated, readings_with_gradient
 from fdi_torch.simulate.injection import Injection, expect_injectable
@@ -83,7 +83,8 @@ class CompiledEngine(EngineText):
         return out
 
     def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
-        if is_differentiated(self, theta):
+        expect_columns(self, theta)
+        if is_differentiated(theta):
             return readings_with_gradient(self, theta)
         out = self._empty(theta, self._sensors)
         self._run("readings", theta, out)

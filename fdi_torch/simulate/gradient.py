@@ -11,9 +11,8 @@ from torch import Tensor
 from fdi_torch.simulate.engine import Engine, EngineText, expect_columns
 
 
-def is_differentiated(engine: EngineText, theta: Tensor) -> bool:
-    """Whether autograd records operations on these parameters. Raises ValueError if they do not fit the engine."""
-    expect_columns(engine, theta)
+def is_differentiated(theta: Tensor) -> bool:
+    """Whether autograd records operations on these parameters."""
     return theta.requires_grad and torch.is_grad_enabled()
 
 
@@ -28,7 +27,8 @@ def readings_with_gradient(engine: Engine, theta: Float[Tensor, "*batch P"]) -> 
 
 def expect_no_gradient(engine: EngineText, theta: Tensor, what: str) -> None:
     """Raises ValueError if theta does not fit the engine or requires a gradient that this operation would lose."""
-    if is_differentiated(engine, theta):
+    expect_columns(engine, theta)
+    if is_differentiated(theta):
         raise ValueError(
             f"{what}: expected theta without requires_grad on the {engine.name} engine, got one with it; differentiate "
             "readings(theta), take the reference engine, or pass theta.detach()"

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.simulate.engine import EngineText, Readings, expect_problems, gram_of, moments_of
+from fdi_torch.simulate.engine import EngineText, Readings, expect_columns, expect_problems, gram_of, moments_of
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.gradient import expect_no_gradient, is_differentiated, readings_with_gradient
 from fdi_torch.simulate.implicit import ImplicitStep
@@ -39,7 +39,8 @@ class TracedEngine(EngineText):
         return self._simulate(theta, tangent=False, levels=True)[0]
 
     def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
-        if is_differentiated(self, theta):
+        expect_columns(self, theta)
+        if is_differentiated(theta):
             return readings_with_gradient(self, theta)
         return self._simulate(theta, tangent=False)[0]
 

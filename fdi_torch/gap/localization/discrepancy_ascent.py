@@ -111,7 +111,8 @@ class Ascent:
 
         start (M,): precisions of its columns from which the regression starts. Without it, the regression starts from
         nothing, and the regressor at the best of all positions is one more column: a stiction whose band lies between
-        two of the grid would need ten of its regressors, after which no position gains any more.
+        two of the grid would need ten of its regressors, after which no position gains any more. exchanges: as in
+        `sparse_fit`.
         """
         fit = regression.fit
         under = with_disturbances(self.fitter, fit, noise, discrepancy.linearised)

@@ -7,8 +7,9 @@ residual r, columns C, G = C'C, b = C'r and noise of unit variance,
 
 over the columns that are used, each of which has a cost (`column_costs`). Their difference is maximised one column at a
 time: the column whose addition, removal or re-estimation gains most is changed until nothing gains (Tipping and Faul,
-2003, "Fast marginal likelihood maximisation for sparse Bayesian models"). Then a column in use is exchanged for another
-if that gains: of two nearly equal columns, the one that was added first is not always the one that suits the others.
+2003, "Fast marginal likelihood maximisation for sparse Bayesian models"). If asked for, a column in use is then
+exchanged for another if that gains: of two nearly equal columns, the one that was added first is not always the one
+that suits the others.
 """
 
 from __future__ import annotations
