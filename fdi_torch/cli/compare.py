@@ -16,7 +16,7 @@ from fdi_torch.disk import replacing
 from fdi_torch.jobs.report import plant_of
 from fdi_torch.logbook import Comparison, compare, read_run
 from fdi_torch.report.comparison import comparison_section, in_words, result_table
-from fdi_torch.report.comparison_headline import comparison_headline, setting_differences
+from fdi_torch.report.comparison_headline import comparison_headline, left_out_words, setting_differences
 from fdi_torch.report.material import Material, gather
 from fdi_torch.report.style import save
 
@@ -52,10 +52,13 @@ def show(comparison: Comparison, logs: Sequence[str | Path], screen: Screen) -> 
 
 
 def _show_tables(comparison: Comparison, runs: Sequence[Material], screen: Screen) -> None:
-    rows = [[key, *(text[:MOST_TEXT] for text in texts)] for key, texts in setting_differences(comparison).items()]
+    settings, left_out = setting_differences(comparison, runs)
+    rows = [[key, *(text[:MOST_TEXT] for text in texts)] for key, texts in settings.items()]
     if rows and len({run.kind for run in runs}) == 1:  # runs of different kinds have different keys
         screen.say()
         screen.table("settings", ("key", *comparison.labels), rows, left=1 + len(comparison.labels))
+        if left_out:
+            screen.say(left_out_words(left_out))
     if comparison.results:
         screen.say()
         screen.table("estimates", *result_table(comparison), left=2)

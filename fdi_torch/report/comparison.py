@@ -9,7 +9,7 @@ import numpy as np
 
 from fdi_torch.logbook import Comparison, align
 from fdi_torch.report.chart import Chart, Line
-from fdi_torch.report.comparison_headline import comparison_headline
+from fdi_torch.report.comparison_headline import comparison_headline, left_out_words, setting_differences
 from fdi_torch.report.html import folded, short, table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, shown_unit, with_error
@@ -32,19 +32,23 @@ def comparison_section(compared: Comparison, runs: Sequence[Material]) -> Sectio
 
 
 def _section(compared: Comparison, runs: Sequence[Material]) -> Section:
-    first, *others = comparison_headline(compared, runs)
-    blocks: list[Any] = [tag("h3", first), *(tag("p", sentence) for sentence in (*others, *in_words(compared)))]
+    first, *sentences = comparison_headline(compared, runs)
+    blocks: list[Any] = [tag("h3", first), *(tag("p", sentence) for sentence in (*sentences, *in_words(compared)))]
     if compared.results:
         blocks.append(table(*result_table(compared), left=2))
     pictures = [*_convergence(compared, runs), *_residuals(compared, runs)]
     blocks += [pictures] if pictures else []
-    for name, entries in compared.differences.items():
+    settings, left_out = setting_differences(compared, runs)
+    in_settings = ("config", "seeds")
+    others = {name: entries for name, entries in compared.differences.items() if name not in in_settings}
+    for name, entries in {"settings": settings, **others}.items():
         if name == "result":  # its lists of numbers are the table above
             entries = {key: texts for key, texts in entries.items() if not any(t.startswith("[") for t in texts)}
         rows = [[key, *(short(text, MOST_LETTERS) for text in texts)] for key, texts in entries.items()]
         if rows:
             shown = table(["key", *compared.labels], rows, len(compared.labels) + 1)
-            blocks.append(folded(f"{name}: {len(rows)} differ", shown))
+            note = [tag("p", left_out_words(left_out))] if name == "settings" and left_out else []
+            blocks.append(folded(f"{name}: {len(rows)} differ", shown, *note))
     return Section("Comparison", blocks)
 
 

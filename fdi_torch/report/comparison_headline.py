@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -13,18 +13,21 @@ import orjson
 
 from fdi_torch.amounts import effect_words
 from fdi_torch.logbook import Comparison
-from fdi_torch.names import listed
+from fdi_torch.names import counted, listed
 from fdi_torch.quantities import quantity_text
 from fdi_torch.report.html import short
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import percent
 from fdi_torch.report.progress import SensorResidual, sensor_residuals
 from fdi_torch.report.verdict import headline, kind_words
+from fdi_torch.units import UnitError, in_unit, number_and_unit
 
 MOST_LISTED, MOST_LETTERS = 4, 60
 AT_95 = 1.96
 VERSIONS = ("env", "git")
 NOT_IN_WORDS = ("sha256", "output.name", "output.folder")
+NONE = ("", "null")  # texts of a missing setting
+ROUNDING = 1e-9  # relative error of an amount that was converted to another unit
 
 
 def comparison_headline(compared: Comparison, runs: Sequence[Material]) -> list[str]:
@@ -101,19 +104,76 @@ def _differences(compared: Comparison, runs: Sequence[Material]) -> str:
     kinds = [kind_words(run) for run in runs]
     several = len(set(kinds)) > 1  # their settings have different keys
     parts += [f"the kind of run ({'; '.join(kinds)})"] if several else []
-    settings = {} if several else setting_differences(compared)
+    settings = {} if several else setting_differences(compared, runs)[0]
     if any(compared.differences.get(section) for section in VERSIONS):
         parts.append("versions of the software")
     parts += [f"{key} ({'; '.join(texts)})" for key, texts in settings.items()]
     return f"They differ in {_first(parts)}." if parts else "Recording, settings and versions are the same."
 
 
-def setting_differences(compared: Comparison) -> dict[str, tuple[str, ...]]:
-    """Settings and seeds that differ, in words: key -> one text per run."""
+def setting_differences(compared: Comparison, runs: Sequence[Material]) -> tuple[dict[str, tuple[str, ...]], int]:
+    """Settings and seeds that differ, in words: key -> one text per run, and the number of keys that are left out.
+
+    A part that some runs lack, such as a tank, is named without its settings, which are left out if they differ in
+    nothing else: plant.tanks -> ("A, B", "T1, T2, T3").
+    """
     found = compared.differences.get("config", {}) | compared.differences.get("seeds", {})
-    kept = {key: texts for key, texts in found.items() if key not in NOT_IN_WORDS}
-    in_words = {key: tuple(plain_text(text) for text in texts) for key, texts in kept.items()}
-    return {key: texts for key, texts in in_words.items() if len(set(texts)) > 1}
+    records = [run.about("config") | run.about("seeds") for run in runs]
+    has = [{part for key, text in each.items() if text not in NONE for part in _parts(key)} for each in records]
+    settings: dict[str, tuple[str, ...]] = {}
+    lacking: dict[str, dict[str, str]] = {}  # section -> key -> its part that some runs lack
+    for key, texts in found.items():
+        words = tuple(plain_text(text) for text in texts)
+        if key in NOT_IN_WORDS or len(set(words)) == 1 or _are_one_amount(words):
+            continue
+        settings[key] = words
+        part = next((part for part in _parts(key) if not all(part in each for each in has)), key)
+        if part != key and len({text for text in texts if text not in NONE}) == 1:
+            lacking.setdefault(part.rpartition(".")[0], {})[key] = part
+    rows: dict[str, tuple[str, ...]] = {}
+    left_out = 0
+    for section, parts in lacking.items():
+        if len(parts) > 1:
+            rows |= _part_differences(section, dict.fromkeys(parts.values()), has)
+            left_out += len(parts)
+            settings = {key: words for key, words in settings.items() if key not in parts}
+    return rows | settings, left_out
+
+
+def _part_differences(section: str, parts: Collection[str], has: Sequence[set[str]]) -> dict[str, tuple[str, ...]]:
+    """The names of all parts of a section in each run if some lack several of them, otherwise whether each has it."""
+    if not section or len(parts) == 1:
+        return {part: tuple("given" if part in each else "none" for each in has) for part in parts}
+    names = [sorted(part for part in each if _is_part_of(section, part, each)) for each in has]
+    return {section: tuple(", ".join(part.rpartition(".")[2] for part in each) or "none" for each in names)}
+
+
+def _is_part_of(section: str, part: str, of_run: set[str]) -> bool:
+    """Whether a key is directly below a section and has keys below itself."""
+    return part.rpartition(".")[0] == section and any(key.startswith(f"{part}.") for key in of_run)
+
+
+def _parts(key: str) -> list[str]:
+    """'plant.tanks.A' -> 'plant', 'plant.tanks', 'plant.tanks.A'."""
+    names = key.split(".")
+    return [".".join(names[: k + 1]) for k in range(len(names))]
+
+
+def _are_one_amount(texts: Sequence[str]) -> bool:
+    """Whether all texts are the same quantity, perhaps in different units."""
+    try:
+        (first, unit), *others = map(number_and_unit, texts)
+        return all(math.isclose(in_unit(number, other, unit), first, rel_tol=ROUNDING) for number, other in others)
+    except UnitError:
+        return False
+
+
+def left_out_words(left_out: int) -> str:
+    """The sentence about the settings that `setting_differences` leaves out."""
+    return (
+        f"{counted(left_out, 'setting')} of parts that not every run has are left out; "
+        "fdi compare --csv FILE lists all of them."
+    )
 
 
 def plain_text(text: str) -> str:
@@ -123,7 +183,7 @@ def plain_text(text: str) -> str:
     with suppress(ValueError):
         value = orjson.loads(text)
         text = f"{value:.12g}" if isinstance(value, float) else _in_words(value) if text[0] in "[{" else text
-    return short(text, MOST_LETTERS) if text not in ("", "null") else "none"
+    return short(text, MOST_LETTERS) if text not in NONE else "none"
 
 
 def _in_words(value: Any) -> str:

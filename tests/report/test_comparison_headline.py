@@ -40,6 +40,10 @@ def sentences(*logs: Path) -> list[str]:
     return comparison_headline(compare(logs), [gather(read_run(log)) for log in logs])
 
 
+def settings_of(*logs: Path) -> tuple[dict[str, tuple[str, ...]], int]:
+    return setting_differences(compare(logs), [gather(read_run(log)) for log in logs])
+
+
 def test_the_run_with_the_smaller_residuals_is_better_by_their_ratio(tmp_path: Path) -> None:
     a, b = write_fit(tmp_path / "a.mcap", 0.004, explained=False), write_fit(tmp_path / "b.mcap", 0.001)
     better, unreliable, same = sentences(a, b)
@@ -80,7 +84,7 @@ def test_settings_are_told_in_words(tmp_path: Path) -> None:
     ours = {"plant.effects": [{"effect": "leak", "location": "T1"}], "seed": 1, "step": None, "sha256": "abc"}
     a = write_fit(tmp_path / "a.mcap", 0.001, config={"seed": 2})
     b = write_fit(tmp_path / "b.mcap", 0.001, config=ours)
-    assert setting_differences(compare([a, b])) == {"seed": ("2", "1"), "plant.effects": ("none", "leak at T1")}
+    assert settings_of(a, b)[0] == {"seed": ("2", "1"), "plant.effects": ("none", "leak at T1")}
     assert sentences(a, b)[-1] == "They differ in seed (2; 1) and plant.effects (none; leak at T1)."
     assert plain_text('[{"name":"T1.leak","low":null}]') == "T1.leak" and plain_text("[broken") == "[broken"
 
@@ -95,7 +99,65 @@ def test_every_difference_that_is_not_listed_is_counted(tmp_path: Path) -> None:
 def test_settings_that_differ_by_rounding_do_not_differ(tmp_path: Path) -> None:
     percent = write_fit(tmp_path / "a.mcap", 0.001, config={"confidence": 95 * 0.01, "duration": 1000.0})
     share = write_fit(tmp_path / "b.mcap", 0.001, config={"confidence": 0.95, "duration": 600.5})
-    assert setting_differences(compare([percent, share])) == {"duration": ("1000", "600.5")}
+    assert settings_of(percent, share)[0] == {"duration": ("1000", "600.5")}
+
+
+ONE_TANK = {
+    "plant.gravity": "9.81 m/s^2",
+    "plant.tanks.A.area": "200 cm^2",
+    "plant.tanks.A.height": "60 cm",
+    "plant.tolerances.A.area": "3 %",
+    "estimate.parameters": ["A.leak"],
+    "estimate.search.population": None,
+}
+TWO_TANKS = {
+    "plant.gravity": "981 cm/s^2",
+    "plant.tanks.T1.area": "160 cm^2",
+    "plant.tanks.T1.height": "100 cm",
+    "plant.tanks.T2.area": "160 cm^2",
+    "plant.tanks.T2.height": "100 cm",
+    "estimate.parameters": ["T1.leak"],
+    "estimate.search.population": 8,
+    "simulate.duration": "160 s",
+    "simulate.inputs.Q1.value": "50 cm^3/s",
+}
+
+
+def test_parts_that_some_runs_lack_are_named_without_their_settings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a = write_fit(tmp_path / "a.mcap", 0.001, config=ONE_TANK)
+    b = write_fit(tmp_path / "b.mcap", 0.001, level=0.2, config=TWO_TANKS)
+    settings, left_out = settings_of(a, b)
+    assert settings == {
+        "plant.tanks": ("A", "T1, T2"),
+        "simulate": ("none", "given"),
+        "plant.tolerances.A.area": ("3 %", "none"),
+        "estimate.parameters": ("A.leak", "T1.leak"),
+        "estimate.search.population": ("none", "8"),
+    }, "the same gravity in another unit is no difference"
+    assert left_out == 8
+    assert cli.main(["compare", str(a), str(b), "--csv", str(tmp_path / "all.csv")]) == cli.DONE
+    said = capsys.readouterr().out
+    assert "plant.tanks.T1.area" not in said and "8 settings of parts that not every run has are left out" in said
+    assert "plant.tanks.T1.area" in (tmp_path / "all.csv").read_text()
+    page = report([a, b]).page.read_text()
+    assert "plant.tanks.T1.area" not in page.split("Comparison", 1)[1].split("<article", 1)[0]
+    assert "8 settings of parts that not every run has are left out" in page
+
+
+def test_a_part_that_all_runs_have_shows_its_settings(tmp_path: Path) -> None:
+    more = {**ONE_TANK, "plant.tanks.A.leak_reference": "OUT", "plant.tanks.A.height": "61 cm"}
+    a, b, c = (
+        write_fit(tmp_path / f"{name}.mcap", 0.001, config=config)
+        for name, config in (("a", ONE_TANK), ("b", more), ("c", TWO_TANKS))
+    )
+    settings, left_out = settings_of(a, b)
+    assert settings == {"plant.tanks.A.height": ("60 cm", "61 cm"), "plant.tanks.A.leak_reference": ("none", "OUT")}
+    assert left_out == 0
+    settings, _ = settings_of(a, b, c)
+    assert settings["plant.tanks.A.height"] == ("60 cm", "61 cm", "none"), "of the runs that have it, two differ"
+    assert settings["plant.tanks"] == ("A", "A", "T1, T2")
 
 
 def test_terminal_and_page_lead_with_the_headline(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
