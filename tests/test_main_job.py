@@ -79,17 +79,26 @@ def test_it_repeats_bit_for_bit(done: TrainResult) -> None:
     assert content_hash(read_run(again.log).messages()) == content_hash(read_run(done.log).messages())
 
 
-def test_a_model_without_the_fault_is_called_unreliable_before_anything_else(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("suspect", "said"),
+    [("P32.openness", "none of the suspected faults explains the recording"), ("T3.leak", "leak at T3")],
+)
+def test_a_model_without_the_fault_is_called_unreliable_and_establishes_nothing(
+    suspect: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    changes = [word for change in (*QUICK, "estimate.parameters=[P32.openness]") for word in ("--set", change)]
+    changes = [word for change in (*QUICK, f"estimate.parameters=[{suspect}]") for word in ("--set", change)]
     assert main(["train", "--quiet", "--out", str(tmp_path), *changes]) == NOT_EXPLAINED
     warning = "Unreliable: the model does not explain the recording"
     shown = capsys.readouterr().out
-    assert shown.startswith(warning) and "estimate its onset" not in shown  # an openness has none
+    assert shown.startswith(warning)
+    assert ("estimate its onset" in shown) == (suspect == "T3.leak")  # an openness has none
+    assert f"not established: {said}" in shown and "no fault" not in shown and "single fault" not in shown
     assert main(["report", "--quiet", str(tmp_path / "default.mcap")]) == DONE
-    headline = rf"default\.mcap: {warning} \(residuals [\d.]+ times the sensors' noise\)\. "
+    headline = rf"default\.mcap: {warning} \(residuals [\d.]+ times the sensors' noise\)\. Not established: {said}"
     assert re.search(headline, capsys.readouterr().out)
+    page = (tmp_path / "default.html").read_text()
+    assert ">not established<" in page and ">present<" not in page and ">not found<" not in page
+    assert "changes the flow" not in page
 
 
 def test_interrupted_it_keeps_what_it_has(tmp_path: Path) -> None:

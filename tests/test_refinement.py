@@ -96,4 +96,4 @@ def test_a_constant_within_its_tolerance_is_no_fault_of_a_pair_that_is_determine
     # Both have the same influence, so that each takes half of the deviation.
     assert value["T2.leak.size"] == pytest.approx(-value["out.plugging.size"], abs=0.01)
     assert combination.std > 0.02 and abs(combination.value) < 3.0 * combination.std
-    assert done.result.diagnosis.names == "leak at T1"
+    assert done.result.diagnosis.statement == "single fault: leak at T1"

@@ -138,7 +138,7 @@ def in_words(done: TrainResult) -> list[str]:
         dict.fromkeys(s for r in recordings for s in data_warnings(r, done.fitting.plant))
     )
     if diagnosis.faults:
-        lines.append(f"{diagnosis.kind}: {diagnosis.names or 'no suspected fault differs significantly from nominal'}")
+        lines.append(diagnosis.statement)
     for fault in diagnosis.present:
         shown = partial(quantity_text, si_unit=fault.unit, name=fault.name)
         parts = [f"{shown(fault.value)} instead of {shown(fault.nominal)}"]

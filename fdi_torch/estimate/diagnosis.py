@@ -24,6 +24,8 @@ from fdi_torch.simulate.equilibrium import RESOLUTION
 
 # Discharge coefficient of a sharp-edged round hole (Idelchik 1986), for converting a flow into an equivalent hole.
 HOLE_COEFFICIENT = 0.6
+NOT_ESTABLISHED = "not established"
+NONE_EXPLAINS = "none of the suspected faults explains the recording"
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Test results for all suspected faults, and whether the model explains the recording.
+    """Test results for all suspected faults, valid only if the model explains the recording.
 
     faults: all suspected faults, present or not. not_isolated: combinations of fault sizes, none of them determined
     alone, that deviate significantly from nominal, so that at least one of their faults is present.
@@ -66,15 +68,26 @@ class Diagnosis:
 
     @property
     def kind(self) -> str:
-        """'no fault', 'single fault', 'fault not isolated' or 'multiple faults'."""
+        """'no fault', 'single fault', 'fault not isolated' or 'multiple faults'; 'not established' if the model does
+        not explain the recording, because every test of a fault size assumes that it does.
+        """
+        if not self.misfit.explained:
+            return NOT_ESTABLISHED
         if self.not_isolated and not self.present:
             return "fault not isolated"
         return ("no fault", "single fault", "multiple faults")[min(len(self.present) + len(self.not_isolated), 2)]
 
     @property
-    def names(self) -> str:
-        """The faults that are present, such as 'leak at T1, leak at T2 or plugging at OUT2'; may be empty."""
-        return ", ".join([*(parameter_words(f.name) for f in self.present), *map(_rivals, self.not_isolated)])
+    def statement(self) -> str:
+        """Kind and names of the faults that differ from nominal: 'multiple faults: leak at T1, leak at T2 or plugging
+        at OUT2'.
+        """
+        names = ", ".join([*(parameter_words(f.name) for f in self.present), *map(_rivals, self.not_isolated)])
+        return f"{self.kind}: {names or self._none}"
+
+    @property
+    def _none(self) -> str:
+        return "no suspected fault differs significantly from nominal" if self.misfit.explained else NONE_EXPLAINS
 
     @property
     def headline(self) -> str:
@@ -84,6 +97,8 @@ class Diagnosis:
         """
         sizes = [sized_words(f.name, [estimate_words(f.name, f.unit, f.value, f.std)]) for f in self.present]
         sizes += [f"{_rivals(c)} ({c.words})" for c in self.not_isolated]
+        if not sizes and not self.misfit.explained:
+            sizes = [NONE_EXPLAINS]
         return self.misfit.headline(f"{self.kind}: {'; '.join(sizes)}" if sizes else self.kind)
 
 

@@ -34,15 +34,11 @@ def comparison_headline(compared: Comparison, runs: Sequence[Material]) -> list[
     """Sentences: the better run, runs whose model fails, and the differences of recordings, settings and versions."""
     if compared.same_content and not compared.differences:
         return ["All logs have the same content, message by message."]
-    failing = [n for n, run in zip(compared.labels, runs, strict=True) if _is_unexplained(run)]
+    failing = [n for n, run in zip(compared.labels, runs, strict=True) if run.unexplained]
     words = [_better(compared, runs)]
     if failing:
         words.append(f"Unreliable: {_first(failing)} (the model does not explain the recording).")
     return [*words, _differences(compared, runs)]
-
-
-def _is_unexplained(run: Material) -> bool:
-    return run.about("result").get("explained") == "false"
 
 
 def _better(compared: Comparison, runs: Sequence[Material]) -> str:

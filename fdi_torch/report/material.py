@@ -65,6 +65,11 @@ class Material:
         return value if isinstance(value, list) else []
 
     @property
+    def unexplained(self) -> bool:
+        """Whether the model of this run does not explain its recording; False for a log that does not say."""
+        return self.about("result").get("explained") == "false"
+
+    @property
     def kind(self) -> str:
         return self.about("run").get("kind", "")
 

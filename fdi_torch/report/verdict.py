@@ -8,6 +8,7 @@ from typing import Any
 from fdi_torch.amounts import parameter_words
 from fdi_torch.clock import clock_text
 from fdi_torch.estimate.combinations import Combination
+from fdi_torch.estimate.diagnosis import NONE_EXPLAINS, NOT_ESTABLISHED
 from fdi_torch.estimate.misfit import UNRELIABLE, Misfit
 from fdi_torch.estimate.uncertainty import convergence_warning
 from fdi_torch.gap.verdict_words import verdict_sentence
@@ -62,19 +63,24 @@ def unreliable_words(material: Material) -> str:
     """
     result = material.about("result")
     warnings = [convergence_warning(result.get("status", "")) if material.kind == "train" else ""]
-    if result.get("explained") == "false":
+    if material.unexplained:
         ratio = result.get("unexplained_ratio", "null")
         warnings.append(UNRELIABLE if ratio == "null" else Misfit(float(ratio)).warning)
     return "".join(f"{warning}. " for warning in warnings if warning)
 
 
 def fault_words(material: Material) -> str:
-    """The faults that are present, with their sizes; those that are not isolated with their determined combination."""
+    """The faults that are present, with their sizes; those that are not isolated with their determined combination.
+
+    If the model does not explain the recording, they are called not established.
+    """
     effects = diagnosed_effects(material)
     if not effects:
         return ""
     present = [f.sized for f in effects if f.present]
     not_isolated = [_rivals(combination) for combination in combinations_of(material, "not_isolated")]
+    if material.unexplained:
+        return f"{NOT_ESTABLISHED.capitalize()}: {listed(present + not_isolated) or NONE_EXPLAINS}"
     if not present and not not_isolated:
         return "No fault found"
     count = len(present) + len(not_isolated)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.estimate.combinations import Combination
+from fdi_torch.estimate.diagnosis import NOT_ESTABLISHED
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material, Payload
@@ -90,7 +91,7 @@ def _combination_row(material: Material, combination: Combination) -> list[Any]:
     c = combination
     cells: list[Any] = [c.formula]
     if material.of("/diagnosis/fault"):
-        deviates = c in combinations_of(material, "not_isolated")
+        deviates = c in combinations_of(material, "not_isolated") and not material.unexplained
         cells.append(tag("span", "present", class_="bad") if deviates else "")
     return [
         *cells,
@@ -119,8 +120,11 @@ def _numbers(value: float, std: float, si_unit: str, name: str) -> list[str]:
 
 
 def _finding(material: Material, name: str) -> Any:
+    """What the test of a fault size says; empty for other parameters."""
     for finding in diagnosed_effects(material):
         if name in (prefix := f"{finding.location}.{finding.effect}", f"{prefix}.size"):
+            if material.unexplained:
+                return NOT_ESTABLISHED
             if finding.present:
                 return tag("span", "present", class_="bad")
             not_isolated = any(name in c.parameters for c in combinations_of(material, "not_isolated"))
@@ -133,7 +137,8 @@ def _water(material: Material) -> list[Any]:
     lines = []
     for finding in diagnosed_effects(material):
         if finding.present and np.isfinite(finding.flow):
-            text = f"{finding.words} changes the flow by {amount(finding.flow, 'm^3/s', 3)}"
+            change = "would change" if material.unexplained else "changes"
+            text = f"{finding.words} {change} the flow by {amount(finding.flow, 'm^3/s', 3)}"
             if np.isfinite(finding.hole):
                 text += f", as a sharp-edged hole of {number(1e3 * finding.hole, 3)} mm would"
             lines.append(tag("li", text))

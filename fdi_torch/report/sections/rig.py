@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from fdi_torch.estimate.diagnosis import NOT_ESTABLISHED
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
@@ -65,6 +66,7 @@ def marks_of(material: Material) -> dict[str, list[str]]:
         if finding.present:
             unit, scale = shown_unit(finding.unit)
             size = "" if math.isnan(finding.size) else f" {number(scale * finding.size, 3)} {unit}".rstrip()
+            size += f", {NOT_ESTABLISHED}" * material.unexplained
             marks.setdefault(finding.location, []).append(f"{finding.effect.replace('_', ' ')}{size}")
     for combination in combinations_of(material, "not_isolated"):
         for fault in map(ParameterName.of_effect, combination.parameters):
