@@ -19,6 +19,7 @@ from fdi_torch.report.style import HEIGHT, MARK, SOFT, VARIABLES, label_lines, l
 MOST_SAMPLES = 6000  # of a line; longer ones keep the extremes of half as many segments
 MOST_EVENTS = 50
 TIME, PLANNED = "time, s", "next"  # label of an axis of time; clock of an experiment to come
+LATE_DIGITS, ROUNDING = 1e-5, 1e-15  # differences relative to the values: beyond the fifth digit; of rounding
 ONE_ROW = 44  # letters of title and names of lines that fit one row above the picture
 
 
@@ -46,6 +47,9 @@ class Chart:
     the vertical axis begins at 0. height: of the picture, inches.
     zero: date of time 0, s since 1970; None if the axis is not time or the recording has no dates. after: words behind
     the label of the axis, as in ' after 2026-11-01 08:00:00'.
+
+    Values that differ only in digits beyond the fifth, and by more than rounding, are replaced by what they are above
+    their lowest, since no label of an axis could tell them apart.
     """
 
     title: str
@@ -66,6 +70,18 @@ class Chart:
             object.__setattr__(self, "zero", None)
         elif self.zero is not None:
             object.__setattr__(self, "after", f" after {clock_text(0.0)}")
+        values = self._values()
+        size, span = np.abs(values).max(initial=0.0), np.ptp(values) if len(values) else 0.0
+        if self.level is None and not self.from_zero and ROUNDING * size < span < LATE_DIGITS * size:
+            lines = [line._replace(y=np.asarray(line.y, dtype=float) - values.min()) for line in self.lines]
+            name, comma, unit = self.y_label.partition(", ")
+            object.__setattr__(self, "lines", lines)
+            object.__setattr__(self, "y_label", f"{name} above lowest{comma}{unit}")
+
+    def _values(self) -> np.ndarray:
+        """The finite values of all lines."""
+        values = np.concatenate([np.asarray(line.y, dtype=float) for line in self.lines] or [np.zeros(0)])
+        return values[np.isfinite(values)]
 
     @property
     def axis(self) -> str:
@@ -75,8 +91,7 @@ class Chart:
     @property
     def scale(self) -> tuple[str, float]:
         """Kind of the vertical axis, "linear", "log" or "asinh", and the width of the linear part of the last."""
-        values = np.concatenate([np.asarray(line.y, dtype=float) for line in self.lines] or [np.zeros(0)])
-        values = values[np.isfinite(values)]
+        values = self._values()
         if not self.log or not (values > 0).any() or values.min() < 0:
             return "linear", 0.0
         low = float(values.min() or np.median(values[values > 0]))

@@ -13,7 +13,7 @@ import pytest
 from browser import browser, draw_all, opened  # noqa: F401
 from sample_runs import material_of, write_train
 
-from fdi_torch.report.chart import MOST_SAMPLES, Chart, Line, chart_json
+from fdi_torch.report.chart import MOST_SAMPLES, Chart, Line, chart_json, draw
 from fdi_torch.report.page import page, report_of
 from fdi_torch.report.page_assets import POLICY, SCRIPT
 from fdi_torch.report.style import MARK, MODEL
@@ -65,6 +65,25 @@ def test_an_axis_is_logarithmic_where_values_span_decades(values: list[float], s
     x = np.arange(len(values))
     assert of_chart(Line("a", x, np.array(values), MODEL), log=True)["scale"] == scale
     assert of_chart(Line("a", x, np.array(values), MODEL))["scale"] == ["linear", 0.0]
+
+
+@pytest.mark.parametrize("excess", [[1e-4, 3e-7, 0.0], [3e-9, 1e-9, 0.0], [2e-12, 0.0, 1e-12]])
+def test_values_that_differ_in_late_digits_are_shown_above_their_lowest(excess: list[float]) -> None:
+    """The labels of picture and interactive chart would otherwise differ in digits beyond the fifth, or not at all."""
+    x, low = np.arange(3.0), 421.123456
+    chart = Chart("Cost", "iteration", "cost, cm", [Line("a", x, low + np.array(excess), MODEL)], log=True)
+    assert json.loads(chart_json(chart))["y"] == "cost above lowest, cm"
+    shown = decoded(json.loads(chart_json(chart))["lines"][0]["y"], "<f4")
+    np.testing.assert_allclose(shown, excess, rtol=1e-3, atol=2e-13)
+    axes = draw(chart).axes[0]
+    axes.figure.canvas.draw()
+    labels = [tick.get_text() for tick in axes.get_yticklabels()]
+    assert len(set(labels)) == len(labels) and max(map(len, labels)) <= 8
+
+
+@pytest.mark.parametrize("values", [[421.0, 421.0], [0.0, 0.0], [421.0, 421.0 + 6e-14], [0.3, 0.31], [np.nan, 1.0]])
+def test_values_that_are_equal_or_clearly_differ_are_shown_as_they_are(values: list[float]) -> None:
+    assert of_chart(Line("a", np.arange(2.0), np.array(values), MODEL))["y"] == "level, cm"
 
 
 def test_the_policy_allows_the_only_script_and_nothing_else() -> None:
