@@ -63,6 +63,45 @@ def test_inspect_fits_on_a_screen(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "/estimator/de/generation" in shown and shown.count("\n") < 40
 
 
+def test_inspect_shows_estimates_and_correlations_as_tables_with_units(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Standard errors of 0.01 and 2 mm, correlated by -0.5; the last parameter is not determined."""
+    result = {
+        "names": ["T1.leak.size", "T1.start_level", "link.plugging.size"],
+        "units": ["1", "m", "1"],
+        "value": [0.3, 0.4, 0.0],
+        "std": [0.01, 0.002, None],
+        "covariance": [1e-4, -1e-5, None, -1e-5, 4e-6, None, None, None, None],
+        "covariance_shape": [3, 3],
+        "noise_std": [0.001015312616463551, 0.0010142879370500788],
+        "undetermined": [],
+        "status": "converged",
+    }
+    with RunLog(tmp_path / "run.mcap", "train", env={}, git={}) as log:
+        log.result(result)
+    assert cli.main(["inspect", str(log.path)]) == cli.DONE
+    shown = capsys.readouterr().out
+    rows = [line.split() for line in shown.splitlines()]
+    assert ["T1.leak.size", "1", "0.300", "±", "0.010"] in rows
+    assert ["T1.start_level", "cm", "40.00", "±", "0.20"] in rows
+    assert ["link.plugging.size", "1", "not", "determined"] in rows
+    assert ["2", "T1.start_level", "-0.50", "1.00"] in rows
+    assert ["result", "noise_std", "0.001015,", "0.001014"] in rows and ["result", "status", "converged"] in rows
+    assert "covariance" not in shown and "[" not in shown and "undetermined" not in shown
+
+
+@pytest.mark.parametrize("damaged", ["[0.3", "{}", "null", '[{"a": 1}]', "[0.3, 0.4]"])
+def test_inspect_shows_an_unreadable_estimate_as_it_stands(
+    damaged: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with RunLog(tmp_path / "run.mcap", "train", env={}, git={}) as log:
+        log.result({"names": ["T1.leak.size"], "units": ["1"], "value": damaged, "std": [0.01]})
+    assert cli.main(["inspect", str(log.path)]) == cli.DONE
+    shown = capsys.readouterr().out
+    assert ("value 0.3, 0.4" if damaged == "[0.3, 0.4]" else f"value {damaged}") in shown
+
+
 def test_inspect_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = write_estimate(tmp_path / "run.mcap", 0.3)
     assert cli.main(["inspect", str(log), "--json"]) == cli.DONE

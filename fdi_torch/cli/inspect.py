@@ -6,16 +6,25 @@ Path: cli.inspect.run → logbook.inspect.inspect_log → logbook.export.export
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import orjson
 
+from fdi_torch.amounts import with_error
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import named_errors, write_text
 from fdi_torch.logbook import Inspection, export, export_attachment, foxglove_layout, inspect_log, read_run
+from fdi_torch.quantities import display_unit
 
-MOST_RESULTS = 12
+MOST_RESULTS, MOST_CORRELATIONS = 12, 10
+ESTIMATE = ("names", "units", "value", "std", "covariance", "covariance_shape")  # results that are shown as tables
+DRAWS = ("draws.parameter", "draws.unit", "draws.median", "draws.std")
+ShownTable = tuple[str, list[str], list[list[str]]]
+"""Title, header and rows."""
 RECORDS = ("run", "status", "data", "seeds", "git")
 
 
@@ -71,11 +80,19 @@ def show(inspection: Inspection, screen: Screen) -> None:
         values = {name: value for name, value in inspection.about.get(record, {}).items() if value}
         if values:
             screen.say(f"{record:<8}{', '.join(f'{name} {value}' for name, value in values.items())}")
-    results = list(inspection.about.get("result", {}).items())
-    for name, value in results[:MOST_RESULTS]:
-        screen.say(f"result  {name} {value[:100]}")
+    result = inspection.about.get("result", {})
+    tables = estimate_tables(result)
+    results = [
+        (name, result_text(text)) for name, text in result.items() if not (tables and name in (*ESTIMATE, *DRAWS))
+    ]
+    results = [(name, text) for name, text in results if text]
+    for name, text in results[:MOST_RESULTS]:
+        screen.say(f"result  {name} {text[:100]}")
     if len(results) > MOST_RESULTS:
-        screen.say(f"result  and {len(results) - MOST_RESULTS} more")
+        screen.say(f"result  and {len(results) - MOST_RESULTS} more: --json shows all")
+    for title, header, cells in tables:
+        screen.say()
+        screen.table(title, header, cells, left=2)
     rows = [
         [info.topic, info.schema, str(info.messages), f"{info.first:.6g}", f"{info.last:.6g}", str(info.size)]
         for info in inspection.topics.values()
@@ -90,6 +107,50 @@ def show(inspection: Inspection, screen: Screen) -> None:
     for sentence in (*inspection.health.problems, inspection.advice):
         if sentence:
             screen.say(f"- {sentence}")
+
+
+def estimate_tables(result: Mapping[str, str]) -> list[ShownTable]:
+    """The estimates and, of a few, their correlations, and the draws; none if a record is unreadable."""
+    try:
+        names, units, values, std, covariance = (orjson.loads(result.get(key, "[]")) for key in ESTIMATE[:5])
+        drawn = [orjson.loads(result.get(key, "[]")) for key in DRAWS]
+        tables = [("estimates", ["parameter", "unit", "estimate"], _rows(names, units, values, std))]
+        tables += [("draws", ["parameter", "unit", "median and standard deviation"], _rows(*drawn))]
+        sigma = np.array([np.nan if s is None else s for s in std], dtype=float)
+        matrix = np.array(covariance, dtype=float).reshape(len(names), -1)
+    except (ValueError, TypeError, AttributeError):
+        return []
+    determined = np.flatnonzero(sigma > 0.0)
+    if matrix.shape == (len(names),) * 2 and 1 < len(determined) <= MOST_CORRELATIONS:
+        rho = matrix[np.ix_(determined, determined)] / np.outer(sigma[determined], sigma[determined])
+        below = [[f"{rho[i, j]:z.2f}" if j <= i else "" for j in range(len(rho))] for i in range(len(rho))]
+        numbers = [str(k + 1) for k in range(len(rho))]
+        cells = [[n, names[i], *row] for n, i, row in zip(numbers, determined, below, strict=True)]
+        tables.insert(1, ("correlations of the estimates", ["", "parameter", *numbers], cells))
+    return [table for table in tables if table[2]]
+
+
+def _rows(
+    names: Sequence[str], units: Sequence[str], values: Sequence[float | None], std: Sequence[float | None]
+) -> list[list[str]]:
+    """Parameter, unit for display, and value with its standard error, which is missing if it is not determined."""
+    rows = []
+    for name, unit, value, error in zip(names, units, values, std, strict=True):
+        shown, scale = display_unit(unit, name)
+        x, sigma = (
+            bad if number is None else scale * float(number) for number, bad in ((value, np.nan), (error, np.inf))
+        )
+        rows.append([name, shown or "1", with_error(x, sigma)])
+    return rows
+
+
+def result_text(text: str) -> str:
+    """A result in words: the numbers of a list with four digits; empty for an empty list."""
+    with suppress(ValueError):
+        value = orjson.loads(text)
+        if isinstance(value, list) and all(isinstance(each, int | float | str) for each in value):
+            return ", ".join(f"{each:.4g}" if isinstance(each, float) else str(each) for each in value)
+    return text
 
 
 def as_json(inspection: Inspection) -> dict[str, object]:
