@@ -75,6 +75,10 @@ class ThreadedServer:
 
     def __init__(self) -> None:
         self.port = free_port()
+        self.start()
+
+    def start(self) -> None:
+        """Start the server, again after `close`, on its port."""
         self._ready = threading.Event()
         self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), daemon=True)
         self._thread.start()

@@ -71,31 +71,34 @@ def source(port: int, **changes: object) -> dict[str, object]:
     return {"url": f"modbus://127.0.0.1:{port}", "tags": tags, "clock": clock, **settings, **changes}
 
 
-@pytest.mark.parametrize("cut", [False, True])
+@pytest.mark.parametrize("disturbance", ["none", "cut", "restart"])
 def test_a_recording_through_a_server_gives_the_events_of_the_file(
-    cut: bool, tmp_path: Path, plc: Plc, capsys: pytest.CaptureFixture[str]
+    disturbance: str, tmp_path: Path, plc: Plc, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Each sample is read at least twice. cut: the network is cut for a while; the server waits meanwhile."""
+    """Each sample is read at least twice. cut: the network is cut for a while; restart: the server is stopped and
+    started again. The plant waits meanwhile.
+    """
     expected = monitored(["--config", config(tmp_path, recording={"file": str(written(tmp_path / "all.csv"))})], capsys)
     proxy = Proxy(plc.port)
 
     def disturb() -> None:
         while plc.sent < 210:
             time.sleep(0.01)
-        proxy.cut()
+        (proxy.cut if disturbance == "cut" else plc.close)()
         time.sleep(0.7)
-        proxy.mend()
+        (proxy.mend if disturbance == "cut" else plc.start)()
 
-    if cut:
+    disturbed = disturbance != "none"
+    if disturbed:
         thread = threading.Thread(target=disturb)
         thread.start()
-    path = config(tmp_path, recording=None, source=source(proxy.port))
-    events = monitored(["--config", path, "--idle", "2"], capsys)
-    if cut:
+    path = config(tmp_path, recording=None, source=source(plc.port if disturbance == "restart" else proxy.port))
+    events = monitored(["--config", path, "--idle", "3"], capsys)
+    if disturbed:
         thread.join()
     proxy.cut()
     assert told(events) == told(expected)
-    assert ("lost" in texts(events), "again after" in texts(events)) == (cut, cut)
+    assert (texts(events).count("lost"), texts(events).count("again after")) == (disturbed, disturbed)
 
 
 def test_without_a_clock_the_time_of_polling_counts(tmp_path: Path, plc: Plc) -> None:
@@ -131,6 +134,7 @@ def test_a_device_that_cannot_be_used_is_refused_in_a_sentence(
     path = config(tmp_path, recording=None, source=source(plc.port, **changes))
     assert main(["monitor", "--config", path, "--quiet"]) == 2
     assert sentence in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.mcap*")), "no log of a run that never began"
 
 
 def test_neighbouring_registers_are_read_by_one_request() -> None:

@@ -13,7 +13,7 @@ import pytest
 from live_servers import Broker, broker, free_port
 from test_monitor_follow import config, growing, logged_events, monitored, readings, texts, written
 
-from fdi_torch.cli import INTERRUPTED, main
+from fdi_torch.cli import INTERRUPTED, MISUSE, main
 from fdi_torch.live.address import PASSWORD, USER, address_of
 from fdi_torch.live.mqtt import MqttClient
 
@@ -175,6 +175,10 @@ def test_a_killed_run_of_a_source_with_dates_is_resumed_with_its_time_origin(
         assert main(["monitor", *words, "--json", "--quiet"]) == INTERRUPTED
     thread.join()
     early = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    running.stop()  # a resumed run that cannot reach the broker leaves the samples to the next
+    assert main(["monitor", *words, "--resume", "--quiet"]) == MISUSE
+    running.start()
+    capsys.readouterr()
     rig = Rig(running.port)
     rig.send(dated[225:])
     late = monitored([*words, "--resume"], capsys)
@@ -237,6 +241,7 @@ def test_a_source_that_cannot_be_used_is_refused_in_a_sentence(
     changes = {key: v.replace("PORT", str(port)) if isinstance(v, str) else v for key, v in changes.items()}
     assert main(["monitor", "--config", live_config(tmp_path, port, **changes), "--quiet"]) == 2
     assert sentence.replace("PORT", str(port)) in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.mcap*")), "no log of a run that never began"
     both = config(tmp_path, source=source(port))
     assert main(["monitor", "--config", both, "--quiet"]) == 2
     assert "expected either recording or source, got both" in capsys.readouterr().err

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -20,6 +20,7 @@ from test_live_mqtt import MESSAGES, told
 from test_monitor_follow import config, monitored, texts, written
 
 from fdi_torch.cli import main
+from fdi_torch.live.values import Inbox, Item
 
 asyncua = pytest.importorskip("asyncua")
 
@@ -28,7 +29,11 @@ START = datetime(2026, 1, 1, tzinfo=UTC)
 
 
 class Plc(ThreadedServer):
-    """An OPC UA server with a node a channel, in a thread of its own."""
+    """An OPC UA server with a node a channel, in a thread of its own, which starts with its last sample."""
+
+    def __init__(self) -> None:
+        self._last = MESSAGES[0]
+        super().__init__()
 
     async def serve(self) -> AsyncIterator[None]:
         server = asyncua.Server()
@@ -38,15 +43,16 @@ class Plc(ThreadedServer):
         for name in NAMES:
             node = await server.nodes.objects.add_variable(f"ns=2;s=Rig.{name}", f"2:{name}", 0.0)
             self.nodes[name] = node
+        self._server = server
+        await self._write(self._last)
         async with server:
-            self._server = server
             yield
 
     def write(self, sample: dict[str, float], bad: tuple[str, ...] = (), only: tuple[str, ...] = NAMES) -> None:
         asyncio.run_coroutine_threadsafe(self._write(sample, bad, only), self.loop).result(10.0)
 
-    async def _write(self, sample: dict[str, float], bad: tuple[str, ...], only: tuple[str, ...]) -> None:
-        ua = asyncua.ua
+    async def _write(self, sample: dict[str, float], bad: tuple[str, ...] = (), only: tuple[str, ...] = NAMES) -> None:
+        self._last, ua = sample, asyncua.ua
         for name in only:
             status = ua.StatusCode(ua.StatusCodes.BadSensorFailure if name in bad else ua.StatusCodes.Good)
             value = ua.DataValue(
@@ -126,6 +132,46 @@ def test_a_recording_through_a_server_gives_the_events_of_the_file(
     assert ("lost" in texts(events), "again after" in texts(events)) == (cut, cut)
 
 
+@pytest.mark.slow
+def test_a_server_that_is_stopped_and_started_again_loses_no_event(
+    tmp_path: Path,
+    plc: Plc,
+    once_subscribed: Callable[[Callable[[], None]], threading.Thread],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A restarted server knows neither session nor subscription. The plant waits until the monitor is back, because
+    nothing keeps samples meanwhile.
+    """
+    connected_again, put = threading.Event(), Inbox.put
+
+    def noticing(self: Inbox, items: Iterable[Item]) -> None:
+        put(self, kept := list(items))
+        if any(isinstance(item, str) and "again after" in item for item in kept):
+            connected_again.set()
+
+    monkeypatch.setattr(Inbox, "put", noticing)
+    expected = monitored(["--config", config(tmp_path, recording={"file": str(written(tmp_path / "all.csv"))})], capsys)
+
+    def replay() -> None:
+        for k, sample in enumerate(MESSAGES):
+            if k == 210:
+                time.sleep(0.5)  # for what the server has not sent yet
+                plc.close()
+                time.sleep(1.0)
+                plc.start()
+                assert connected_again.wait(60.0)
+            plc.write(sample)
+            time.sleep(0.005)
+
+    thread = once_subscribed(replay)
+    path = config(tmp_path, recording=None, source=source(plc.port))
+    events = monitored(["--config", path, "--idle", "14"], capsys)
+    thread.join()
+    assert told(events) == told(expected)
+    assert texts(events).count("trying again") == texts(events).count("again after") == 1
+
+
 def test_a_bad_status_is_a_missing_reading(tmp_path: Path, plc: Plc) -> None:
     from fdi_torch.config.live_source import LiveRows
     from fdi_torch.config.monitor_file import load_monitor
@@ -155,6 +201,7 @@ def test_a_node_or_server_that_is_missing_is_named(
     absent = config(tmp_path, recording=None, source=source(free_port()))
     assert main(["monitor", "--config", absent, "--quiet"]) == 2
     assert "expected an OPC UA server" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.mcap*")), "no log of a run that never began"
     clock = config(tmp_path, recording=None, source=source(plc.port, clock={"tag": "t"}))
     assert main(["monitor", "--config", clock, "--quiet"]) == 2
     assert "clock: expected none for OPC UA" in capsys.readouterr().err

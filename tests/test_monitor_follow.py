@@ -283,12 +283,15 @@ def test_a_fault_that_was_there_before_the_recording_is_said_to_be(
 
 def test_a_file_that_cannot_be_followed_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "rig.csv").write_text(HEADER)
-    assert main(["monitor", "--config", config(tmp_path), "--follow", "--idle", "0.2", "--quiet"]) == 2
-    assert "expected samples to follow, got 0; check that" in capsys.readouterr().err
     thinned = config(tmp_path, recording={"file": "rig.csv", "every": 2})
     assert main(["monitor", "--config", thinned, "--follow", "--quiet"]) == 2
     assert "expected neither mask nor every" in capsys.readouterr().err
-    assert main(["monitor", "--config", config(tmp_path, recording={"file": "no.mcap"}), "--follow", "--quiet"]) == 2
+    (tmp_path / "other.csv").write_text("t_s,Q1_cm3_s\n")
+    for name in ("no.mcap", "no.csv", "other.csv"):
+        assert main(["monitor", "--config", config(tmp_path, recording={"file": name}), "--follow", "--quiet"]) == 2
+    assert not list(tmp_path.rglob("*.mcap*")), "no log of a run that never began"
+    assert main(["monitor", "--config", config(tmp_path), "--follow", "--idle", "0.2", "--quiet"]) == 2
+    assert "expected samples to follow, got 0; check that" in capsys.readouterr().err
     with RunLog(tmp_path / "bare.mcap", "rig") as log:
         log.write("/plant/input", {"Q1": 1.0, "Q2": 1.0}, 0.0)
     assert main(["monitor", "--config", config(tmp_path, recording={"file": "bare.mcap"}), "--follow", "--quiet"]) == 2

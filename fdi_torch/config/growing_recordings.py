@@ -33,7 +33,7 @@ def growing_rows(
     idle: float,
     began: Callable[[float], None] | None = None,
 ) -> Iterator[Row | str]:
-    """Samples in the order of writing, and a sentence for each row that cannot be read.
+    """Samples in the order of writing, and a sentence for each row that cannot be read. The file is opened at once.
 
     Ends when the file is finished, or when nothing has arrived for `idle` s. Raises ConfigError for an unusable file.
     began: called with time 0 as the file's clock shows it, s since 1970, if it has dates.
@@ -60,6 +60,14 @@ def growing_rows(
         mapping = channel_mapping(config, plant)
         is_log = ".mcap" in path.suffixes
         rows = _mcap_rows(path, plant, mapping, idle) if is_log else _csv_rows(path, plant, mapping, idle, began)
+    except (ValueError, LogError) as error:
+        raise ConfigError([str(error)]) from error
+    return _between(rows, start, stop)
+
+
+def _between(rows: Iterator[Row | str], start: float, stop: float) -> Iterator[Row | str]:
+    """The rows from start to stop, s, and all sentences."""
+    try:
         for row in rows:
             if isinstance(row, str) or start <= row[0] <= stop:
                 yield row
@@ -87,6 +95,10 @@ def _csv_rows(
     inputs, outputs = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
     file = GrowingCsv(path, inputs, outputs, mapping)
     expect_units(str(path), (*inputs, *outputs), (*file.input_units, *file.output_units), plant)
+    return _new_rows(file, idle, began)
+
+
+def _new_rows(file: GrowingCsv, idle: float, began: Callable[[float], None] | None) -> Iterator[Row | str]:
     quiet_since = time.monotonic()
     while time.monotonic() - quiet_since <= idle:
         seconds, commands, readings, troubles = file.new()

@@ -7,6 +7,7 @@ resumed by processing the logged samples again, which is a thousand times faster
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -22,7 +23,7 @@ from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.jobs.event_messages import event_key
 from fdi_torch.jobs.live_batches import DelayWatch, LiveBatches
-from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
+from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path, partial_path
 from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.monitor_rows import (
     ALARM,
@@ -70,12 +71,18 @@ def run_monitor(
     origin = logged_origin(unfinished) if unfinished is not None else None
     messages = unfinished.messages([ALARM]) if unfinished is not None else ()
     reported = Counter(event_key(message.payload) for message in messages)
+    zeros: list[float] = []
+    try:  # before the log begins, so that a source that cannot be reached leaves none
+        source = _source(run, idle, origin, _rows(earlier), zeros) if follow else iter(())
+    except BaseException:
+        if unfinished is not None:
+            os.replace(unfinished.path, partial_path(path))  # for the next attempt to resume
+        raise
     with RunLog(path, "monitor", **origin_of(run, whole), listener=callbacks.log, after_interruption=RESUMES) as log:
         monitor = LoggedMonitor(run, log, callbacks, reported)
         try:
             if whole is None:
-                zeros: list[float] = []
-                _follow(monitor, callbacks, _source(run, idle, origin, _rows(earlier), zeros), earlier, zeros)
+                _follow(monitor, callbacks, source, earlier, zeros)
             else:
                 show_clock([whole.clock_zero])
                 if run.config.recording.every > 1:  # the inputs' mean until the next kept sample is known only then
