@@ -36,7 +36,13 @@ def test_from_nothing_to_a_diagnosis_with_new_files_alone(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     fdi("new", "plant", "--out", "rig.yaml")
+    assert cli.main(["check", "--plant", "rig.yaml"]) == cli.NOT_EXPLAINED
+    said = capsys.readouterr().out
+    assert [f", {part}: " in said for part in ("tanks", "pipes", "pumps", "sensors")] == [True] * 4
+    assert "- line 5, tanks: which there are; cross-section, and height from the floor to the rim" in said
+    Path("rig.yaml").write_text(Path("rig.yaml").read_text().replace("# !", "#"))
     fdi("check", "--plant", "rig.yaml")
+    assert "placeholders" not in capsys.readouterr().out
     for kind in ("run", "monitor", "study"):
         fdi("new", kind, "--plant", "rig.yaml")
     assert "run.yaml; next: fdi train --config run.yaml" in capsys.readouterr().out
@@ -200,7 +206,7 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
         "outside",
     ]
     assert plant.pumps[0].max_flow == pytest.approx(4e-3 / 60)
-    fdi("check", "--plant", "rig.yaml", "--recording", "trend.csv")
+    assert cli.main(["check", "--plant", "rig.yaml", "--recording", "trend.csv"]) == cli.NOT_EXPLAINED
     fdi("new", "monitor", "--plant", "rig.yaml", "--recording", "trend.csv")
     fdi("new", "run", "--plant", "rig.yaml", "--recording", "trend.csv")
     assert load_monitor("monitor.yaml").config.recording.file == "trend.csv"
@@ -239,7 +245,7 @@ def test_a_recording_with_a_row_per_value_is_mapped_by_tags(
     for name, column, unit in (("Q", "FIC1", "l/min"), ("hA", "LI101", "mm"), ("hB", "LI102", "mm")):
         lines = lines.replace(f"{name}: {{column: TAG, unit: ...}}", f"{name}: {{column: {column}, unit: {unit}}}")
     Path("runs.yaml").write_text("recordings:\n" + lines)
-    fdi("check", "--plant", "rig.yaml", "--recording", "runs.yaml")
+    assert cli.main(["check", "--plant", "rig.yaml", "--recording", "runs.yaml"]) == cli.NOT_EXPLAINED
     assert "long.csv: 60 samples" in capsys.readouterr().out
 
 

@@ -12,8 +12,10 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fdi_torch.cli import DONE, NOT_EXPLAINED
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.plant_file import chosen_plant
+from fdi_torch.config.plant_file import chosen_plant, placeholders
+from fdi_torch.config.yaml_files import find_plant
 from fdi_torch.names import counted
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
 from fdi_torch.plant.scales import emptying_time
@@ -29,6 +31,12 @@ WRONG = ("range", "slip", "unit")  # findings that no diagnosis accepts or survi
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     plant, recordings, base = _wanted(arguments)
     checks = []
+    guesses = [] if arguments.plant is None else placeholders(find_plant(arguments.plant, Path.cwd()))
+    if guesses:
+        screen.say(f"{arguments.plant}: these entries are still placeholders; correct each, and delete its !")
+        for place in guesses:
+            screen.say(f"- {place}")
+        screen.say()
     _show_plant(plant, screen)
     if arguments.picture:
         from fdi_torch.report.schematic import schematic
@@ -45,11 +53,11 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             screen.say(f"usable with all inputs known: {spans}")
     if checks and arguments.config is None:
         named = f"--plant {arguments.plant} --recording {arguments.recording or arguments.file}"
-        wrong = any(f.kind in WRONG for check in checks for f in check.findings)
+        wrong = bool(guesses) or any(f.kind in WRONG for check in checks for f in check.findings)
         correct = "correct the plant file or the columns, then check again; " if wrong else ""
         screen.say(f"next: {correct}fdi gap {named} says whether the plant file explains it")
-    screen.result({"format": "fdi_torch.check/1", "plant": plant, "recordings": checks})
-    return 0
+    screen.result({"format": "fdi_torch.check/1", "plant": plant, "recordings": checks, "placeholders": guesses})
+    return NOT_EXPLAINED if guesses else DONE
 
 
 def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[RecordingConfig], Path]:

@@ -14,7 +14,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import named_errors
 
 NEXT = {
-    "plant": "{correct}fdi check --plant {}{recording}",
+    "plant": "correct what follows a !, then fdi check --plant {}{recording}",
     "run": "fdi train --config {}",
     "monitor": "fdi monitor --config {}",
     "rehearsal": "fdi rehearse --config {}",
@@ -34,9 +34,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     with named_errors(path), path.open("x", encoding="utf-8") as file:
         file.write(text)
     recording = f" --recording {arguments.recording}" if arguments.recording else ""
-    correct = "correct what follows a !, then " if recording else ""
     to_complete = "complete the columns, then " if "column: ..." in text else ""
-    screen.say(f"{path}; next: {to_complete}{NEXT[arguments.kind].format(path, recording=recording, correct=correct)}")
+    screen.say(f"{path}; next: {to_complete}{NEXT[arguments.kind].format(path, recording=recording)}")
     screen.result({"format": "fdi_torch.new/1", "file": str(path), "kind": arguments.kind})
     return DONE
 

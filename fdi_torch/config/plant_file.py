@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sized
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,9 @@ from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, READING_UNITS, Faul
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.quantities import SI_UNITS, display_in, unit_factor
 from fdi_torch.untrusted_input import MOST_COMPONENTS
+
+MARK = re.compile(r"\s*([\w.-]+):[^#]*#\s*!\s*(.*\S)\s*")
+"""An entry whose comment begins with an exclamation mark."""
 
 
 def _start_level(value: Any) -> float | None:
@@ -96,6 +100,12 @@ def chosen_plant(name: str | Path) -> Plant:
     plant = load_plant(name)
     display_in(units_for_display(plant))
     return plant
+
+
+def placeholders(path: Path) -> list[str]:
+    """The entries that a new plant file marks with ! as guesses: 'line 5, tanks: cross-section'."""
+    marked = ((number, MARK.match(line)) for number, line in enumerate(path.read_text("utf-8").splitlines(), 1))
+    return [f"line {number}, {match[1]}: {match[2]}" for number, match in marked if match]
 
 
 def build_plant(data: dict[str, Any], source: str) -> Plant:

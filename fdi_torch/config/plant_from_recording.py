@@ -80,7 +80,7 @@ def plant_from_recording(path: Path, name: str) -> str:
     used = {column.header for column in (*sensors, *commands)}
     without = [column for column in named if column not in used]
     lines = [
-        f"# From the columns of {path.name}. Correct what follows a !, then check it.",
+        f"# From the columns of {path.name}. Correct what follows a ! and delete the !, then check the file.",
         *([f"# Left out, as their header has no unit of a level or command: {', '.join(without)}"] if without else []),
         f"name: {name}",
         "",

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from fdi_torch.amounts import estimate_words, parameter_words, sized_words
 from fdi_torch.estimate.combinations import Combination
-from fdi_torch.estimate.misfit import Misfit
+from fdi_torch.estimate.misfit import NONE_EXPLAINS, NOT_ESTABLISHED, Misfit
 from fdi_torch.names import listed
 from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace, common_name
 from fdi_torch.plant.effect import Stage
@@ -24,8 +24,6 @@ from fdi_torch.simulate.equilibrium import RESOLUTION
 
 # Discharge coefficient of a sharp-edged round hole (Idelchik 1986), for converting a flow into an equivalent hole.
 HOLE_COEFFICIENT = 0.6
-NOT_ESTABLISHED = "not established"
-NONE_EXPLAINS = "none of the suspected faults explains the recording"
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ EXACT = 1e-5
 """Relative error of a simulated reading: `gap.free_runs.prediction` stops at this defect. A recording without noise
 that is mostly at rest has smaller second differences, and would count as unexplained by the plant that made it."""
 UNRELIABLE = "Unreliable: the model does not explain the recording"
+NOT_ESTABLISHED, NONE_EXPLAINS = "not established", "none of the suspected faults explains the recording"
+"""Words for the faults of such a model, whose tests assume that it explains the recording."""
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ from typing import Any
 from fdi_torch.amounts import parameter_words
 from fdi_torch.clock import clock_text
 from fdi_torch.estimate.combinations import Combination
-from fdi_torch.estimate.diagnosis import NONE_EXPLAINS, NOT_ESTABLISHED
-from fdi_torch.estimate.misfit import UNRELIABLE, Misfit
+from fdi_torch.estimate.misfit import NONE_EXPLAINS, NOT_ESTABLISHED, UNRELIABLE, Misfit
 from fdi_torch.estimate.uncertainty import convergence_warning
 from fdi_torch.gap.verdict_words import verdict_sentence
 from fdi_torch.names import counted, listed

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.estimate.combinations import Combination
-from fdi_torch.estimate.diagnosis import NOT_ESTABLISHED
+from fdi_torch.estimate.misfit import NOT_ESTABLISHED
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material, Payload

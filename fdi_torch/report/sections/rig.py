@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from fdi_torch.estimate.diagnosis import NOT_ESTABLISHED
+from fdi_torch.estimate.misfit import NOT_ESTABLISHED
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
