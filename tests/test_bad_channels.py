@@ -6,12 +6,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+import yaml
 from torch import Tensor
 
+from fdi_torch.config.loaded_recordings import read_recording
+from fdi_torch.config.recording_config import config_of
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.diagnose import Settings, diagnose
@@ -27,6 +31,7 @@ from fdi_torch.gap.preprocess.first_order_likelihood import FirstOrderLikelihood
 from fdi_torch.gap.trajectory_problem import BEHIND
 from fdi_torch.jobs.logged_monitor import usable_part
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.csv_writing import write_csv
 from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs
 from tests.test_gap import SMALL, noise, nominal_plant, recorded
 
@@ -163,22 +168,39 @@ def late(run: Recording, seconds: int) -> Recording:
 
 @pytest.mark.parametrize("seconds", [40, -20, pytest.param(-200, marks=pytest.mark.slow)])
 def test_clock_offsets_are_refused(seconds: int) -> None:
-    with pytest.raises(ValueError, match=rf"the readings: the clock seems to run {abs(seconds)}(\.\d)? s (be|ah)"):
+    when = "late" if seconds > 0 else "early"
+    with pytest.raises(ValueError, match=rf"the readings: stamped {abs(seconds)}(\.\d)? s too {when},"):
         usable(nominal_plant(), late(sound(), seconds))
 
 
 def test_a_sensor_that_reads_ahead_of_the_others_is_refused() -> None:
     run, early = sound(), 60
     ahead = with_channel(run, 1, torch.cat([run.outputs[early:, 1], run.outputs[-early:, 1]])).stretch(0, 1900)
-    with pytest.raises(ValueError, match=r"h2: the clock seems to run \S+ s ahead of that of the other channels"):
+    with pytest.raises(ValueError, match=r"h2: stamped \S+ s too early, by the times of the other channels"):
         usable(nominal_plant(), ahead)
+
+
+@pytest.mark.parametrize("late_by", [-60, 60])
+def test_the_correction_that_is_named_mends_the_clock(late_by: int, tmp_path: Path) -> None:
+    """The channel in a file of its own, with the shift of the message."""
+    plant, run = nominal_plant(), sound()
+    moved = with_channel(run, 1, torch.roll(run.outputs[:, 1], late_by)).stretch(
+        max(late_by, 0), 2000 + min(late_by, 0)
+    )
+    file = write_csv(moved, tmp_path / "run.csv")
+    whole = read_recording(config_of(file), plant, tmp_path)
+    fault = examined(plant, whole).fault
+    assert fault is not None
+    fix = fault.text.partition("also: ")[2].replace("...", file.name)
+    mended = read_recording(config_of({"file": file.name, "also": yaml.safe_load(fix)}), plant, tmp_path)
+    assert [examined(plant, part).fault for part in mended.known_segments()] == [None]
 
 
 def test_a_late_sensor_is_accepted_if_the_caller_considers_sensor_delays() -> None:
     run, delay = sound(), 60
     late_one = with_channel(run, 1, torch.cat([run.outputs[:delay, 1], run.outputs[:-delay, 1]])).stretch(delay, 2000)
     assert usable(nominal_plant(), late_one, effects=True).fault is not None
-    with pytest.raises(ValueError, match=r"h2: the clock seems to run \S+ s behind that of the other channels"):
+    with pytest.raises(ValueError, match=r"h2: stamped \S+ s too late, by the times of the other channels"):
         usable(nominal_plant(), late_one)
 
 

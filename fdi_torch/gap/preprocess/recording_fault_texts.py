@@ -41,10 +41,11 @@ def clock_offset(columns: tuple[str, ...], delay: float, everything: bool) -> Re
     """Readings are `delay` seconds late. everything: all of them, against the inputs."""
     what = "the readings" if everything else ", ".join(columns)
     reference = "the inputs" if everything else "the other channels"
+    fix = ", ".join([f"t: {{shift: {-delay:.3g} s}}", *(f"{column}: {{column: {column}}}" for column in columns)])
     text = (
-        f"{what}: the clock seems to run {abs(delay):.3g} s {'behind' if delay > 0 else 'ahead of'} that of "
-        f"{reference}; "
-        "state the shift of each file under columns: {t: {shift: ...}}"
+        f"{what}: stamped {abs(delay):.3g} s too {'late' if delay > 0 else 'early'}, by the times of {reference}; "
+        f"if that is a fault of the clock, name the file once more, with another shift: also: "
+        f"[{{file: ..., columns: {{{fix}}}}}]"
     )
     return RecordingFault(("all",) if everything else columns, text, physical=delay > 0 and not everything)
 
