@@ -6,7 +6,7 @@ import csv
 import io
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,10 +27,12 @@ def export(run: Run, topic: str, form: str, stream: BinaryIO) -> int:
     """
     if form not in _FORMS:
         raise ValueError(f"expected one of the formats {', '.join(_FORMS)}, got {form}")
-    if next(run.messages([topic]), None) is None:
+    messages = list(run.messages([topic]))
+    if not messages:
         known = ", ".join(sorted({message.topic for message in run.messages()})) or "(none)"
         raise LogError(f"{run.path}: expected one of the topics {known}, got {topic}")
-    return _FORMS[form](run, topic, stream)
+    _FORMS[form](run, messages, stream)
+    return len(messages)
 
 
 def export_attachment(run: Run, name: str, folder: str | Path) -> Path:
@@ -56,51 +58,41 @@ def safe_name(name: str) -> str:
     return _UNSAFE.sub("_", last).lstrip(".")[:100] or "attachment"
 
 
-def _csv(run: Run, topic: str, stream: BinaryIO) -> int:
-    columns, units = _columns(run, topic)
+def _csv(_run: Run, messages: Sequence[Message], stream: BinaryIO) -> None:
+    columns, units = _columns(messages)
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
     table = csv.writer(text)
     table.writerow([_header(name, units.get(name, "")) for name in columns])
-    count = 0
-    for payload in _payloads(run, topic):
-        count += 1
+    for message in messages:
+        payload = message.payload
         table.writerow([_cell(payload.get(name)) for name in columns])
     text.detach()
-    return count
 
 
-def _ndjson(run: Run, topic: str, stream: BinaryIO) -> int:
-    count = 0
-    for message in run.messages([topic]):
-        count += 1
+def _ndjson(run: Run, messages: Sequence[Message], stream: BinaryIO) -> None:
+    for message in messages:
         stream.write(orjson.dumps(_loaded(run, message), option=orjson.OPT_APPEND_NEWLINE))
-    return count
 
 
-def _npz(run: Run, topic: str, stream: BinaryIO) -> int:
-    columns, _ = _columns(run, topic)
-    payloads = list(_payloads(run, topic))
+def _npz(_run: Run, messages: Sequence[Message], stream: BinaryIO) -> None:
+    columns, _ = _columns(messages)
+    payloads = [message.payload for message in messages]
     arrays = {name: _array([payload.get(name) for payload in payloads]) for name in columns}
     usable = {name: array for name, array in arrays.items() if array is not None}
     np.savez_compressed(stream, **usable)  # type: ignore[arg-type]
-    return len(payloads)
 
 
-_FORMS: dict[str, Callable[[Run, str, BinaryIO], int]] = {"csv": _csv, "ndjson": _ndjson, "npz": _npz}
+_FORMS: dict[str, Callable[[Run, Sequence[Message], BinaryIO], None]] = {"csv": _csv, "ndjson": _ndjson, "npz": _npz}
 
 
-def _columns(run: Run, topic: str) -> tuple[list[str], dict[str, str]]:
-    """Fields of a topic's messages, `t` first, and their units."""
+def _columns(messages: Sequence[Message]) -> tuple[list[str], dict[str, str]]:
+    """Fields of the messages, `t` first, and their units."""
     names: dict[str, None] = {}
     units: dict[str, str] = {}
-    for message in run.messages([topic]):
+    for message in messages:
         names.update(dict.fromkeys(message.payload))
         units.update((k.removeprefix("unit."), v) for k, v in message.channel.metadata if k.startswith("unit."))
     return sorted(names, key=lambda name: name != "t"), units
-
-
-def _payloads(run: Run, topic: str) -> Iterator[dict[str, Any]]:
-    return (message.payload for message in run.messages([topic]))
 
 
 def _loaded(run: Run, message: Message) -> Any:

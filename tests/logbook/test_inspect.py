@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 
 from fdi_torch.logbook import LogError, RunLog, export, export_attachment, inspect_log, read_run
 from fdi_torch.logbook.export import safe_name
+from fdi_torch.logbook.reader import Run
 from fdi_torch.logbook.sink import Sink
 from fdi_torch.logbook.topic_definitions import TOPICS
 
@@ -115,6 +116,15 @@ def test_npz_holds_numbers_and_texts(finished: Path) -> None:
     export(read_run(finished), "/estimate/final", "npz", stream)
     with np.load(io.BytesIO(stream.getvalue()), allow_pickle=False) as found:
         assert "values" not in found and found["status"].tolist() == ["converged"]
+
+
+@pytest.mark.parametrize("form", ["csv", "ndjson", "npz"])
+def test_an_export_reads_the_log_once(finished: Path, form: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    passes: list[Path] = []
+    walk = Run.walk
+    monkeypatch.setattr(Run, "walk", lambda self: passes.append(self.path) or walk(self))
+    assert export(read_run(finished), "/estimate/final", form, io.BytesIO()) == 1
+    assert len(passes) == 1
 
 
 @pytest.mark.parametrize("form", ["csv", "ndjson", "npz"])
