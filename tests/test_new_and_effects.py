@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from fdi_torch import cli
+from fdi_torch.config.channels import mapped
 from fdi_torch.config.estimation import parameter_values, placements_of
 from fdi_torch.config.file_templates import template
 from fdi_torch.config.monitor_file import load_monitor
@@ -247,6 +248,24 @@ def test_a_recording_with_a_row_per_value_is_mapped_by_tags(
     Path("runs.yaml").write_text("recordings:\n" + lines)
     assert cli.main(["check", "--plant", "rig.yaml", "--recording", "runs.yaml"]) == cli.NOT_EXPLAINED
     assert "long.csv: 60 samples" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("header", "tags"),
+    [
+        ("TagName,TimeStamp,DataValue,OPCQuality", "tag: TagName, value: DataValue, quality: OPCQuality"),
+        ("_time,_field,_value", "tag: _field, value: _value"),
+        ("Messstelle;Zeit;Messwert;Status", "tag: Messstelle, value: Messwert, quality: Status"),
+        ("Point Name,t_s,Avg Value", "tag: Point Name, value: Avg Value"),
+        ("t_s,Point,h_cm", ""),  # a table with a column that is called so
+    ],
+)
+def test_columns_of_historians_are_recognised_by_their_usual_names(header: str, tags: str, tmp_path: Path) -> None:
+    sign = ";" if ";" in header else ","
+    path = tmp_path / "long.csv"
+    path.write_text(header + "\n" + (sign.join(["1"] * len(header.split(sign))) + "\n") * 2)
+    lines = mapped(path, load_plant("three_tank"))
+    assert lines[0].startswith(f"tags: {{{tags}}} " if tags else "columns:")
 
 
 def test_a_recording_without_a_header_is_mapped_by_numbers(

@@ -11,6 +11,7 @@ from fdi_torch.names import shortened, unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text, si_unit_of
 from fdi_torch.recordings.csv_files import read_header
+from fdi_torch.recordings.csv_tags import tag_columns
 from fdi_torch.recordings.csv_text import HeaderlessError
 from fdi_torch.recordings.header import header_unit, names_in
 from fdi_torch.recordings.source import ChannelSource, ClockSource
@@ -153,11 +154,9 @@ def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()
     if width > len(header):
         lines = ["header: false", f"columns:    # by number, 1 to {width}", "  t: {column: 1, unit: s}"]
         return [*lines, *(f"  {name}: {{column: ..., unit: ...}}" for name in missing)]
-    names = {column.lower().replace(" ", ""): column for column in header}
-    tag = next((names[word] for word in ("tag", "tagname", "point", "variable") if word in names), None)
-    if tag and "value" in names:
-        quality = f", quality: {names['quality']}" if "quality" in names else ""
-        lines = [f"tags: {{tag: {tag}, value: {names['value']}{quality}}}    # one row per value", "columns:"]
+    if tags := tag_columns(header):
+        quality = f", quality: {tags.quality}" if tags.quality else ""
+        lines = [f"tags: {{tag: {tags.tag}, value: {tags.value}{quality}}}    # one row per value", "columns:"]
         return [*lines, *(f"  {name}: {{column: TAG, unit: ...}}" for name in missing)]
     found = {column: si_unit_of(pair[1]) for column in header if (pair := header_unit(column)) and pair[0] not in kinds}
     lines = ["columns:    # units only where the header has none"]

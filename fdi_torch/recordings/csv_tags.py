@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,9 +14,16 @@ from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_binding import Bound, bind_clock, column_of, rule_of
 from fdi_torch.recordings.csv_cells import apply_rule, number_in
 from fdi_torch.recordings.csv_text import heading_of, open_csv, rows_of
-from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource
+from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource, TagRows
 from fdi_torch.recordings.time_stamps import StampReader
 
+TAG_NAMES = (
+    *("tag", "tagname", "point", "pointname", "variable", "varname", "signal", "metric", "field", "item", "itemname"),
+    "messstelle",
+)
+VALUE_NAMES = ("value", "datavalue", "tagvalue", "varvalue", "avgvalue", "average", "wert", "messwert")
+QUALITY_NAMES = ("quality", "dataquality", "opcquality", "status", "validity")
+"""Usual names of the columns of tags, values and their quality: lower case, letters only."""
 Tagged = tuple[Bound, np.ndarray, np.ndarray, np.ndarray]
 """A channel, and for each of its rows the row number, the time in the clock's unit, and the value."""
 
@@ -25,6 +33,16 @@ class _Rows:
     number: list[int] = field(default_factory=list)
     time: list[float] = field(default_factory=list)
     value: list[float] = field(default_factory=list)
+
+
+def tag_columns(header: Sequence[str]) -> TagRows | None:
+    """The columns of tag, value and quality in a header with the usual names; None for another table."""
+    by_name = {"".join(re.findall(r"[^\W\d_]+", column.lower())): column for column in reversed(header)}
+    tag, value, quality = (
+        next((by_name[name] for name in names if name in by_name), None)
+        for names in (TAG_NAMES, VALUE_NAMES, QUALITY_NAMES)
+    )
+    return TagRows(tag, value, quality) if tag and value else None
 
 
 def read_tags(file: FileSource, names: Sequence[str]) -> tuple[Bound, list[Tagged]]:
