@@ -150,7 +150,8 @@ def test_a_file_with_a_title_and_no_header_is_refused_with_lines_that_number_its
     path.write_text("Versuch 7, 20.11.2026\n" + "".join(f"{k}\t50,5\t40\t30,1\t20\t20\n" for k in range(9)))
     assert cli.main(["check", str(path), "--plant", "three_tank"]) == cli.MISUSE
     lines = capsys.readouterr().err
-    assert "    header: false\n    columns:    # by number, 1 to 6\n      t: {column: 1, unit: s}\n      Q1: {" in lines
+    numbered = "by number, 1 to 6; first row: 0 | 50,5 | 40 | 30,1 | 20 | 20"
+    assert f"    header: false\n    columns:    # {numbered}\n      t: {{column: 1, unit: s}}\n      Q1: {{" in lines
 
 
 def test_a_file_without_its_option_is_told_the_option(capsys: pytest.CaptureFixture[str]) -> None:
@@ -427,3 +428,14 @@ def test_a_shell_completes_commands_and_options(
     """
     done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.split() == [expected]
+
+
+def test_a_warning_of_torch_about_itself_is_not_shown() -> None:
+    """Newer versions of torch warn of their own use of it when a derivative is first taken."""
+    code = (
+        "import warnings, fdi_torch.cli as cli; "
+        "cli.main = lambda: warnings.warn('`torch.jit.script` is deprecated.', FutureWarning) or "
+        "warnings.warn('of ours', FutureWarning) or 0; cli.command_line()"
+    )
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stderr
+    assert "of ours" in shown and "torch.jit" not in shown

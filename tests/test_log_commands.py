@@ -102,6 +102,14 @@ def test_inspect_shows_an_unreadable_estimate_as_it_stands(
     assert ("value 0.3, 0.4" if damaged == "[0.3, 0.4]" else f"value {damaged}") in shown
 
 
+def test_a_log_is_found_by_its_name_while_its_run_lasts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = write_estimate(tmp_path / "run.mcap", 0.3)
+    log.rename(f"{log}.partial")
+    assert cli.main(["inspect", str(log)]) == cli.main(["report", "--quiet", str(log)]) == cli.DONE
+    assert capsys.readouterr().out.startswith(f"{log}.partial: a log of fdi train")
+    assert (tmp_path / "run.html").exists()
+
+
 def test_inspect_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = write_estimate(tmp_path / "run.mcap", 0.3)
     assert cli.main(["inspect", str(log), "--json"]) == cli.DONE

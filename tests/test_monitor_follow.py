@@ -22,6 +22,7 @@ from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.problems import ConfigError
 from fdi_torch.jobs.live_batches import LARGEST_BATCH, DelayWatch, LiveBatches
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
@@ -224,6 +225,13 @@ def test_a_gain_by_hand_or_by_time_constant_finds_the_fault(
     written(tmp_path / "rig.csv", size=0.1)
     events = monitored(["--config", config(tmp_path, observer=observer)], capsys)
     assert next(event for event in events if event["kind"] == "isolated")["faults"] == [FAULT]
+
+
+def test_faults_may_be_named_by_a_pattern(tmp_path: Path) -> None:
+    run = load_monitor(config(tmp_path, faults=["T1.leak", "*.leak"]))
+    assert run.config.faults == ["T1.leak.size", "T2.leak.size", "T3.leak.size"]
+    with pytest.raises(ConfigError, match=r"faults: expected a pattern such as \*\.leak or P1\.\*, got '\*\.leek'"):
+        load_monitor(config(tmp_path, faults=["*.leek"]))
 
 
 @pytest.mark.parametrize("mode", ["hybrid", "evolution", "least_squares", "multi_start"])

@@ -280,7 +280,8 @@ def test_a_recording_without_a_header_is_mapped_by_numbers(
     words = ["--plant", "rig.yaml", "--recording", "lab.txt"]
     assert cli.main(["check", *words]) == cli.MISUSE
     refused = capsys.readouterr().err
-    assert "got numbers without a header; save these lines" in refused and "by number, 1 to 4" in refused
+    assert "got numbers without a header; save these lines" in refused
+    assert "by number, 1 to 4; first row: 0,0E+0 | 3,0 | 20,1 | 15,5" in refused
     fdi("new", "run", *words)
     fdi("new", "monitor", *words, "--out", "watch.yaml")
     assert "run.yaml; next: complete the columns, then fdi train" in capsys.readouterr().out

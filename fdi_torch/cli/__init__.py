@@ -14,6 +14,7 @@ import argparse
 import importlib
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from contextvars import copy_context
@@ -60,6 +61,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def command_line() -> NoReturn:
     """The entry point `fdi`. Standard output may be closed early, as by `| head`, or from the start."""
     _open_standard_streams()
+    # torch compiles its own rules of differentiation so, and its users cannot do anything about it.
+    warnings.filterwarnings("ignore", r"`torch\.jit\.script` is deprecated", FutureWarning)
     code = DONE
     try:
         code = main()

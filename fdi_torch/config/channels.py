@@ -10,7 +10,7 @@ from fdi_torch.config.strict import Amount, quantity
 from fdi_torch.names import shortened, unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text, si_unit_of
-from fdi_torch.recordings.csv_files import read_header
+from fdi_torch.recordings.csv_files import first_row, read_header
 from fdi_torch.recordings.csv_tags import tag_columns
 from fdi_torch.recordings.csv_text import HeaderlessError
 from fdi_torch.recordings.header import header_unit, names_in
@@ -152,7 +152,12 @@ def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()
         return []
     header, width = _header(path), len(read_header(path, header=False))
     if width > len(header):
-        lines = ["header: false", f"columns:    # by number, 1 to {width}", "  t: {column: 1, unit: s}"]
+        row = shortened(" | ".join(first_row(path)))
+        lines = [
+            "header: false",
+            f"columns:    # by number, 1 to {width}; first row: {row}",
+            "  t: {column: 1, unit: s}",
+        ]
         return [*lines, *(f"  {name}: {{column: ..., unit: ...}}" for name in missing)]
     if tags := tag_columns(header):
         quality = f", quality: {tags.quality}" if tags.quality else ""

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from fdi_torch.config.estimation import names_in_full
+from fdi_torch.config.estimation import matching_names, names_in_full
 from fdi_torch.config.live_source import SourceConfig
 from fdi_torch.config.loaded_recordings import separate_recordings
-from fdi_torch.config.problems import naming_source
+from fdi_torch.config.problems import ConfigError, naming_source
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.strict import ScaledSeconds, Seconds, Strict
@@ -64,7 +64,10 @@ class MonitorConfig(Strict):
         description="interval from which the noise is estimated, as in [0 s, 300 s]"
     )
     calibrate: list[str] = Field(default_factory=list, description="constants fitted to the fault-free part first")
-    faults: list[str] = Field(default_factory=list, description="parameters that may change; by default the usual ones")
+    faults: list[str] = Field(
+        default_factory=list,
+        description="parameters that may change, or patterns such as '*.leak'; by default the usual ones",
+    )
     ranges: dict[str, tuple[float, float]] = Field(
         default_factory=dict, description="ranges of faults that replace the default ones, SI"
     )
@@ -119,9 +122,16 @@ def build_monitor(data: Mapping[str, Any], base: Path, source: str) -> MonitorRu
 
 
 def _in_full(config: MonitorConfig, plant: PlantDescription) -> MonitorConfig:
-    """Expand short names of faults: 'T1.leak' means the leak's size."""
+    """Expand names of faults: 'T1.leak' means the leak's size, and a pattern such as '*.leak' all that it matches."""
     ranged = names_in_full(config.ranges, plant, "ranges")
     ranges = dict(zip(ranged, config.ranges.values(), strict=True))
-    faults = names_in_full(config.faults, plant, "faults")
+    faults = names_in_full(_matching(config.faults, plant), plant, "faults")
     names_in_full(config.calibrate, plant, "calibrate")
     return config.model_copy(update={"faults": faults, "ranges": ranges})
+
+
+def _matching(names: Sequence[str], plant: PlantDescription) -> list[str]:
+    try:
+        return list(dict.fromkeys(full for name in names for full in matching_names(name, plant)))
+    except ValueError as error:
+        raise ConfigError([f"faults: {error}"]) from error

@@ -76,6 +76,8 @@ class Run:
 
     def __init__(self, path: str | Path, salvage: bool = False) -> None:
         self.path = Path(path)
+        if not self.path.exists() and (partial := Path(f"{path}.partial")).exists():
+            self.path = partial  # its run lasts, or was killed
         self.salvage = salvage
         self.profile = self.library = ""
         self.metadata: dict[str, dict[str, str]] = {}

@@ -203,6 +203,13 @@ def read_header(path: Path, header: bool = True, sheet: str | None = None) -> tu
         return heading_of(path, handle, header)[0].names
 
 
+def first_row(path: Path) -> list[str]:
+    """The cells of the first row of a table without a header."""
+    with open_csv(path, None) as handle:
+        heading, lines = heading_of(path, handle, header=False)
+        return next(lines, "").strip().split(heading.delimiter)
+
+
 def _read_table(lines: Iterator[str], columns: Columns) -> tuple[np.ndarray, list[str]]:
     """The columns as (rows, columns) float64, with non-finite cells where there is no number; and notes on omitted
     lines.
