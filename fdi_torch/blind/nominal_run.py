@@ -76,7 +76,7 @@ class NominalRun:
         return component.tank if isinstance(component, Sensor) else component.name
 
     def head(self, pipe: str, share: float) -> float:
-        """The driving head below which the pipe is for this share of the time, m."""
+        """The quantile of the pipe's driving head, m: it is below this for that share of the time."""
         tanks = [t.name for t in self.plant.tanks]
         p = self.plant.pipe(pipe)
         head = self.levels[:, tanks.index(p.source)] - p.elevation

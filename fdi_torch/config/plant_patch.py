@@ -90,8 +90,8 @@ def _changes(before: PlantDescription, after: PlantDescription) -> Iterator[tupl
 
 
 def _unit_of(path: Path, plant: PlantDescription) -> str:
-    """The unit in which a value without a unit is written, where the file does not have it yet: relative tolerances
-    and readings in % have none.
+    """The unit in which a new entry of the file is written if its SI unit is "1": % for a relative tolerance, otherwise
+    the unit for display.
     """
     name = ".".join(map(str, path[-2:])) if path[0] == "sensors" else str(path[-1])
     if path[0] == "tolerances" and name not in absolute_units(plant):

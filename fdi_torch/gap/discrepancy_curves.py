@@ -1,9 +1,9 @@
 """Curves of the discrepancy at one component: a free function of its local variables with errors, and the named effect.
 
-All is to first order about the trajectory of the best explanation: the influence of the named effect is added to the
-residual again, and the free form is fitted to it with the nuisance parameters projected out. The variables of a free
-form (a head, the time) share what they have in common. The curves therefore compare what both do along the trajectory,
-averaged over samples with the same value of the variable.
+Both are computed to first order about the trajectory of the best explanation. The influence of the named effect is
+added to the residual again, and the free function is fitted to the sum, with the nuisance parameters projected out. The
+variables of a free function (a head, the time) share what they have in common. The curves therefore compare what both
+do along the trajectory, averaged over samples with the same value of the variable.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def _neutral(fitter: Fitter, placements: Sequence[Placement]) -> tuple[tuple[Pla
 
 
 def _effect(fitter: Fitter, fit: Fit, place: str, here: tuple[Placement, ...]) -> Tensor:
-    """What the fit's causes at the place do there, (X,)."""
+    """The influence (X,) of the fit's causes at the place."""
     without = _local(fitter, fit, place, [_neutral(fitter, here)])[0]
     return -without / (1.0 + without) if any(p.effect.stage is Stage.STORAGE for p in here) else -without
 

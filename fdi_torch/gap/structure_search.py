@@ -4,9 +4,9 @@ A forward search with a beam: about each of the best explanations so far, the mo
 evaluated (`explanation_pool.py`). Finally, each effect of the best explanation is removed or exchanged while that
 improves it (floating search: Pudil, Novovicova and Kittler, 1994).
 
-The screening is made under two noises. The disturbance noise of an explanation that lacks a cause is too large, because
-it absorbs the cause, and hides further small causes. The sensor noise alone overrates effects that only compensate a
-wrong equation.
+The screening is repeated with a second noise model, that of the sensors alone. The disturbance noise of an explanation
+that lacks a cause is too large, because it absorbs the cause, and hides further small causes. The sensor noise alone,
+however, overrates effects that only compensate a wrong equation.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ def holdout_warning(answer: Named) -> str:
 
 
 def closed_sentence(closure: Named) -> str:
-    """How much of the gap that recalibration leaves on the hold-outs the causes close."""
+    """The share of the gap on the hold-outs, after recalibration, that the causes explain."""
     closed, interval = closure.get("closed"), closure.get("closed_ci95")
     if not isinstance(closed, int | float):
         return (

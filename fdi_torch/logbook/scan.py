@@ -200,7 +200,7 @@ def _sound(data: Buffer, place: int) -> int | None:
 
 
 def _ends(layout: Sequence[int | str], data: Buffer, place: int, end: int) -> int:
-    """Where fields of this layout that begin at `place` end; beyond `end` if they do not fit."""
+    """The position behind a record's fields, which begin at `place`; it is beyond `end` if they do not fit."""
     for field in layout:
         if isinstance(field, int):
             place += field

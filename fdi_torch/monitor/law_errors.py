@@ -51,8 +51,10 @@ class LawErrors:
         innovations: Tensor,
         size_errors: Sequence[float] = (),
     ) -> LawErrors:
-        """Before the readings since the latest change. state (order + M,), memory (G,) and innovations (K, sensors) are
-        those of the observer itself. size_errors (F): standard deviations of c, by default SIZE_ERROR.
+        """The errors at the latest change, before any reading after it.
+
+        state (order + M,), memory (G,), innovations (K, sensors): of the observer itself. size_errors (F): standard
+        deviations of c, by default SIZE_ERROR.
         """
         f = len(columns)
         sizes = state.new_tensor(size_errors) if size_errors else state.new_full((f,), SIZE_ERROR)

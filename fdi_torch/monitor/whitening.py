@@ -56,7 +56,7 @@ class Whitening:
         """The whitening if the random flows are learnt from further residuals (S, C) too, the observer's from `number`
         on, and the log of their likelihood over that with the present ones.
 
-        What the innovations' standard deviations are relative to those of the flow filter remains.
+        The ratio of the innovations' standard deviations to those that the flow filter predicts is kept.
         """
         if self.flows is None:
             return self, 0.0

@@ -55,7 +55,7 @@ class Correction:
 
 
 def wrong_units(plant: PlantDescription, recording: Recording) -> str:
-    """What is probably wrong by the ratio of two units and what to write, in one sentence; '' if nothing is."""
+    """A sentence on numbers that are probably in a wrong unit, and the unit to write; empty if there are none."""
     as_is = volumes_along(plant, recording)
     if not bool((as_is.metered.nan_to_num() != 0.0).any()):
         return ""

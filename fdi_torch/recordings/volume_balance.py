@@ -50,7 +50,7 @@ class Volumes:
     def log_evidence(self) -> Tensor:
         """Log likelihood of the readings of each tank (tanks), up to a constant that all corrections share.
 
-        NaN for a tank of whose balance the recording determines nothing.
+        NaN for a tank with too few intervals whose volume balance is known.
         """
         terms = torch.stack([self.stored, self.metered, self.by_laws], dim=-1)
         rounding = math.sqrt(torch.finfo(terms.dtype).eps) * float(terms.nan_to_num().abs().max())

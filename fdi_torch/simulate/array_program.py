@@ -73,9 +73,9 @@ class ArrayProgram:
     ) -> bool:
         """Solve trajectories path (L, n, K+1) from their first states by the implicit midpoint rule, in place.
 
-        The inputs contain views of middle (n, K), the states in the middle of each step. The program computes the n
-        rates, and then their slopes by (rate, state). span (K,): lengths of the steps, s. Returns False without a
-        compiler.
+        Some of the inputs are views of middle (n, K), which holds the states in the middle of each step. The program
+        computes the n rates, and then their slopes by (rate, state). span (K,): lengths of the steps, s. Returns False
+        without a compiler.
         """
         (lanes, n, _), steps, library = path.shape, len(span), _library()
         if library is None:

@@ -141,7 +141,7 @@ class _Slopes:
 
 
 def traced_rates(network: TankNetwork, names: Sequence[str]) -> TracedRates:
-    """The traced rates of a plant; plants of the same components and effects share one."""
+    """The traced rates of a plant; plants with the same components and effects share one trace."""
     plant = network.description
     structure = type(network), network.may_overflow, plant.gravity, plant.tanks, *plant.flow_components()
     effects = tuple(p.effect for p in network.placements)  # the names of their constants hold their places

@@ -33,7 +33,7 @@ FINEST, COARSEST = 1e-5, 1e-2  # bounds of the noise, as shares of the sensor's 
 
 
 class UnknownInflow(Effect):
-    """A constant inflow during each part of the segment, normal about zero; none after it."""
+    """An unknown inflow, constant during each part of the segment and zero after it; its prior is normal about zero."""
 
     name = "unseen_flow"
     stage = Stage.BALANCE

@@ -20,7 +20,7 @@ class Columns:
         return sum(b.shape[-1] for b in self.blocks)
 
     def __getitem__(self, used: Tensor) -> Tensor:
-        """Some columns (S, C, .). used (M,) bool."""
+        """The columns (S, C, number used) for which used (M,) is True."""
         parts = used.split([b.shape[-1] for b in self.blocks])
         return torch.cat([b[..., part] for b, part in zip(self.blocks, parts, strict=True)], dim=-1)
 

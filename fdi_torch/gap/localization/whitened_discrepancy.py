@@ -37,7 +37,7 @@ class _Projection:
         return _Projection(group, basis, without(basis, rows))
 
     def remaining(self, columns: Tensor) -> Tensor:
-        """What is left (R, M) of whitened columns (S, C, M)."""
+        """The part (R, M) of whitened columns (S, C, M) that the projection leaves."""
         return without(self.basis, _grouped(columns, self.group))
 
 
@@ -50,10 +50,11 @@ class _Block:
 
 
 class WhitenedDiscrepancy:
-    """The columns of a discrepancy and the residual under one noise, with the parameters of a fit projected out.
+    """The columns of a discrepancy and the residual, whitened by one noise model, with the parameters of a fit
+    projected out.
 
-    Columns are selected with samples summed in groups. A group is shorter than any regressor's changes. What a sum of
-    its samples leaves out is little of the residual, but may be many nats if the residual is large: it serves to select
+    To save time, columns are selected with successive samples summed in groups, each shorter than the changes of any
+    regressor. The sums lack little of the residual, but this may be many nats of a large one: they serve to select
     columns, not to weigh them.
     """
 

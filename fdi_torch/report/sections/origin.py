@@ -32,7 +32,8 @@ def provenance_section(material: Material) -> Section | None:
     for record, title in RECORDS.items():
         values = material.about(record)
         if values:
-            plain = [(name, value) for name, value in values.items() if not value.startswith(("[", "{"))]
+            known = [(name, value) for name, value in values.items() if value not in ("", "null")]
+            plain = [(name, value) for name, value in known if not value.startswith(("[", "{"))]
             blocks += [folded(f"{title} ({len(plain)})", pairs(plain))] if plain else []
     return Section("Provenance", blocks)
 

@@ -36,7 +36,8 @@ def _section(material: Material, with_result: bool) -> Section | None:
     if with_result != bool(overlay.levels or overlay.marks or overlay.probabilities):
         return None
     parts = ["Levels are the last readings."] if overlay.levels else []
-    parts += ["Orange: diagnosed effects."] if overlay.marks else []
+    kind = f"fitted effects, {NOT_ESTABLISHED}" if material.unexplained else "diagnosed effects"
+    parts += [f"Orange: {kind}."] if overlay.marks else []
     parts += [f"Strength of colour: {material.meaning_of_shares}."] if overlay.probabilities else []
     caption = " ".join([f"{plant.name}, not to scale.", *parts])
     picture = Picture(RIG, schematic(plant, overlay), caption, wide=True)
@@ -66,7 +67,6 @@ def marks_of(material: Material) -> dict[str, list[str]]:
         if finding.present:
             unit, scale = shown_unit(finding.unit)
             size = "" if math.isnan(finding.size) else f" {number(scale * finding.size, 3)} {unit}".rstrip()
-            size += f", {NOT_ESTABLISHED}" * material.unexplained
             marks.setdefault(finding.location, []).append(f"{finding.effect.replace('_', ' ')}{size}")
     for combination in combinations_of(material, "not_isolated"):
         for fault in map(ParameterName.of_effect, combination.parameters):
