@@ -124,8 +124,8 @@ class _Edits:
         self._added: dict[Path, list[str]] = {}
 
     def set(self, path: Path, value: str | float, unit: str, std: float | None) -> None:
-        """Write a value in the unit of the present one, or of the pattern that stands for it, or add the key to its
-        mapping. unit: of a value without a unit. std: its standard error, SI.
+        """Replace the value at a path, or add its key. It is written in the unit of the value that stands there, or of
+        the pattern that covers it, otherwise in `unit`. std: its standard error, SI.
         """
         node = self._at(path)
         if isinstance(node, yaml.ScalarNode):

@@ -65,7 +65,7 @@ def misfit_of(rms: Mapping[str, float], recordings: Sequence[Recording], plant: 
 
 
 def unexplained_ratio(rms: torch.Tensor, values: torch.Tensor, weight: torch.Tensor) -> float:
-    """The ratio for residuals of root mean square rms (C,) of readings (S, C) of this weight; 0 masks a reading."""
+    """The ratio for residuals of root mean square rms (C,). values, weight (S, C): the readings; weight 0 masks one."""
     noise = torch.maximum(sample_noise(values, weight), least_noise(values, weight))
     ratio = torch.where((weight > 0).any(dim=0), rms / noise, 0.0)
     return max(0.0, *ratio.nan_to_num(nan=math.inf, posinf=math.inf).tolist())
