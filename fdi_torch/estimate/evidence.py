@@ -60,7 +60,7 @@ def log_odds_of_law(error: float | None, choices: int, places: int) -> float:
 
     error: None if the readings cannot show an error of the law. choices: number of possible pairs of effect and place.
     places: number of places. The error of the library's law is normal. A law that no library has differs from it,
-    relative to its size, by a number that is uniform between 0 and 2.
+    relative to its size, by a number that is uniform between -2 and 2.
     """
     density = math.log(2.0 * 2.0 / (ODDS.law_error * math.sqrt(2.0 * math.pi)))
     law = density + (math.log1p(-ODDS.inexact) if error is None else log_law_error(error))
