@@ -416,6 +416,7 @@ def test_the_equilibrium_of_a_plant_is_computed_once(monkeypatch: pytest.MonkeyP
     first, second = three_tank(), quadruple_tank()
     rest = case_drafts._equilibria([first, second, first])
     assert [levels.tolist() for levels in rest] == [[1.0] * 3, [2.0] * 3, [1.0] * 3]
+    assert len(computed) == 2
 
 
 def test_a_cause_that_another_hides_is_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
