@@ -1,7 +1,7 @@
 """Generate the reference pages from the code, and pages that show the source files to which other pages link.
 
-MkDocs calls `on_files` and `on_page_markdown` (`hooks` in mkdocs.yml). `generated()` needs fdi_torch only, so that
-tests can check links without MkDocs.
+MkDocs calls `on_files`, `on_page_markdown` and `on_post_build` (`hooks` in mkdocs.yml). `generated()` needs fdi_torch
+only, so that tests can check links without MkDocs.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 FILES = {"Run file": "train", "Monitor file": "monitor", "Study file": "study", "Rehearsal file": "rehearse"}
 LINK = re.compile(r"(?<!!)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
+LOADED = re.compile(r'(?:src|<link[^>]* href)="(https?://[^"]*)"')
 FENCE = re.compile(r"^```.*?^```", re.S | re.M)
 CODE = {".py": "python", ".yaml": "yaml", ".toml": "toml", ".md": "markdown", ".hpp": "cpp"}
 
@@ -341,3 +342,10 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
         up = "../" * name.count("/")
         markdown = markdown.replace(f"]({target})", f"]({up}source/{path}.md)")
     return markdown
+
+
+def on_post_build(config: Any) -> None:
+    """Raises ValueError if a page of the site loads something from elsewhere."""
+    for page in sorted(Path(config["site_dir"]).rglob("*.html")):
+        if loaded := LOADED.findall(page.read_text(encoding="utf-8")):
+            raise ValueError(f"{page}: expected a page that loads nothing from elsewhere, got {', '.join(loaded)}")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from fdi_torch.blind import cases
 from fdi_torch.cli import DONE, MISUSE, main
 from fdi_torch.config.plant_file import load_plant
 
@@ -44,7 +45,8 @@ def test_misuse_is_said_in_a_sentence(words: list[str], said: str, capsys: pytes
 
 
 @pytest.mark.slow
-def test_cases_on_networks_are_made_without_an_answer(tmp_path: Path) -> None:
+def test_cases_on_networks_are_made_without_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cases, "STEP", 0.5)
     words = ["challenge", "--plant", "network", "--tanks", "3", "--cases", "1", "--kinds", "hidden"]
     assert main([*words, "--minutes", "0", "--out", str(tmp_path), "--quiet"]) == DONE
     plant = load_plant(tmp_path / "cases" / "case0001_plant.yaml")

@@ -153,7 +153,8 @@ def test_a_third_of_the_levels_is_unmeasured() -> None:
 
 
 @pytest.mark.slow
-def test_cases_on_networks_are_as_their_kinds_say() -> None:
+def test_cases_on_networks_are_as_their_kinds_say(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cases, "STEP", 0.5)
     made = {case.plan.kind: case for case in make(plans(8, 3, ON_NETWORKS), Networks(3, 4), 3)}
     causes = {kind: case.truth["causes"] for kind, case in made.items()}
     assert causes["null"] == causes["dnull"] == [] and len(causes["site"]) in (1, 2)
@@ -170,7 +171,8 @@ def test_cases_on_networks_are_as_their_kinds_say() -> None:
 
 
 @pytest.mark.slow
-def test_random_flows_may_act_beside_a_level_control() -> None:
+def test_random_flows_may_act_beside_a_level_control(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cases, "STEP", 0.5)
     (case,) = make(plans(1, 3, ("dloop",)), three_tank(), 3)
     assert case.truth["control"]["law"] and case.truth["disturbance"]["kind"] in KINDS
     assert case.truth["causes"] == [] and case.truth["disturbance"]["moves_levels_by_noise"] > 0.1

@@ -410,6 +410,15 @@ def test_full_effects_show_and_stay_in_the_tanks(rig: Rig, monkeypatch: pytest.M
         assert gap == 0 if truth["kind"] == "null" or quantised else gap > 0.05 * rig.noise_unit
 
 
+def test_the_equilibrium_of_a_plant_is_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    computed: list[Rig] = []
+    monkeypatch.setattr(case_drafts, "levels_at_rest", lambda rig: computed.append(rig) or np.full(3, len(computed)))
+    first, second = three_tank(), quadruple_tank()
+    rest = case_drafts._equilibria([first, second, first])
+    assert [levels.tolist() for levels in rest] == [[1.0] * 3, [2.0] * 3, [1.0] * 3]
+    assert len(computed) == 2
+
+
 def test_a_cause_that_another_hides_is_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """A weir above all levels, beside a leak."""
     rig, plan = three_tank(), plans(1, 1, ("pair",))

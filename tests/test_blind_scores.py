@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fdi_torch.blind import cases
 from fdi_torch.blind.benchmark import always_null, blind_benchmark
 from fdi_torch.blind.case_drafts import plans
 from fdi_torch.blind.cases import Case
@@ -457,7 +458,8 @@ def test_sizes_are_summed_up_by_effect() -> None:
 
 
 @pytest.mark.slow
-def test_a_benchmark_from_end_to_end(tmp_path: Path) -> None:
+def test_a_benchmark_from_end_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cases, "STEP", 0.5)
     rows = blind_benchmark(9, 5, tmp_path, Counting())
     assert len([r for r in rows if r["by"] == "fdi"]) == 9
     assert blind_benchmark(9, 5, tmp_path, Counting(RuntimeError, at=1)) == rows

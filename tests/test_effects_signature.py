@@ -16,13 +16,13 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of
 from fdi_torch.simulate.engine import Engine
-from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import lay_out
+from fdi_torch.simulate.traced_engine import TracedEngine
 
 STRONG = 0.95
 
 
-def likeness_of(placements: tuple[Placement, ...], kind: str) -> Tensor:
+def likeness_of(placements: tuple[Placement, ...]) -> Tensor:
     """|cosines| on the three tanks under random steps over 40 min, coefficients and start levels calibrated away."""
     plant = three_tank((0.3, 0.25, 0.28))
     network = build_network(plant, placements)
@@ -30,16 +30,16 @@ def likeness_of(placements: tuple[Placement, ...], kind: str) -> Tensor:
     wanted = {p.prefix for p in placements}
     space = ParameterSpace(p for p in network.constants if p.name.rpartition(".")[0] in wanted or p.name in nuisance)
     recording = random_steps(plant, 2400.0, sample=20.0)
-    engine = make_engine(network, space, lay_out(recording, plant.channels(), 20.0), kind)
-    operating_range = operating_range_of(replace(recording, outputs=engine.readings(space.nominal()), mask=None), plant)
+    engine = TracedEngine(network, space, lay_out(recording, plant.channels(), 20.0))
+    reach = operating_range_of(replace(recording, outputs=engine.readings(space.nominal()), mask=None), plant)
     noise = torch.full((3,), 1e-3, dtype=torch.float64)
-    directions = signatures(engine, space, placements, plant, operating_range, noise, nuisance)
+    directions = signatures(engine, space, placements, plant, reach, noise, nuisance)
     return torch.abs(directions @ directions.T)
 
 
 def test_what_is_one_thing_has_one_signature_and_what_calibration_absorbs_has_none() -> None:
     names = ("Q1.pump_offset.offset", "T1.evaporation.rate", "OUT2.plugging.size", "h1.sensor_drift.rate")
-    same = likeness_of(placements_for(names), "traced")
+    same = likeness_of(placements_for(names))
     assert same[0, 1] == pytest.approx(1.0, abs=1e-9)  # a constant flow into T1 is a constant flow into T1
     assert same[2, 2] == 0.0  # plugging from the start is another discharge coefficient
     assert same[0, 3] < 0.8
@@ -48,7 +48,7 @@ def test_what_is_one_thing_has_one_signature_and_what_calibration_absorbs_has_no
 @pytest.mark.slow
 def test_each_effect_names_its_strongest_rival() -> None:
     placements = all_placements(three_tank())
-    alike = likeness_of(placements, "auto")
+    alike = likeness_of(placements)
     unnamed = set()
     for i, one in enumerate(placements):
         rivals = [j for j, p in enumerate(placements) if p.effect.name != one.effect.name]
@@ -65,7 +65,7 @@ def signatures(
     space: ParameterSpace,
     placements: Sequence[Placement],
     plant: PlantDescription,
-    operating_range: OperatingRange,
+    reach: OperatingRange,
     noise: Tensor,
     nuisance: Iterable[str] = (),
 ) -> Tensor:
@@ -75,32 +75,21 @@ def signatures(
     its starting points. noise (sensors,): standard deviations. nuisance: names of calibration constants, whose effects
     are projected out.
     """
-    nominal = space.nominal()
-    readings, jacobian = engine.linearise(nominal)
+    readings, jacobian = engine.linearise(space.nominal())
     rows = []
     for placement in placements:
         size = placement.effect.parameters(placement.location, plant)[0].name
-        if placement.effect.smooth:
-            rows.append(jacobian[..., space.index(f"{placement.prefix}.{size}")])
-        else:
-            rows.append(_largest_change(engine, space, placement, plant, operating_range, readings))
+        rows.append(jacobian[..., space.index(f"{placement.prefix}.{size}")])
+    abrupt = [k for k, placement in enumerate(placements) if not placement.effect.smooth]
+    starts = [(k, start) for k in abrupt for start in placements[k].effect.starts(placements[k].location, plant, reach)]
+    thetas = [space.vector({f"{placements[k].prefix}.{name}": x for name, x in start.items()}) for k, start in starts]
+    changes = engine.readings(torch.stack([*thetas, space.nominal()])) - readings
+    for k in abrupt:
+        of_starts = [change for (other, _), change in zip(starts, changes, strict=False) if other == k]
+        rows[k] = max(of_starts, key=lambda change: float(change.abs().sum()))
     absorbed = [jacobian[..., space.index(name)] for name in nuisance]
     whitened = [torch.flatten(row / noise) for row in (*rows, *absorbed)]
     return _directions(torch.stack(whitened[: len(rows)]), whitened[len(rows) :])
-
-
-def _largest_change(
-    engine: Engine,
-    space: ParameterSpace,
-    placement: Placement,
-    plant: PlantDescription,
-    operating_range: OperatingRange,
-    readings: Tensor,
-) -> Tensor:
-    starts = placement.effect.starts(placement.location, plant, operating_range)
-    full = [{f"{placement.prefix}.{name}": value for name, value in start.items()} for start in starts]
-    changes = engine.readings(torch.stack([space.vector(start) for start in full])) - readings
-    return changes[int(changes.abs().flatten(1).sum(1).argmax())]
 
 
 def _directions(rows: Tensor, absorbed: list[Tensor]) -> Tensor:

@@ -91,7 +91,7 @@ def test_there_are_such_effects_and_they_have_states_in_a_network() -> None:
 @each_place
 def test_adaptive_steps_agree_with_short_fixed_steps(placement: Placement) -> None:
     plant = with_effect(placement)
-    recording, network = recording_of(plant), build_network(plant)
+    recording, network = recording_of(plant, 100), build_network(plant)
     control = StepControl.for_tolerance(1e-6, plant, STEP)
     adaptive = replace(lay_out(recording, plant.channels(), 1.0), step_control=control)
     space = ParameterSpace(network.constants[n] for n in ("AB.discharge_coefficient",))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ast
 import os
+import runpy
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib
+import matplotlib.pyplot as plt
 import pytest
 
 import fdi_torch
@@ -41,15 +43,24 @@ def test_scripts_are_short_and_use_public_names(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_a_script_draws_its_picture(name: str, tmp_path: Path) -> None:
+def test_a_script_draws_its_picture(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "docs" / "gallery"
     shutil.copytree(GALLERY, folder, ignore=shutil.ignore_patterns("*.png", "__pycache__"))
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
-    data = os.environ.get("FDI_TORCH_DATA", str(ROOT.parent / "shared" / "data"))
-    settings = os.environ | {"FDI_TORCH_DATA": data, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, str(folder / f"{name}.py")]
-    done = subprocess.run(command, capture_output=True, text=True, env=settings, cwd=tmp_path, check=False)
-    assert done.returncode == 0, done.stderr
-    if name == "real_rig" and done.stdout.startswith("skipped"):
-        pytest.skip(done.stdout.strip())
+    monkeypatch.setenv("FDI_TORCH_DATA", os.environ.get("FDI_TORCH_DATA", str(ROOT.parent / "shared" / "data")))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(folder)  # where a script finds style.py
+    monkeypatch.delitem(sys.modules, "style", raising=False)
+    with matplotlib.rc_context():
+        try:
+            runpy.run_path(str(folder / f"{name}.py"), run_name="__main__")
+        except SystemExit as end:
+            assert not end.code
+        finally:
+            plt.close("all")
+    said = capsys.readouterr().out
+    if name == "real_rig" and said.startswith("skipped"):
+        pytest.skip(said.strip())
     assert (folder / f"{name}.png").stat().st_size > 10_000

@@ -301,11 +301,9 @@ def test_the_frequency_of_a_pulsating_pump_is_estimated_to_its_phase() -> None:
     assert abs(133.5 / found[0].periods[0] - 1.0) * turns < 0.01
 
 
-# A lag that the library lacks is unknown in test_gap_closure and test_gap_scales as well.
-LAG = pytest.param({"Q1.pump_lag.time_constant": 15.0}, marks=pytest.mark.slow)
-
-
-@pytest.mark.parametrize("values", [LAG, {"h2.sensor_hysteresis.play": 0.02}])
+# Of the fast tests, test_gap_closure and test_gap_scales have a lag that the library lacks.
+@pytest.mark.slow
+@pytest.mark.parametrize("values", [{"Q1.pump_lag.time_constant": 15.0}, {"h2.sensor_hysteresis.play": 0.02}])
 def test_an_effect_with_memory_that_the_library_lacks_is_unknown_at_its_place(values: dict[str, float]) -> None:
     answer = diagnose(nominal_plant(), recorded(values, 5), settings=Settings(leave_out=("pump_lag", "pump_delay")))
     place = next(iter(values)).partition(".")[0]

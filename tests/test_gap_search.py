@@ -156,3 +156,4 @@ def test_of_descents_that_end_at_the_same_cost_the_first_is_taken() -> None:
     cost = torch.tensor([910.0, math.nan, 899.88 + 2e-12, 899.88, 899.9], dtype=torch.float64)
     assert first_lowest(cost) == 2
     assert first_lowest(cost[:2]) == 0 and first_lowest(torch.tensor([math.nan, math.inf, 3.0])) == 2
+    assert first_lowest(torch.tensor([math.nan, math.nan])) == 0, "no descent has ended at a cost"

@@ -112,9 +112,7 @@ def _rig(plan: CasePlan, rigs: Rig | Networks, seed: int) -> Rig:
 
 def _equilibria(rigs: Sequence[Rig]) -> list[Array]:
     """Equilibrium levels of each rig, computed once for each plant."""
-    computed: dict[int, Array] = {}
-    for rig in rigs:
-        computed.setdefault(id(rig.plant.tanks), levels_at_rest(rig))
+    computed = {key: levels_at_rest(rig) for key, rig in {id(rig.plant.tanks): rig for rig in rigs}.items()}
     return [computed[id(rig.plant.tanks)] for rig in rigs]
 
 

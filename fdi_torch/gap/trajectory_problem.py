@@ -28,7 +28,8 @@ def first_lowest(cost: Tensor) -> int:
     Rounding decides between descents that end at the same cost, as where an effect shows nowhere; their evidence may
     differ.
     """
-    return int((cost <= cost.nan_to_num(nan=torch.inf).min() + DECREMENT).nonzero()[0])
+    cost = cost.nan_to_num(nan=torch.inf)
+    return int((cost <= cost.min() + DECREMENT).nonzero()[0])
 
 
 class Objective(Protocol):
