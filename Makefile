@@ -16,7 +16,7 @@ LOWEST = tests/test_units.py tests/test_yaml_files.py tests/test_config_plant.py
 LOWEST_EXTRAS := parquet,excel,hdf5,sql,influx,mqtt,opcua,modbus,prometheus
 EXTRAS := test$(if $(COMPILER),,$(comma)compiler)
 
-.PHONY: run test slow tests longest mutants lint paper docs lowest clean
+.PHONY: run test slow longest mutants lint paper docs lowest clean
 
 run: $(STAMP)
 	$(BIN)/python -m fdi_torch.train
@@ -26,10 +26,6 @@ test: $(STAMP)
 
 slow: $(STAMP)
 	$(TESTS) -m slow
-
-# Both of them in one session, which loads the tests once and shares what fast and slow ones compute.
-tests: $(STAMP)
-	$(TESTS) -m "not longest"
 
 longest: $(STAMP)
 	$(TESTS) -m longest
