@@ -6,8 +6,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 COMPILER := $(shell command -v g++ || command -v c++ || command -v clang++)
-# One thread a worker: two of them on the same core wait for each other.
-TESTS = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(shell nproc) --dist worksteal
+# One thread a worker: two of them on the same core wait for each other. nproc would answer with a given OMP_NUM_THREADS.
+TESTS = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(shell env -u OMP_NUM_THREADS nproc) --dist worksteal
 comma := ,
 LOWEST = tests/test_units.py tests/test_yaml_files.py tests/test_config_plant.py tests/test_config_run.py \
 	tests/test_recording_csv.py tests/test_hostile_files.py tests/test_command_line.py tests/logbook/test_reader.py \
