@@ -70,12 +70,13 @@ class ExplanationPool:
     def evaluate(self, fit: Fit, start: StateNoise | None = None) -> RankedExplanation:
         """Estimate noise and fit alternately until the evidence converges; keep the better explanation.
 
-        Effects that were evaluated before are evaluated again only if this fit is better under the noise found then.
+        Effects that were evaluated before are evaluated again only if this fit is likelier under the noise found then.
         The evaluation stops early if the explanation cannot compete: with those of as many effects that will be
-        extended, or with one that has only some of its effects.
+        extended, or with one that has only some of its effects. Otherwise, parameters that only some starts of the
+        fit's candidate have, as an onset, are in the end dropped if they lower the evidence.
         """
-        before = self.explanations.get(fit.key)
-        if before and before.fitter.cost(fit) > before.fit.cost - CONVERGED:
+        before, candidate = self.explanations.get(fit.key), fit.candidate
+        if before and self._evidence_of(fit, before.fitter) < before.log_evidence + CONVERGED:
             return before
         rivals = self.best_of(len(fit.key))[BEAM - 1 :] + [e for k, e in self.explanations.items() if k < fit.key]
         rival = max((e.log_evidence for e in rivals), default=-math.inf)
@@ -92,13 +93,34 @@ class ExplanationPool:
                 best = updated
             behind = rival - best.log_evidence
             hopeless = behind > 0.5 * BEHIND and gain < SHARE * behind
-            if hopeless or (climb and not gain > CONVERGED):
+            if hopeless:
+                break
+            if climb and not gain > CONVERGED:
+                best = self._with_fewer_parameters(best, candidate)
                 break
             # The search for the correlation time, which takes longest, begins where the rest has converged.
             fit, start, climb = best.fit, best.noise, not gain > CONVERGED
         if before is None or best.log_evidence > before.log_evidence:
             self.explanations[fit.key] = best
         return best
+
+    def _with_fewer_parameters(self, explanation: RankedExplanation, candidate: Candidate) -> RankedExplanation:
+        """The explanation with its own parameters, or with those of its effects that some starts of the candidate have,
+        whichever are likeliest under its noise.
+
+        By chance, an onset lowers the cost of an effect that was there from the start.
+        """
+        values, likeliest = explanation.fit.effect_values, explanation
+        for free in dict.fromkeys(tuple(sorted(s)) for s in candidate.starts):
+            if set(free) < values.keys():
+                start = Candidate(candidate.placements, ({name: values[name] for name in free},))
+                fit = explanation.fitter.fit(start, explanation.fit)
+                if (evidence := self._evidence_of(fit, explanation.fitter)) > likeliest.log_evidence:
+                    likeliest = replace(explanation, fit=fit, log_evidence=evidence)
+        return likeliest
+
+    def _evidence_of(self, fit: Fit, fitter: Fitter) -> float:
+        return log_evidence(fitter, replace(fit, cost=fitter.cost(fit)), self.choices)
 
     def without(self, explanation: RankedExplanation, cause: CauseName) -> RankedExplanation:
         """The explanation without one of its effects, refitted from its present values.
