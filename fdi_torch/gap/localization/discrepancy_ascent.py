@@ -164,13 +164,11 @@ class Ascent:
         """Improve noise, regressors and fit parameters in turn, until nothing gains or `needed` is out of reach."""
         not_refitted = -math.inf  # largest gain from which a refit gained nothing
         for turn in range(MOST_TURNS):
-            if best.gain < SHARE * (needed - best.gain):
-                break
             before, best = best.gain, max(best, self._with_likely_noise(best, turn == 0), key=gain_of)
             best = self.with_finer_positions(best)
             if turn == 0 or bool((best.regressed.used & best.discrepancy.sinusoids).any()):
                 best = max(best, self._with_finer_frequency(best), key=gain_of)
-            if best.gain - not_refitted < CONVERGED:
+            if best.gain < max(not_refitted + CONVERGED, SHARE * (needed - best.gain)):
                 break
             refitted = self._refitted(best)
             if refitted.gain > best.gain:

@@ -32,8 +32,7 @@ from fdi_torch.gap.localization.regressors import dominant_frequency, step_funct
 from fdi_torch.gap.localization.single_regressor_gain import SingleRegressorGains
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, occam, with_disturbances
 
-CALIBRATION_PLACES = 3  # places that show how far first-order gains are too low
-MOST_GROWTH = 10.0  # before they are evaluated, the largest share of a first-order gain by which it may be too low
+CALIBRATION_PLACES = 3  # places always evaluated; they show how far first-order gains are too low
 
 
 @dataclass(frozen=True)
@@ -80,8 +79,7 @@ def localize(
     evaluated: dict[str, LocalizedDiscrepancy] = {}
     growth, examined = -math.inf, 0  # growth: largest ratio so far of what a first-order gain lacks to that gain
     for place, first in sorted(first_order.items(), key=lambda item: -item[1].expected):
-        conceivable = growth if examined >= CALIBRATION_PLACES else max(growth, MOST_GROWTH)
-        if first.expected + conceivable * first.gain < needed:
+        if examined >= CALIBRATION_PLACES and first.expected + growth * first.gain < needed:
             continue
         best = ascent.climbed(ascent.under_less_and_less_noise(regression, place, likely), needed)
         examined += 1
@@ -128,7 +126,7 @@ def localize_beside(
 @dataclass(frozen=True)
 class _FirstOrder:
     """expected: gain in log evidence of the best single regressor of a place, with that of the noise. gain: of the
-    regressor alone, without the cost of its selection; zero if it is not worth that cost."""
+    regressor alone, without the cost of its selection."""
 
     expected: float
     gain: float
@@ -151,9 +149,7 @@ def _first_order_gains(
     first_order = {}
     for place in places:  # the regression keeps the regressors of one place only
         each = [(without, gains.at(place)) for without, gains in under_each]
-        first_order[place] = max(
-            (_FirstOrder(w + g.net, g.gain if g.net > 0.0 else 0.0) for w, g in each), key=lambda f: f.expected
-        )
+        first_order[place] = max((_FirstOrder(w + g.net, g.gain) for w, g in each), key=lambda f: f.expected)
     return first_order
 
 
