@@ -96,7 +96,8 @@ class ExplanationPool:
             if hopeless:
                 break
             if climb and not gain > CONVERGED:
-                best = self._with_fewer_parameters(best, candidate)
+                fit = self._with_likeliest_parameters(best.fitter, best.fit, candidate)
+                best = replace(best, fit=fit, log_evidence=self._evidence_of(fit, best.fitter))
                 break
             # The search for the correlation time, which takes longest, begins where the rest has converged.
             fit, start, climb = best.fit, best.noise, not gain > CONVERGED
@@ -104,19 +105,19 @@ class ExplanationPool:
             self.explanations[fit.key] = best
         return best
 
-    def _with_fewer_parameters(self, explanation: RankedExplanation, candidate: Candidate) -> RankedExplanation:
-        """The explanation with its own parameters, or with those of its effects that some starts of the candidate have,
-        whichever are likeliest under its noise.
+    def _with_likeliest_parameters(self, fitter: Fitter, fit: Fit, candidate: Candidate) -> Fit:
+        """The fit with its own parameters, or with fewer: those that some starts of the candidate have.
 
         By chance, an onset lowers the cost of an effect that was there from the start.
         """
-        values, likeliest = explanation.fit.effect_values, explanation
+        values, evidence = fit.effect_values, self._evidence_of(fit, fitter)
+        likeliest = fit
         for free in dict.fromkeys(tuple(sorted(s)) for s in candidate.starts):
             if set(free) < values.keys():
                 start = Candidate(candidate.placements, ({name: values[name] for name in free},))
-                fit = explanation.fitter.fit(start, explanation.fit)
-                if (evidence := self._evidence_of(fit, explanation.fitter)) > likeliest.log_evidence:
-                    likeliest = replace(explanation, fit=fit, log_evidence=evidence)
+                fewer = fitter.fit(start, fit)
+                if (of_fewer := self._evidence_of(fewer, fitter)) > evidence:
+                    likeliest, evidence = fewer, of_fewer
         return likeliest
 
     def _evidence_of(self, fit: Fit, fitter: Fitter) -> float:
@@ -178,7 +179,8 @@ class ExplanationPool:
             else c
             for c in self._extensions(base, screening, own=False)
         ]
-        return self._fitted(fitter, base, candidates, again=True)[:EVALUATED]
+        fits = self._fitted(fitter, base, candidates, again=True)[:EVALUATED]
+        return [self._with_likeliest_parameters(fitter, fit, fit.candidate) for fit in fits]
 
     def _fitted(
         self,
