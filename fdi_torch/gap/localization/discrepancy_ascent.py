@@ -69,7 +69,7 @@ class EvaluatedDiscrepancy:
         """The result. fitter: that of the explanation, whose sensor noise is the unit of the size."""
         explained, at, used, fit = self.explained, self.discrepancy, self.regressed.used, self.regression.fit
         precision = self.regressed.precision[used]
-        size = unexplained_norm(fitter, fit.space, fit.theta, fit.linearised.jacobian[0], explained)
+        size = unexplained_norm(fitter, fit.space, fit.theta, at.linearised.jacobian[0], explained)
         return LocalizedDiscrepancy(
             self.location,
             self.gain,
