@@ -41,3 +41,19 @@ def test_a_leak_that_grows_is_named() -> None:
     assert (leak.effect, leak.location) == ("leak", "T1")
     assert leak.parameters["onset"].value == pytest.approx(250.0, abs=5.0 * leak.parameters["onset"].std)
     assert leak.parameters["ramp"].value == pytest.approx(600.0, abs=5.0 * leak.parameters["ramp"].std)
+
+
+@pytest.mark.parametrize(("truth", "seed"), [({"T1.leak.size": 0.3}, 1), ({"T1.leak.size": 0.3}, 0)])
+def test_a_fault_from_the_start_at_the_floor_has_neither_onset_nor_height(truth: dict[str, float], seed: int) -> None:
+    """Both lower chi-square by chance; their prior widths cost more than that."""
+    answer = diagnose(nominal_plant(), recorded(truth, seed, samples=600), settings=Settings(("leak",)))
+    (leak,) = answer.causes
+    assert leak.parameters.keys() == {"size"}
+
+
+def test_a_fault_that_begins_soon_keeps_its_onset() -> None:
+    truth = {"P32.plugging.size": 0.3, "P32.plugging.onset": 20.0}
+    answer = diagnose(nominal_plant(), recorded(truth, 1, samples=600), settings=Settings(("plugging",)))
+    (plugging,) = answer.causes
+    onset = plugging.parameters["onset"]
+    assert onset.value == pytest.approx(20.0, abs=4.0 * onset.std)

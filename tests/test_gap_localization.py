@@ -174,7 +174,8 @@ def test_the_thresholds_of_a_relay_are_found_between_those_of_the_grid(nearest: 
     none = torch.zeros(len(about.columns), dtype=torch.bool)
     found = Positions(regression, "OUT2", observed, about, none, torch.Generator().manual_seed(0)).best(about, none)
     assert found is not None
-    basis, residual = parameter_basis(observed, null), whitened_residual(observed, null, about.linearised)
+    basis = parameter_basis(observed, null, about.linearised)
+    residual = whitened_residual(observed, null, about.linearised)
 
     def gain(columns: Tensor) -> float:
         white = without(basis, observed.whiten(columns).flatten(0, 1))

@@ -70,12 +70,13 @@ class ExplanationPool:
     def evaluate(self, fit: Fit, start: StateNoise | None = None) -> RankedExplanation:
         """Estimate noise and fit alternately until the evidence converges; keep the better explanation.
 
-        Effects that were evaluated before are evaluated again only if this fit is better under the noise found then.
+        Effects that were evaluated before are evaluated again only if this fit is likelier under the noise found then.
         The evaluation stops early if the explanation cannot compete: with those of as many effects that will be
-        extended, or with one that has only some of its effects.
+        extended, or with one that has only some of its effects. Otherwise, parameters that only some starts of the
+        fit's candidate have, as an onset, are in the end dropped if they lower the evidence.
         """
-        before = self.explanations.get(fit.key)
-        if before and before.fitter.cost(fit) > before.fit.cost - CONVERGED:
+        before, candidate = self.explanations.get(fit.key), fit.candidate
+        if before and self._evidence_of(fit, before.fitter) < before.log_evidence + CONVERGED:
             return before
         rivals = self.best_of(len(fit.key))[BEAM - 1 :] + [e for k, e in self.explanations.items() if k < fit.key]
         rival = max((e.log_evidence for e in rivals), default=-math.inf)
@@ -92,13 +93,35 @@ class ExplanationPool:
                 best = updated
             behind = rival - best.log_evidence
             hopeless = behind > 0.5 * BEHIND and gain < SHARE * behind
-            if hopeless or (climb and not gain > CONVERGED):
+            if hopeless:
+                break
+            if climb and not gain > CONVERGED:
+                fit = self._with_likeliest_parameters(best.fitter, best.fit, candidate)
+                best = replace(best, fit=fit, log_evidence=self._evidence_of(fit, best.fitter))
                 break
             # The search for the correlation time, which takes longest, begins where the rest has converged.
             fit, start, climb = best.fit, best.noise, not gain > CONVERGED
         if before is None or best.log_evidence > before.log_evidence:
             self.explanations[fit.key] = best
         return best
+
+    def _with_likeliest_parameters(self, fitter: Fitter, fit: Fit, candidate: Candidate) -> Fit:
+        """The fit with its own parameters, or with fewer: those that some starts of the candidate have.
+
+        By chance, an onset lowers the cost of an effect that was there from the start.
+        """
+        values, evidence = fit.effect_values, self._evidence_of(fit, fitter)
+        likeliest = fit
+        for free in dict.fromkeys(tuple(sorted(s)) for s in candidate.starts):
+            if set(free) < values.keys():
+                start = Candidate(candidate.placements, ({name: values[name] for name in free},))
+                fewer = fitter.fit(start, fit)
+                if (of_fewer := self._evidence_of(fewer, fitter)) > evidence:
+                    likeliest, evidence = fewer, of_fewer
+        return likeliest
+
+    def _evidence_of(self, fit: Fit, fitter: Fitter) -> float:
+        return log_evidence(fitter, replace(fit, cost=fitter.cost(fit)), self.choices)
 
     def without(self, explanation: RankedExplanation, cause: CauseName) -> RankedExplanation:
         """The explanation without one of its effects, refitted from its present values.
@@ -156,7 +179,8 @@ class ExplanationPool:
             else c
             for c in self._extensions(base, screening, own=False)
         ]
-        return self._fitted(fitter, base, candidates, again=True)[:EVALUATED]
+        fits = self._fitted(fitter, base, candidates, again=True)[:EVALUATED]
+        return [self._with_likeliest_parameters(fitter, fit, fit.candidate) for fit in fits]
 
     def _fitted(
         self,

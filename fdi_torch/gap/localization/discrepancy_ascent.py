@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -68,7 +69,7 @@ class EvaluatedDiscrepancy:
         """The result. fitter: that of the explanation, whose sensor noise is the unit of the size."""
         explained, at, used, fit = self.explained, self.discrepancy, self.regressed.used, self.regression.fit
         precision = self.regressed.precision[used]
-        size = unexplained_norm(fitter, fit.space, fit.theta, fit.linearised.jacobian[0], explained)
+        size = unexplained_norm(fitter, fit.space, fit.theta, at.linearised.jacobian[0], explained)
         return LocalizedDiscrepancy(
             self.location,
             self.gain,
@@ -161,15 +162,19 @@ class Ascent:
 
     def climbed(self, best: EvaluatedDiscrepancy, needed: float) -> EvaluatedDiscrepancy:
         """Improve noise, regressors and fit parameters in turn, until nothing gains or `needed` is out of reach."""
-        refitted: EvaluatedDiscrepancy | None = None  # a refit of this one gained nothing
+        not_refitted = -math.inf  # largest gain from which a refit gained nothing
         for turn in range(MOST_TURNS):
             before, best = best.gain, max(best, self._with_likely_noise(best, turn == 0), key=gain_of)
             best = self.with_finer_positions(best)
             if turn == 0 or bool((best.regressed.used & best.discrepancy.sinusoids).any()):
                 best = max(best, self._with_finer_frequency(best), key=gain_of)
-            if best is refitted or best.gain < SHARE * (needed - best.gain):
+            if best.gain < max(not_refitted + CONVERGED, SHARE * (needed - best.gain)):
                 break
-            refitted, best = best, max(best, self._refitted(best), key=gain_of)
+            refitted = self._refitted(best)
+            if refitted.gain > best.gain:
+                best = refitted
+            else:
+                not_refitted = best.gain
             if best.gain - before < max(CONVERGED, SHARE * (needed - best.gain)):
                 break
         return best

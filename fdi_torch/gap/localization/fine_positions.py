@@ -64,7 +64,7 @@ class Positions:
         self.regression, self.place, self.under, self.fit = regression, place, under, regression.fit
         self._residual = whitened_residual(under, self.fit, discrepancy.linearised)
         signs = random_signs(self._residual, generator)
-        basis = parameter_basis(under, self.fit, discrepancy.columns[used])
+        basis = parameter_basis(under, self.fit, discrepancy.linearised, discrepancy.columns[used])
         self._strengths = [strengths_of(p) for p in self._products(signs, basis)]
         choices = sum(map(len, self._strengths))
         (self._cost,) = column_costs(torch.tensor([float(choices)]), largest_influence(under)).tolist()
@@ -73,7 +73,7 @@ class Positions:
     def best(self, discrepancy: Discrepancy, used: Tensor) -> Discrepancy | None:
         """The discrepancy with the regressor that explains most in addition to those used, or None if none is worth
         its selection."""
-        basis = parameter_basis(self.under, self.fit, discrepancy.columns[used])
+        basis = parameter_basis(self.under, self.fit, discrepancy.linearised, discrepancy.columns[used])
         products = self._products(self._residual, basis)
         gains = [gains_of(p[:, 0], strength) for p, strength in zip(products, self._strengths, strict=True)]
         highest = [(float(g[i]), family, i) for family, g in enumerate(gains) for i in _local_maxima(g)]
@@ -166,7 +166,7 @@ def with_best_frequency(
     sinusoids = discrepancy.sinusoids
     if discrepancy.frequency is None:
         return None
-    basis = parameter_basis(under, fit, discrepancy.columns[used & ~sinusoids])
+    basis = parameter_basis(under, fit, discrepancy.linearised, discrepancy.columns[used & ~sinusoids])
     residual = whitened_residual(under, fit, discrepancy.linearised)
     residual = without(basis, residual)
     frequency = discrepancy.frequency

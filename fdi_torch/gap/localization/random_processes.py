@@ -12,13 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 
 from fdi_torch.estimate.evidence import RARE
 from fdi_torch.estimate.kalman import SCATTER, StateNoise, Wander
 from fdi_torch.estimate.state_noise import CORRELATION_TIMES, LOG_BOUND
-from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.localized_discrepancy import (
@@ -49,39 +49,86 @@ def random_flows(
     if tank not in places or len(noise.intensity) < 2:
         return []
     cost = math.log(2.0 * LOG_BOUND / (SCATTER * math.sqrt(2.0 * math.pi)))
-    nothing = torch.zeros_like(fitter.data.readings)
 
-    def evaluate(apart: StateNoise) -> LocalizedDiscrepancy:
-        gain = log_evidence(fitter, fit, apart, linearised) - base - cost
-        under = with_disturbances(fitter, fit, apart, linearised)
-        size, estimate = _moved(under, linearised), _estimate(under, fit, linearised)
-        return LocalizedDiscrepancy(tank, gain, gain + cost, 1, nothing, None, size, None, fit, apart, estimate)
+    def gain_under(apart: StateNoise) -> float:
+        return log_evidence(fitter, fit, apart, linearised) - base - cost
 
-    return [_most_likely(regression, linearised, evaluate, replace(noise, apart=largest), needed)]
+    gain, apart = _most_likely(regression, linearised, gain_under, replace(noise, apart=largest), needed)
+    if gain < needed:
+        return []
+    size = _moved(with_disturbances(fitter, fit, apart, linearised), linearised)
+    return [_random_process(regression, tank, linearised, apart, gain, gain + cost, 1, size)]
+
+
+def drifting_sensors(
+    regression: DiscrepancyRegression, noise: StateNoise, places: Sequence[str], base: float, needed: float
+) -> list[LocalizedDiscrepancy]:
+    """A drift at each sensor, without those whose gain in log evidence is below `needed`, or far below another's."""
+    fitter, fit, quiet = regression.fitter, regression.fit, nearly_without_disturbances(noise)
+
+    def gain_at(place: str, noise: StateNoise) -> float:
+        assert noise.wander is not None
+        return log_evidence(fitter, fit, noise, regression.at(place)[1]) - base - _drift_cost(fitter, noise.wander)
+
+    starts: list[tuple[float, str, StateNoise]] = []
+    for place in places:
+        if (channel := regression.sensor(place)) is not None:
+            start = _initial_drift(fitter, regression.at(place)[1], quiet, channel)
+            starts.append((gain_at(place, start), place, start))
+    drifts: list[LocalizedDiscrepancy] = []
+    noise_gain = 0.0
+    for tried, (initial, place, start) in enumerate(sorted(starts, key=lambda s: -s[0])):
+        if tried and initial + noise_gain < needed:
+            break
+        linearised = regression.at(place)[1]
+        found = _most_likely(regression, linearised, partial(gain_at, place), start, needed)
+        gain, drift = max(found, (initial, start), key=lambda f: f[0])
+        noise_gain, needed = max(noise_gain, gain - initial), max(needed, gain + math.log(RARE))
+        assert drift.wander is not None
+        if gain >= needed and not is_rounding_error(fitter, place, drift.wander.std):
+            likelihood, size = gain + _drift_cost(fitter, drift.wander), _drift_size(fitter, drift.wander)
+            drifts.append(_random_process(regression, place, linearised, drift, gain, likelihood, 2, size))
+    return drifts
 
 
 def _most_likely(
     regression: DiscrepancyRegression,
     linearised: Linearised,
-    evaluate: Callable[[StateNoise], LocalizedDiscrepancy],
+    gain_under: Callable[[StateNoise], float],
     start: StateNoise,
     needed: float,
-) -> LocalizedDiscrepancy:
-    """A random process with its most likely parameters.
+) -> tuple[float, StateNoise]:
+    """The largest gain of a random process, and its most likely parameters.
 
     Its correlation time stays that of `start` if its gain is then below SHARE of what it lacks to be relevant.
     """
     fitter, fit = regression.fitter, regression.fit
-    first = evaluate(estimate_disturbances(fitter, fit, linearised, start=start, climb=False).noise)
-    if first.gain < SHARE * (needed - first.gain):
-        return first
-    climbed = evaluate(estimate_disturbances(fitter, fit, linearised, start=first.noise).noise)
-    return max(first, climbed, key=lambda d: d.gain)
+    first = estimate_disturbances(fitter, fit, linearised, start=start, climb=False).noise
+    gain = gain_under(first)
+    if gain < SHARE * (needed - gain):
+        return gain, first
+    climbed = estimate_disturbances(fitter, fit, linearised, start=first).noise
+    return max((gain, first), (gain_under(climbed), climbed), key=lambda f: f[0])
 
 
-def _estimate(under: Fitter, fit: Fit, linearised: Linearised) -> Estimate:
-    nothing = linearised.readings.new_zeros(*linearised.readings.shape[1:], 0)
-    return Estimate.beside(under, fit, linearised, nothing, nothing.new_zeros(0))
+def _random_process(
+    regression: DiscrepancyRegression,
+    place: str,
+    linearised: Linearised,
+    noise: StateNoise,
+    gain: float,
+    log_likelihood: float,
+    parameters: int,
+    size: float,
+) -> LocalizedDiscrepancy:
+    """A random process as a discrepancy without regressors."""
+    fitter, fit = regression.fitter, regression.fit
+    nothing = torch.zeros_like(fitter.data.readings)
+    under = with_disturbances(fitter, fit, noise, linearised)
+    estimate = Estimate.beside(under, fit, linearised, nothing.unsqueeze(-1)[..., :0], nothing.new_zeros(0))
+    return LocalizedDiscrepancy(
+        place, gain, log_likelihood, parameters, nothing, None, size, None, fit, noise, estimate
+    )
 
 
 def _moved(fitter: Fitter, linearised: Linearised) -> float:
@@ -92,42 +139,6 @@ def _moved(fitter: Fitter, linearised: Linearised) -> float:
     names = [t.name for t in plant.tanks]
     of_sensors = moved[:, [names.index(s.tank) for s in plant.sensors]]
     return float(torch.linalg.vector_norm(torch.where(fitter.data.mask, of_sensors, 0.0) / fitter.noise.std))
-
-
-def drifting_sensors(
-    regression: DiscrepancyRegression, noise: StateNoise, places: Sequence[str], base: float, needed: float
-) -> list[LocalizedDiscrepancy]:
-    """A drift at each sensor, without those whose gain in log evidence cannot reach `needed`."""
-    fitter, fit = regression.fitter, regression.fit
-
-    def evaluate(noise: StateNoise) -> LocalizedDiscrepancy:
-        assert noise.wander is not None
-        sensor = fitter.data.plant.sensors[noise.wander.channel].name
-        linearised = regression.at(sensor)[1]
-        gain = log_evidence(fitter, fit, noise, linearised) - base
-        cost = _drift_cost(fitter, noise.wander)
-        nothing, size = torch.zeros_like(fitter.data.readings), _drift_size(fitter, noise.wander)
-        estimate = _estimate(with_disturbances(fitter, fit, noise, linearised), fit, linearised)
-        return LocalizedDiscrepancy(sensor, gain - cost, gain, 2, nothing, None, size, None, fit, noise, estimate)
-
-    starts = [
-        _initial_drift(fitter, regression.at(p)[1], nearly_without_disturbances(noise), channel)
-        for p in places
-        if (channel := regression.sensor(p)) is not None
-    ]
-    drifts: list[LocalizedDiscrepancy] = []
-    noise_gain = 0.0
-    for initial in sorted(map(evaluate, starts), key=lambda d: d.gain, reverse=True):
-        if drifts and initial.gain + noise_gain < needed:
-            break
-        found = _most_likely(regression, regression.at(initial.location)[1], evaluate, initial.noise, needed)
-        best = max(initial, found, key=lambda d: d.gain)
-        noise_gain = max(noise_gain, best.gain - initial.gain)
-        needed = max(needed, best.gain + math.log(RARE))
-        assert best.noise.wander is not None
-        if not is_rounding_error(fitter, best.location, best.noise.wander.std):
-            drifts.append(best)
-    return drifts
 
 
 def _initial_drift(fitter: Fitter, linearised: Linearised, quiet: StateNoise, channel: int) -> StateNoise:

@@ -60,7 +60,8 @@ class SingleRegressorGains:
 
     def __init__(self, regression: DiscrepancyRegression, under: Fitter, fit: Fit, generator: torch.Generator) -> None:
         self.regression, self.under, self.fit = regression, under, fit
-        self._basis, self._largest = parameter_basis(under, fit), largest_influence(under)
+        self._largest = largest_influence(under)
+        self._basis = parameter_basis(under, fit, regression.linearised)
         residual = whitened_residual(under, fit, regression.linearised)
         columns = torch.cat([residual, random_signs(residual, generator)], dim=1)
         self._adjoints = adjoints_of(regression, under, columns, self._basis)
@@ -77,7 +78,8 @@ class SingleRegressorGains:
     def _reading_weights(self, place: str, channel: int) -> list[Tensor]:
         """Per recording, the weights (1 + SIGNS, K) of a sensor's readings, about the model's level of its tank."""
         linearised = self.regression.at(place)[1]
-        residual = _whitened_adjoint(self.under, whitened_residual(self.under, self.fit, linearised), self._basis)
+        basis = parameter_basis(self.under, self.fit, linearised)
+        residual = _whitened_adjoint(self.under, whitened_residual(self.under, self.fit, linearised), basis)
         weights = torch.cat([residual[:, channel], self._adjoints.readings[:, channel, 1:]], dim=1)
         return [weights[piece.rows].T for piece in self.regression.pieces]
 
@@ -145,10 +147,11 @@ def whitened_residual(under: Fitter, fit: Fit, linearised: Linearised) -> Tensor
     return torch.cat([under.residual(linearised.readings).flatten(), -off]).unsqueeze(1)
 
 
-def parameter_basis(under: Fitter, fit: Fit, columns: Tensor | None = None) -> Tensor:
-    """Orthonormal basis (S C + P, .) of the influence of the parameters, and of further columns (S, C, M)."""
+def parameter_basis(under: Fitter, fit: Fit, linearised: Linearised, columns: Tensor | None = None) -> Tensor:
+    """Orthonormal basis (S C + P, .) of the influence of the parameters about a linearised trajectory, and of further
+    columns (S, C, M)."""
     scale, pull, _ = under.priors(fit.space, fit.theta)
-    jacobian = under.whiten(fit.linearised.jacobian[0]) * scale
+    jacobian = under.whiten(linearised.jacobian[0]) * scale
     if columns is not None:
         jacobian = torch.cat([jacobian, under.whiten(columns)], dim=-1)
     return decomposed(jacobian.flatten(0, 1), pull)[0]

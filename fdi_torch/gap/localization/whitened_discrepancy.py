@@ -99,6 +99,7 @@ class WhitenedDiscrepancy:
 
 def _grouped(x: Tensor, each: int) -> Tensor:
     """Sums (S / each C, M) of groups of samples of x (S, C, M), scaled to unit variance."""
-    groups = len(x) // each
-    sums = x if each == 1 else x[: groups * each].reshape(groups, each, *x.shape[1:]).sum(dim=1) / each**0.5
+    groups = x[: len(x) // each * each].unflatten(0, (-1, each))
+    # PyTorch sums a short dimension slowly.
+    sums = x if each == 1 else sum(groups.unbind(1)[1:], groups[:, 0]) / each**0.5
     return sums.flatten(0, 1)
