@@ -40,12 +40,8 @@ class AlarmHandler:
 
     def __init__(self, explainer: Explainer, detector: Detector, writer: EventWriter) -> None:
         self.explainer, self.observer, self.faults = explainer, explainer.observer, explainer.faults
-        self.space, self.settings, self.detector, self.writer = (
-            self.observer.space,
-            explainer.settings,
-            detector,
-            writer,
-        )
+        self.space, self.settings = self.observer.space, explainer.settings
+        self.detector, self.writer = detector, writer
         self.reach = max(round(self.settings.lookback / detector.design.interval), 1)
 
     # Schedule
