@@ -139,7 +139,7 @@ def make_detector(
 
 
 def max_abs(white: Tensor, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """max over channels of |e|, (*batch, S, C) -> (*batch, S). It has no memory."""
+    """max over channels of |e|, for white (*batch, S, C). It has no memory."""
     return torch.nan_to_num(white, nan=0.0).abs().amax(dim=-1), white[..., :0, :]
 
 

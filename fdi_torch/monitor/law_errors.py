@@ -6,8 +6,8 @@ If fault j has 1 + c_j + a_j(t) times the effect that the model gives it, the wh
 
 D_k (sensors, F) is the effect of each fault on them, by finite differences along the readings. The error c of a size is
 constant. The error a of a law has the standard deviation ODDS.law_error and an exponential correlation in time. The
-deviation b (sensors,) is zero, or constant and unknown after an alarm that no fault explains. The Kalman filter for c,
-a and b turns e_k into innovations that are white with unit variance unless something else changes.
+deviation b (sensors,) is zero, or constant and unknown after an answer that leaves more than noise. The Kalman filter
+for c, a and b turns e_k into innovations that are white with unit variance unless something else changes.
 """
 
 from __future__ import annotations
