@@ -199,7 +199,7 @@ class AlarmHandler:
             events = [self.writer.unexplained(waiting, number, self.explainer.reported(fits))]
         if self.next_fit(waiting) - state.alarm(number).last <= self.settings.longest:
             return waiting, events
-        waiting, event = self.retire(waiting, number, "no fault of the list explains it better than chance does")
+        waiting, event = self.retire(waiting, number, "no fault of the list explains it")
         return waiting, [*events, event]
 
     def _alarm_of_known_faults(self, state: MonitorState, best: HypothesisFit) -> int | None:
