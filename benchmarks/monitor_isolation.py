@@ -1,7 +1,9 @@
 """What the monitor says about a fault on disturbed tanks: `python -m benchmarks.monitor_isolation --seed 1`.
 
-With `--oracle`, each of its answers is compared with the posterior over the same suspects on the same samples if onset,
-course (sudden or growing) and the number of faults are known: what remains is what the readings do not decide.
+With `--oracle`, each of its answers is compared with two posteriors on the same samples: over the same suspects if
+onset, course (sudden or growing) and the number of faults are known, and over the injected faults if their sizes are
+known too. What remains is what the readings do not decide. With `--from-prior N`, N sudden faults and their sizes are
+drawn from the prior of the monitor, so that its probabilities must be the frequencies with which it is right.
 """
 
 from __future__ import annotations
@@ -9,8 +11,10 @@ from __future__ import annotations
 import argparse
 import time
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
+import numpy as np
 import torch
 
 from benchmarks.monitor_rigs import GROWTH, KINDS, SIZES, Case, recordings
@@ -21,7 +25,7 @@ from fdi_torch.monitor.hypothesis import Hypothesis
 from fdi_torch.monitor.hypothesis_fit import Prior, fit
 from fdi_torch.monitor.monitor_settings import LOOKBACK
 from fdi_torch.monitor.monitor_setup import PreparedMonitor, fault_free_part, prepare_monitor
-from fdi_torch.monitor.observer_bank import ObserverWindow, no_change
+from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverWindow, no_change
 from fdi_torch.monitor.samples import Samples, samples_of_recording
 from fdi_torch.recording import Recording
 
@@ -35,10 +39,13 @@ def events_of(recording: Recording, learn: float, every: float = 20000.0) -> lis
     return followed(*prepared_for(recording, learn, every), learn)
 
 
-def prepared_for(recording: Recording, learn: float, every: float = 20000.0) -> tuple[PreparedMonitor, Samples]:
-    """A monitor that has learnt for `learn` s, and all samples."""
-    plant = load_plant("three_tank")
-    prepared = prepare_monitor(plant, fault_free_part(recording, 0.0, learn), time_between_false_alarms=every)
+def prepared_for(
+    recording: Recording, learn: float, every: float = 20000.0, ranges: Mapping[str, tuple[float, float]] | None = None
+) -> tuple[PreparedMonitor, Samples]:
+    """A monitor that has learnt for `learn` s, and all samples. ranges: of its suspects, the usual ones by default."""
+    plant, suspects = load_plant("three_tank"), list(ranges or {})
+    known = fault_free_part(recording, 0.0, learn)
+    prepared = prepare_monitor(plant, known, suspects, time_between_false_alarms=every, ranges=ranges)
     return prepared, samples_of_recording(recording, plant)
 
 
@@ -47,25 +54,50 @@ def followed(prepared: PreparedMonitor, samples: Samples, learn: float) -> list[
     return prepared.monitor.advance(state, samples.segment(1, len(samples)))[1]
 
 
+def windows(
+    prepared: PreparedMonitor, samples: Samples, case: Case, times: Sequence[float]
+) -> Iterator[ObserverWindow]:
+    """The windows that begin before the onset and end at each of the times."""
+    monitor, start = prepared.monitor, case.onset - LOOKBACK
+    first = int((samples.time < start).sum())
+    state = monitor.start(samples, prepared.believed, learning_until=case.lasts)
+    state, _ = monitor.advance(state, samples.segment(1, first + 1))
+    for end in times:
+        until = int((samples.time <= end).sum())
+        yield ObserverWindow(samples.segment(first, until), state.state[-1], state.number, state.memory[-1])
+
+
 def known_onset_posterior(
     prepared: PreparedMonitor, samples: Samples, case: Case, times: Sequence[float]
 ) -> list[dict[str, float]]:
     """The probability of each single fault at each of the times, if its onset and course are known."""
-    monitor, believed = prepared.monitor, prepared.believed
-    observer, start = monitor.observer, case.onset - LOOKBACK
-    first = int((samples.time < start).sum())
-    state = monitor.start(samples, believed, learning_until=case.lasts)
-    state, _ = monitor.advance(state, samples.segment(1, first + 1))
+    monitor, believed, observer = prepared.monitor, prepared.believed, prepared.monitor.observer
     hypotheses = [Hypothesis((fault.size,), case.ramp > 0.0) for fault in monitor.faults]
     starts = torch.cat([believed, believed.new_tensor([case.onset])]).repeat(len(hypotheses), 1)
     prior, posteriors = Prior(monitor.space.names, len(hypotheses)), []
-    for end in times:
-        until = int((samples.time <= end).sum())
-        window = ObserverWindow(samples.segment(first, until), state.state[-1], state.number, state.memory[-1])
+    for window in windows(prepared, samples, case, times):
         base = 0.5 * float(observer.white_innovations(window, believed, no_change(believed)).square().sum())
         fits = fit(observer, window, believed, hypotheses, starts, base, prior, known_onset=True)
         names = [monitor.space.names[f.hypothesis.columns[0]] for f in fits]
         posteriors.append(dict(zip(names, posterior([f.evidence for f in fits]), strict=True)))
+    return posteriors
+
+
+def known_size_posterior(
+    prepared: PreparedMonitor, samples: Samples, case: Case, times: Sequence[float]
+) -> list[dict[str, float]]:
+    """The probability of each injected fault at each of the times, if its onset, course and size are known."""
+    space, believed, observer = prepared.monitor.space, prepared.believed, prepared.monitor.observer
+    rivals = [replace(case, fault=fault, share=1.0) for fault in SIZES]
+    posteriors = []
+    for end, window in zip(times, windows(prepared, samples, case, times), strict=True):
+        theta = torch.stack([space.vector({r.name: r.size_at(end)}) for r in rivals])
+        onsets, incipient = theta.new_full((len(rivals),), case.onset), torch.full((len(rivals),), case.ramp > 0.0)
+        white = observer.white_innovations(window, believed, ChangeHypotheses(theta, onsets, incipient))
+        total: dict[str, float] = defaultdict(float)
+        for rival, p in zip(rivals, posterior((-0.5 * white.square().sum((1, 2))).tolist()), strict=True):
+            total[rival.name] += p
+        posteriors.append(total)
     return posteriors
 
 
@@ -84,20 +116,20 @@ def answers_of(case: Case, events: Sequence[Event]) -> list[Event]:
     return [e for e in events if e.kind in ANSWERS and e.time >= case.onset and e.explanations]
 
 
-def scored_oracle(case: Case, posteriors: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Counts for the posteriors with known onset, as those of `scored`."""
+def scored_oracle(case: Case, posteriors: Sequence[Mapping[str, float]], known: str) -> dict[str, float]:
+    """Counts for posteriors with known onsets or sizes, as those of `scored`."""
     count: dict[str, float] = defaultdict(float)
     for probabilities in posteriors:
-        groups = {frozenset(twins_of(n)): sum(probabilities[m] for m in twins_of(n)) for n in probabilities}
+        groups = {frozenset(twins_of(n)): sum(probabilities.get(m, 0.0) for m in twins_of(n)) for n in probabilities}
         held = 0.0
         for rank, group in enumerate(sorted(groups, key=lambda g: -groups[g])):
-            count["oracle: in set"] += held < 0.95 and case.name in group
+            count[f"known {known}: in set"] += held < 0.95 and case.name in group
             held += groups[group]
             if rank == 0:
-                count["oracle: top"] += case.name in group
-                count["oracle: top by its own probability"] += groups[group]
-                count["oracle: certain"] += held >= 0.95
-                count["oracle: certain, wrong"] += held >= 0.95 and case.name not in group
+                count[f"known {known}: top"] += case.name in group
+                count[f"known {known}: top by its own probability"] += groups[group]
+                count[f"known {known}: certain"] += held >= 0.95
+                count[f"known {known}: certain, wrong"] += held >= 0.95 and case.name not in group
     return count
 
 
@@ -133,6 +165,25 @@ def cases(seed: int, learn: float, faults: Sequence[str], kinds: Sequence[str]) 
     return [Case(f, r, k, learn, onset, onset + 1600.0, True, 1000 * seed + i) for i, (f, r, k) in enumerate(drawn)]
 
 
+RANGES = {
+    "leak.size": (0.0, 0.3), "plugging.size": (-0.3, 0.3), "pump_gain.factor": (0.7, 1.3),
+    "pump_offset.offset": (-1.35e-5, 1.35e-5), "sensor_bias.bias": (-0.1, 0.1), "sensor_gain.factor": (0.8, 1.2),
+}  # fmt: skip
+"""Of the sizes that are drawn, 0.2 to 0.3 of the usual ranges, so that no tank overflows or runs dry."""
+
+
+def cases_from_prior(seed: int, learn: float, count: int) -> tuple[list[Case], dict[str, tuple[float, float]]]:
+    """Sudden faults with sizes from a monitor's prior, and the ranges that this monitor has."""
+    ranges = {f: RANGES[f.partition(".")[2]] for f in SIZES if " " not in f}
+    rng, names, drawn = np.random.default_rng(seed), list(ranges), []
+    for i in range(count):
+        fault = names[rng.integers(len(names))]
+        size = rng.uniform(*ranges[fault]) - fault.endswith(".factor")
+        kind, share, onset = list(KINDS)[i % 3], size / SIZES[fault], learn + 300.0
+        drawn.append(Case(fault, 0.0, kind, learn, onset, onset + 1600.0, True, 1000 * seed + i, share))
+    return drawn, ranges
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
@@ -140,19 +191,26 @@ def main() -> None:
     parser.add_argument("--faults", nargs="*", default=list(SIZES))
     parser.add_argument("--kinds", nargs="*", default=list(KINDS))
     parser.add_argument("--every", type=int, default=1, help="only each n-th case")
-    parser.add_argument("--oracle", action="store_true", help="compare with the posterior for known onsets")
+    parser.add_argument("--first", type=int, default=0, help="number of the first case")
+    parser.add_argument("--from-prior", type=int, default=0, help="draw that many cases from the monitor's prior")
+    parser.add_argument("--oracle", action="store_true", help="compare with posteriors for known onsets and sizes")
     parser.add_argument("--show", action="store_true", help="print the events")
     a = parser.parse_args()
-    chosen = cases(a.seed, a.learn, a.faults, a.kinds)[:: a.every]
+    if a.from_prior:
+        chosen, ranges = cases_from_prior(a.seed, a.learn, a.from_prior)
+    else:
+        chosen, ranges = cases(a.seed, a.learn, a.faults, a.kinds)[a.first :: a.every], {}
     total: dict[str, float] = defaultdict(float)
     started = time.process_time()
     for case, (recording, _) in zip(chosen, recordings(chosen), strict=True):
-        prepared, samples = prepared_for(recording, case.learn)
+        prepared, samples = prepared_for(recording, case.learn, ranges=ranges)
         events = followed(prepared, samples, case.learn)
         count = scored(case, events)
         if a.oracle:
             times = [e.time for e in answers_of(case, events)]
-            count |= scored_oracle(case, known_onset_posterior(prepared, samples, case, times))
+            count |= scored_oracle(case, known_onset_posterior(prepared, samples, case, times), "onset")
+            if not a.from_prior:
+                count |= scored_oracle(case, known_size_posterior(prepared, samples, case, times), "size")
         for name, number in count.items():
             total[name] += number
         print(f"{case.fault:26} {case.ramp:6.0f} {case.kind:6}", dict(count), flush=True)

@@ -55,7 +55,7 @@ def cusum_run_length(threshold: float, drift: float, std: float = 1.0) -> float:
 def glr_peaks() -> torch.Tensor:
     """The simulated maxima on which the thresholds of a GLR of three channels depend."""
     lengths = window_lengths(LONGEST_WINDOW)
-    return block_maxima(lambda e: glr(e, lengths), 3, torch.Generator().manual_seed(1))
+    return block_maxima(lambda e: glr(lengths, e)[0], 3, torch.Generator().manual_seed(1))
 
 
 def detector_of(chart: Chart, time_between_false_alarms: float) -> Detector:
@@ -86,8 +86,8 @@ def test_a_rarely_read_sensor_needs_as_many_of_its_own_readings() -> None:
     """A missing reading changes nothing: neither its own sums nor those of other channels."""
     rare = torch.full((400, 2), torch.nan, dtype=torch.float64)
     rare[::10, 1] = noise(40) + 1.5
-    alone = cusum(rare[::10, 1:], 0.5)
-    torch.testing.assert_close(cusum(rare, 0.5)[::10], alone)
+    alone, together = cusum(0.5, rare[::10, 1:])[0], cusum(0.5, rare)[0]
+    torch.testing.assert_close(together[::10], alone)
     white = whitening_of(
         torch.stack([noise(400), torch.where(torch.arange(400) % 2 == 0, noise(400, seed=1), torch.nan)], 1)
     )
@@ -167,7 +167,7 @@ def test_the_first_alarm_since_a_time_is_one_of_all_alarms(chart: Chart) -> None
 
 
 def test_simulated_threshold_agrees_with_the_exact_one() -> None:
-    rate = rate_of_maxima(block_maxima(max_abs, 3, torch.Generator().manual_seed(0)))
+    rate = rate_of_maxima(block_maxima(lambda e: max_abs(e)[0], 3, torch.Generator().manual_seed(0)))
     exact = known(fixed_rate, 5000.0, 3).threshold
     assert known(lambda h, std: rate(h / std[:, 0]), 5000.0, 3).threshold == pytest.approx(exact, abs=0.03)
 
@@ -188,7 +188,7 @@ def test_cusum_is_pages_recursion() -> None:
     up = down = torch.zeros(2, dtype=torch.float64)
     for k in range(50):
         up, down = (up + e[k] - drift).clamp(min=0.0), (down - e[k] - drift).clamp(min=0.0)
-        assert float(cusum(e, drift)[k]) == pytest.approx(float(torch.maximum(up, down).max()), abs=1e-12)
+        assert float(cusum(drift, e)[0][k]) == pytest.approx(float(torch.maximum(up, down).max()), abs=1e-12)
 
 
 @pytest.mark.parametrize(("samples", "k"), [(40, 25), (8, 7)], ids=["within", "a window as long as all samples"])
@@ -196,14 +196,14 @@ def test_glr_is_the_largest_normalised_sum(samples: int, k: int) -> None:
     e = noise(samples, 2) + 3.0
     lengths = window_lengths(8)
     expected = max(float(e[k - n + 1 : k + 1].sum(0).square().sum() / n) for n in lengths)
-    assert float(glr(e, lengths)[k]) == pytest.approx(expected, rel=1e-12)
+    assert float(glr(lengths, e)[0][k]) == pytest.approx(expected, rel=1e-12)
 
 
 def test_glr_false_alarms_with_wrong_variances_are_those_of_a_simulation() -> None:
     lengths, std = window_lengths(50), torch.tensor([[1.0, 1.15, 0.9]], dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
-    rate = sum_of_squares_rate(block_maxima(lambda e: glr(e, lengths), 3, generator), 3, generator)
-    alarms = glr(std * noise(200, 5000, 3, seed=3), lengths)[:, 500:] > 20.0
+    rate = sum_of_squares_rate(block_maxima(lambda e: glr(lengths, e)[0], 3, generator), 3, generator)
+    alarms = glr(lengths, std * noise(200, 5000, 3, seed=3))[0][:, 500:] > 20.0
     first = alarms & ~torch.nn.functional.pad(alarms, (60, 0))[:, :-60].cumsum(1).bool()
     lasted = float((~alarms.cumsum(1).bool()).sum())
     assert float(rate(20.0, std)) == pytest.approx(float(first.any(1).sum()) / lasted, rel=0.2)

@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
 
+from fdi_torch.effects import build_network, place
 from fdi_torch.estimate.evidence import ODDS
-from fdi_torch.monitor.law_errors import SIZE_ERROR, LawErrors
+from fdi_torch.monitor.events import Event
+from fdi_torch.monitor.law_errors import SIZE_ERROR, UNKNOWN, LawErrors
+from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.parameters import ParameterSpace
-from tests.test_monitor import INPUTS, NETWORK, SPACE, followed, monitor, recorded
+from tests.test_monitor import (
+    INPUTS,
+    NETWORK,
+    PLANT,
+    SPACE,
+    Truth,
+    followed,
+    monitor,
+    noise,
+    recorded,
+    step_to,
+)
 
 DTYPE = torch.float64
 
@@ -19,8 +35,12 @@ def start(faults: int, correlation_time: float) -> LawErrors:
     return LawErrors.at_start(range(faults), correlation_time, nothing, nothing, torch.zeros(0, 3, dtype=DTYPE))
 
 
-def test_innovations_beside_known_faults_are_those_of_the_normal_distribution_of_all_residuals() -> None:
-    """Its covariance is I + D (SIZE_ERROR^2 + law_error^2 exp(-|t - t'| / T)) D', for the readings that are there."""
+@pytest.mark.parametrize("deviation", [0.0, UNKNOWN])
+def test_innovations_beside_known_faults_are_those_of_the_normal_distribution_of_all_residuals(
+    deviation: float,
+) -> None:
+    """Its covariance is I + D (SIZE_ERROR^2 + law_error^2 exp(-|t - t'| / T)) D', for the readings that are there, and
+    UNKNOWN^2 between those of one sensor beside a steady deviation."""
     generator = torch.Generator().manual_seed(3)
     count, sensors, faults, time = 40, 3, 2, 25.0
     white, effects = (torch.randn(*n, count, sensors, generator=generator, dtype=DTYPE) for n in ((), (faults,)))
@@ -29,13 +49,17 @@ def test_innovations_beside_known_faults_are_those_of_the_normal_distribution_of
     white[10, 1] = white[11, 1] = white[20] = torch.nan
     at = intervals.cumsum(0)
     shared = SIZE_ERROR**2 + ODDS.law_error**2 * torch.exp(-(at[:, None] - at).abs() / time)
-    joint = torch.einsum("fsc,ftd,st->sctd", effects, effects, shared).reshape(count * sensors, -1)
+    joint = torch.einsum("fsc,ftd,st->sctd", effects, effects, shared)
+    joint = joint + deviation**2 * torch.eye(sensors, dtype=DTYPE)[:, None]
+    joint = joint.reshape(count * sensors, -1)
     present = torch.isfinite(white).flatten()
     covariance = (joint + torch.eye(count * sensors, dtype=DTYPE))[present][:, present]
     expected = torch.linalg.solve_triangular(
         torch.linalg.cholesky(covariance), white.flatten()[present][:, None], upper=False
     ).flatten()
-    errors, first = start(faults, time).after(white[:15], effects[:, :15], intervals[:15])
+    errors = start(faults, time)
+    errors = errors.with_unknown_deviation() if deviation else errors
+    errors, first = errors.after(white[:15], effects[:, :15], intervals[:15])
     _, second = errors.after(white[15:], effects[:, 15:], intervals[15:])
     got = torch.cat([first, second]).flatten()
     assert torch.equal(torch.isfinite(got), present)
@@ -91,3 +115,37 @@ def test_a_fault_is_detected_as_soon_beside_a_known_one_as_alone(known: str) -> 
 
     _, events = followed(monitor(), recorded(truth, 400))
     assert next(event.time for event in events if event.kind == "alarm" and event.time > 320.0) <= 344.0
+
+
+def beside_steady_deviation(leaks: Truth, sensor: int, size: float, samples: int) -> list[Event]:
+    """The events of a monitor for leaks of T1 alone if one sensor reads `size` m too much from 340 s on."""
+    network = build_network(PLANT, [place("leak", "T1")])
+    space = ParameterSpace([network.constants["T1.leak.size"]])
+    whole = recorded(leaks, samples)
+    readings = whole.readings.clone()
+    readings[340:, sensor] += size
+    usual = monitor()
+    watch = Monitor(network, space, noise(), usual.detector, usual.settings)
+    return followed(watch, replace(whole, readings=readings))[1]
+
+
+@pytest.mark.parametrize("size", [4e-3, 2e-2])
+@pytest.mark.parametrize("sensor", [1, 2])
+@pytest.mark.parametrize("known", [0.0, 0.1])
+def test_a_steady_deviation_that_no_fault_explains_does_not_raise_one_alarm_after_another(
+    known: float, sensor: int, size: float
+) -> None:
+    """Each answer restarts the detector: at the deviation alone it alarmed again within 30 s, 14 to 21 times in all."""
+    events = beside_steady_deviation(step_to("T1.leak.size", known, 100.0), sensor, size, 1200)
+    alarms = [event.time for event in events if event.kind == "alarm" and event.time >= 340.0]
+    assert alarms[0] <= 350.0
+    assert len(alarms) <= 3  # the observer settles on a large deviation over minutes
+    assert not any("chance" in event.text for event in events if event.kind == "cannot tell")
+
+
+def test_a_fault_is_detected_as_soon_beside_a_steady_deviation_as_alone() -> None:
+    first = []
+    for size in (0.0, 4e-3):
+        events = beside_steady_deviation(step_to("T1.leak.size", 0.1, 700.0), 2, size, 760)
+        first.append(next(event.time for event in events if event.kind == "alarm" and event.time > 600.0))
+    assert 700.0 < first[1] <= first[0] + 2.0

@@ -32,7 +32,7 @@ from fdi_torch.monitor.known_faults import (
     with_new_sizes,
 )
 from fdi_torch.monitor.monitor_state import DetectedChange, HiddenFault, MonitorState, PendingAlarm
-from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, residuals_to_test
+from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, beside_deviation, residuals_to_test
 
 
 class AlarmHandler:
@@ -40,12 +40,8 @@ class AlarmHandler:
 
     def __init__(self, explainer: Explainer, detector: Detector, writer: EventWriter) -> None:
         self.explainer, self.observer, self.faults = explainer, explainer.observer, explainer.faults
-        self.space, self.settings, self.detector, self.writer = (
-            self.observer.space,
-            explainer.settings,
-            detector,
-            writer,
-        )
+        self.space, self.settings = self.observer.space, explainer.settings
+        self.detector, self.writer = detector, writer
         self.reach = max(round(self.settings.lookback / detector.design.interval), 1)
 
     # Schedule
@@ -199,13 +195,11 @@ class AlarmHandler:
         number, attempts = state.pending.number, state.pending.attempts + 1
         waiting, events = replace(state, pending=PendingAlarm(number, attempts)), []
         if attempts == 1:
-            waiting = replace(waiting, detector_memory=None).with_alarm(
-                waiting.alarm(number).with_state(State.CANNOT_TELL)
-            )
+            waiting = beside_deviation(waiting).with_alarm(waiting.alarm(number).with_state(State.CANNOT_TELL))
             events = [self.writer.unexplained(waiting, number, self.explainer.reported(fits))]
         if self.next_fit(waiting) - state.alarm(number).last <= self.settings.longest:
             return waiting, events
-        waiting, event = self.retire(waiting, number, "no fault of the list explains it better than chance does")
+        waiting, event = self.retire(waiting, number, "no fault of the list explains it")
         return waiting, [*events, event]
 
     def _alarm_of_known_faults(self, state: MonitorState, best: HypothesisFit) -> int | None:
@@ -253,6 +247,8 @@ class AlarmHandler:
         announce = announce or names != change.reported
         change = replace(change, ended=ended, reported=names)
         state = adopt_change(self.observer, state, change, reset_to_nominal(self.space, change, back))
+        if not best.fits:
+            state = beside_deviation(state)
         window, healthy = state.window(change.best.onset), state.healthy.tolist()
         state = updated_tracks(
             state,

@@ -33,14 +33,13 @@ NO_ALARM = -1
 
 @dataclass(frozen=True)
 class Detector:
-    """A statistic of white residuals (*batch, S, C) -> (*batch, S), and its threshold.
+    """A statistic of white residuals, and its threshold.
 
-    design: of the threshold. update: the recursive form, (samples (S, C), memory or None at the start) -> (statistic
-    (S,), memory). Its result is identical to the last bit for any division of the samples into calls.
+    design: of the threshold. update: (samples (*batch, S, C), memory or None at the start) -> (statistic (*batch, S),
+    memory). Its result is identical to the last bit for any division of the samples into calls.
     """
 
     chart: str
-    statistic: Callable[[Tensor], Tensor]
     design: FalseAlarmDesign
     update: Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]]
 
@@ -51,12 +50,12 @@ class Detector:
     def shares(self, white: Tensor) -> Tensor:
         """Share (C,) of each channel in the statistic at the last sample of white residuals (S, C)."""
         single = torch.eye(white.shape[-1], dtype=torch.bool).unsqueeze(1)
-        each = self.statistic(torch.where(single, white, 0.0))[:, -1].clamp(min=0.0)
+        each = self.update(torch.where(single, white, 0.0), None)[0][:, -1]
         return each / each.sum().clamp(min=1e-300)
 
     def first_alarm(self, white: Tensor) -> Tensor:
         """Index of the first sample above the threshold, (*batch); NO_ALARM if there is none."""
-        above = self.statistic(white) > self.threshold
+        above = self.update(white, None)[0] > self.threshold
         first = above.to(torch.int8).argmax(dim=-1)
         return torch.where(above.any(dim=-1), first, torch.full_like(first, NO_ALARM))
 
@@ -112,18 +111,19 @@ def make_detector(
             "ask for fewer false alarms"
         )
     rate: ChartRate
+    update: Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]]
     sums: Callable[[float], tuple[int, ...]]  # lengths of those that decide about an alarm
     if chart == "fixed":
         rate, sums = fixed_rate, lambda threshold: (1,)
-        statistic, update = max_abs, lambda e, before: (max_abs(e), e[:0])
+        update = max_abs
     elif chart == "cusum":
         # A sum that alarms by chance has most likely grown by the drift with each sample.
         rate, sums = partial(cusum_rate, drift=DRIFT), lambda threshold: (max(round(threshold / DRIFT), 1),)
-        statistic, update = partial(cusum, drift=DRIFT), lambda e, before: cusum_update(e, DRIFT, before)
+        update = partial(cusum, DRIFT)
     elif chart == "glr":
         lengths = window_lengths(LONGEST_WINDOW)
-        statistic, update = partial(glr, lengths=lengths), lambda e, before: glr_update(e, lengths, before)
-        peaks = block_maxima(statistic, channels, generator) if peaks is None else peaks
+        update = partial(glr, lengths)
+        peaks = block_maxima(lambda e: update(e, None)[0], channels, generator) if peaks is None else peaks
         rate, sums = sum_of_squares_rate(peaks, channels, generator), lambda threshold: lengths
     else:
         raise ValueError(f"expected a detector of {', '.join(CHARTS)}, got '{chart}'")
@@ -135,61 +135,45 @@ def make_detector(
 
     median = torch.full((1, channels), 0.5, dtype=torch.float64)
     share = median if learnt is None else latin_hypercube(channels, generator)
-    return Detector(chart, statistic, FalseAlarmDesign(rate, error, share, run_length, sampling), update)
+    return Detector(chart, FalseAlarmDesign(rate, error, share, run_length, sampling), update)
 
 
-def max_abs(white: Tensor) -> Tensor:
-    """max over channels of |e|, (*batch, S, C) -> (*batch, S)."""
-    return torch.nan_to_num(white, nan=0.0).abs().amax(dim=-1)
+def max_abs(white: Tensor, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """max over channels of |e|, for white (*batch, S, C). It has no memory."""
+    return torch.nan_to_num(white, nan=0.0).abs().amax(dim=-1), white[..., :0, :]
 
 
-def cusum(white: Tensor, drift: float) -> Tensor:
+def cusum(drift: float, white: Tensor, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The largest of 2 C one-sided sums g = max(0, g +- e - drift) (Page 1954), as a sum minus its running minimum.
 
-    A missing reading leaves its sums unchanged; otherwise the drift would reset the sums of a rarely read sensor.
+    A missing reading leaves its sums unchanged; otherwise the drift would reset the sums of a rarely read sensor. white
+    (*batch, S, C); before (*batch, 2, 2 C): the sums and their minima after the previous sample.
     """
-    sums = torch.cumsum(torch.nan_to_num(torch.cat([white, -white], dim=-1) - drift, nan=0.0), dim=-2)
-    lowest = torch.cummin(sums, dim=-2).values.clamp(max=0.0)
-    return (sums - lowest).amax(dim=-1)
-
-
-def cusum_update(white: Tensor, drift: float, before: Tensor | None) -> tuple[Tensor, Tensor]:
-    """`cusum` of the next samples (S, C). before (2, 2 C): the sums and their minima after the previous sample."""
     moves = torch.nan_to_num(torch.cat([white, -white], dim=-1) - drift, nan=0.0)
-    before = torch.zeros(2, moves.shape[-1], dtype=moves.dtype) if before is None else before
-    sums = torch.cumsum(torch.cat([before[:1], moves]), dim=0)
-    lowest = torch.cummin(torch.cat([before[1:], sums[1:]]), dim=0).values
-    return (sums - lowest)[1:].amax(dim=-1), torch.stack([sums[-1], lowest[-1]])
+    before = moves.new_zeros(*moves.shape[:-2], 2, moves.shape[-1]) if before is None else before
+    sums = torch.cumsum(torch.cat([before[..., :1, :], moves], dim=-2), dim=-2)[..., 1:, :]
+    lowest = torch.cummin(torch.cat([before[..., 1:, :], sums], dim=-2), dim=-2).values[..., 1:, :]
+    return (sums - lowest).amax(dim=-1), torch.stack([sums[..., -1, :], lowest[..., -1, :]], dim=-2)
 
 
-def glr_update(white: Tensor, lengths: tuple[int, ...], before: Tensor | None) -> tuple[Tensor, Tensor]:
-    """`glr` of the next samples (S, C). before (N, C): the last N cumulative sums, N at most the longest window."""
-    fresh = torch.nan_to_num(white, nan=0.0)
-    before = torch.zeros(1, fresh.shape[-1], dtype=fresh.dtype) if before is None else before
-    sums = torch.cat([before[:-1], torch.cumsum(torch.cat([before[-1:], fresh]), dim=0)])
-    best, count = torch.zeros_like(fresh[:, 0]), len(fresh)
-    for n in lengths:
-        reach = min(count, len(sums) - n)
-        if reach <= 0:
-            break
-        last = sums[len(sums) - reach :]
-        best[-reach:] = torch.maximum(best[-reach:], (last - sums[-reach - n : len(sums) - n]).square().sum(-1) / n)
-    return best, sums[-(lengths[-1] + 1) :]
-
-
-def glr(white: Tensor, lengths: tuple[int, ...]) -> Tensor:
+def glr(lengths: tuple[int, ...], white: Tensor, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """The largest |sum e|^2 / n over windows of the last n samples, n from `lengths`.
 
-    It is twice the log-likelihood ratio of a change of the mean in any channels (Willsky & Jones 1976).
+    It is twice the log-likelihood ratio of a change of the mean in any channels (Willsky & Jones 1976). white (*batch,
+    S, C); before (*batch, N, C): the last N cumulative sums, N at most the longest window.
     """
-    sums = torch.cumsum(torch.nan_to_num(white, nan=0.0), dim=-2)
-    best = torch.zeros_like(sums[..., 0])
+    fresh = torch.nan_to_num(white, nan=0.0)
+    before = torch.zeros_like(fresh[..., :1, :]) if before is None else before
+    further = torch.cumsum(torch.cat([before[..., -1:, :], fresh], dim=-2), dim=-2)
+    sums = torch.cat([before[..., :-1, :], further], dim=-2)
+    best, count, total = torch.zeros_like(fresh[..., 0]), fresh.shape[-2], sums.shape[-2]
     for n in lengths:
-        if n > sums.shape[-2]:
+        reach = min(count, total - n)
+        if reach <= 0:
             break
-        shifted = torch.cat([torch.zeros_like(sums[..., :n, :]), sums[..., :-n, :]], dim=-2)
-        best = torch.maximum(best, (sums - shifted).square().sum(dim=-1) / n)
-    return best
+        change = sums[..., total - reach :, :] - sums[..., total - reach - n : total - n, :]
+        best[..., count - reach :] = torch.maximum(best[..., count - reach :], change.square().sum(-1) / n)
+    return best, sums[..., -(lengths[-1] + 1) :, :]
 
 
 def window_lengths(longest: int) -> tuple[int, ...]:

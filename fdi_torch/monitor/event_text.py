@@ -78,7 +78,7 @@ class EventWriter:
     def unexplained(self, state: MonitorState, number: int, fits: Sequence[HypothesisFit]) -> Event:
         """An alarm for which "no change" is among the likely explanations."""
         explanations = tuple(self.explanation(f, state) for f in fits)
-        text = f"no fault of the list explains the alarm better than chance does: {headline(explanations)}"
+        text = f"the likeliest cause of the alarm is no fault of the list: {headline(explanations)}"
         return self._event(state, "cannot tell", text, state.alarm(number), explanations=explanations)
 
     def retired(self, state: MonitorState, alarm: Alarm, reason: str, announced: bool) -> Event:
@@ -171,7 +171,7 @@ class EventWriter:
             rate = (size - float(change.before[c])) / (now - fit.onset) if grows and change else None
             sizes.append(self._size(state, c, size, std, rate))
         if not sizes:
-            return Explanation(fit.probability, ())
+            return Explanation(fit.probability, (), unlisted=not fit.fits)
         ended = tuple(self.space.names[c] for c in h.recovered if c not in hidden)
         return Explanation(fit.probability, tuple(sizes), fit.onset, fit.onset_std, h.incipient, ended)
 

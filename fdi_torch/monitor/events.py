@@ -59,7 +59,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Explanation:
-    """One possible cause of an alarm. mass: its posterior probability. Without sizes: a false alarm.
+    """One possible cause of an alarm. mass: its posterior probability. Without sizes: chance, or a cause `unlisted`.
 
     onset, onset_std: s. growing: an incipient fault. ended: those of the parameters that are back to nominal.
     """
@@ -70,6 +70,7 @@ class Explanation:
     onset_std: float | None = None
     growing: bool = False
     ended: tuple[str, ...] = ()
+    unlisted: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -90,7 +91,8 @@ class Explanation:
         present = " and ".join(words(sizes) for sizes in faults if sizes[0].name not in self.ended)
         back = " and ".join(parameter_words(sizes[0].name) for sizes in faults if sizes[0].name in self.ended)
         both = ", with " if present and back else ""
-        return f"{present}{both}{back}{' back to nominal' if back else ''}" or "chance"
+        no_fault = "a cause that is not on the list" if self.unlisted else "chance"
+        return f"{present}{both}{back}{' back to nominal' if back else ''}" or no_fault
 
     def restricted_to(self, names: Sequence[str]) -> Explanation:
         """The explanation with the sizes of some parameters only."""

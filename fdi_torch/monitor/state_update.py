@@ -78,6 +78,11 @@ def adopt_sizes(observer: ObserverBank, state: MonitorState, fit: HypothesisFit)
     return _adopt(observer, state, fit.value, state.believed, fit)
 
 
+def beside_deviation(state: MonitorState) -> MonitorState:
+    """Restart the detector beside a deviation that no fault explains: it is steady, and of unknown size."""
+    return replace(state, detector_memory=None, errors=state.errors.with_unknown_deviation())
+
+
 def _adopt(
     observer: ObserverBank, state: MonitorState, believed: Tensor, before: Tensor, fit: HypothesisFit
 ) -> MonitorState:

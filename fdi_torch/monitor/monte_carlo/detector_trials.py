@@ -31,7 +31,7 @@ def detectors(every: float, sampling: float, channels: int, learnt: Whitening | 
 def _peaks(channels: int) -> Tensor:
     """Simulated block maxima for the GLR's threshold, kept for further detectors."""
     lengths = window_lengths(LONGEST_WINDOW)
-    return block_maxima(lambda white: glr(white, lengths), channels, torch.Generator().manual_seed(0))
+    return block_maxima(lambda white: glr(lengths, white)[0], channels, torch.Generator().manual_seed(0))
 
 
 def white_residuals(rig: SimulatedRig, noise: NoiseModel, samples: Samples) -> Tensor:
