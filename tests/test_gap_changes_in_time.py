@@ -7,7 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.candidate import Candidate
+from fdi_torch.gap.candidate_fit import standard_errors
+from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
+from fdi_torch.gap.problem import problem_of
 from tests.test_gap import nominal_plant, recorded
 
 LIBRARY = ("pump_gain", "pump_saturation", "coefficient_drift", "unmetered_flow", "leak", "flow_exponent")
@@ -57,3 +60,18 @@ def test_a_fault_that_begins_soon_keeps_its_onset() -> None:
     (plugging,) = answer.causes
     onset = plugging.parameters["onset"]
     assert onset.value == pytest.approx(20.0, abs=4.0 * onset.std)
+
+
+def test_a_parameter_that_the_readings_do_not_show_is_known_no_better_than_its_range() -> None:
+    """A flow that has not ended when the recording does may last any time."""
+    truth = {"T1.unmetered_flow.flow": -8e-6, "T1.unmetered_flow.begin": 200.0, "T1.unmetered_flow.duration": 900.0}
+    case = problem_of(nominal_plant(), (recorded(truth, 1, samples=600),), (), Settings(("unmetered_flow",)))
+    fitter, null, _ = recalibrate(case.data)
+    (placement,) = [p for p in case.library if p.location == "T1"]
+    fit = fitter.fit(Candidate((placement,), ({**truth, "T1.unmetered_flow.duration": 599.0},)), null)
+    errors = standard_errors(fitter, fit)
+    low, high, _ = fitter.box(fit.space)
+    i = fit.space.index("T1.unmetered_flow.duration")
+    assert errors["T1.unmetered_flow.duration"] == pytest.approx(float(high[i] - low[i]) / 12.0**0.5)
+    begin = "T1.unmetered_flow.begin"
+    assert 0.1 < errors[begin] < 2.0 and abs(fit.values[begin] - 200.0) < 4.0 * errors[begin]

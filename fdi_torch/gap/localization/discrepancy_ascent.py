@@ -28,6 +28,7 @@ from fdi_torch.gap.trajectory_problem import SHARE
 
 STEPS = 120  # step functions of time
 LESS_NOISE = (0.3, 0.1, 0.03, 0.01)  # random flows in successive regressions, as shares of the likeliest without one
+MOST_REGRESSORS = 100  # that a relevant law needs; a regression that so many steps would not save is given up
 MOST_TURNS = 12  # alternations between the disturbance noise, one more regressor, and the parameters of the fit
 
 
@@ -155,7 +156,7 @@ class Ascent:
         for share in LESS_NOISE:
             last, less = evaluated[-1], replace(noise, intensity=share * noise.intensity)
             current = self.evaluate(regression, last.discrepancy, place, less, last.regressed.precision)
-            evaluated.append(self.with_finer_positions(current))
+            evaluated.append(self.with_finer_positions(current, max(map(gain_of, evaluated))))
             if len(evaluated) > 2 and evaluated[-3].gain > max(evaluated[-2].gain, evaluated[-1].gain):
                 break
         return max(evaluated, key=gain_of)
@@ -179,16 +180,18 @@ class Ascent:
                 break
         return best
 
-    def with_finer_positions(self, current: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
+    def with_finer_positions(self, current: EvaluatedDiscrepancy, least: float = -math.inf) -> EvaluatedDiscrepancy:
         """The discrepancy with further regressors under the same noise, until none is worth its selection.
 
-        The estimated noise falls only after most of them were added, so that each alone seems to gain little.
+        The estimated noise falls only after most of them were added, so that each alone seems to gain little. least:
+        gain that matters; where random flows are far too small, hundreds of regressors do not reach it.
         """
         at, used = current.discrepancy, current.regressed.used
         positions = Positions(current.regression, current.location, current.under, at, used, self.generator)
         while finer := positions.best(current.discrepancy, current.regressed.used):
             extended = self._changed(current, finer)
-            if extended.gain - current.gain < CONVERGED:
+            gain = extended.gain - current.gain
+            if gain < CONVERGED or current.gain + MOST_REGRESSORS * gain < least:
                 break
             current = extended
         return current
