@@ -226,9 +226,9 @@ def _in_library_order(placements: Sequence[Placement]) -> list[Placement]:
 
 def covariance(fitter: Fitter, fit: Fit) -> Tensor:
     """Covariance (P, P) of a fit's parameters: the inverse of the curvature, priors included."""
-    scale, ends = fitter.box(fit.space)[2], _ranges(fitter, fit)
+    scale, widths = fitter.box(fit.space)[2], _widths(fitter, fit)
     # What the readings do not determine must not vanish from the inverse as if it were known exactly.
-    curvature = fitter.curvature(fit) + torch.diag(UNDETERMINED * (scale / ends) ** 2)
+    curvature = fitter.curvature(fit) + torch.diag(UNDETERMINED * (scale / widths) ** 2)
     size = torch.sqrt(torch.diagonal(curvature).clamp(min=1e-300))
     correlations = torch.linalg.pinv(curvature / size / size.unsqueeze(1), hermitian=True)
     unit = scale / size
@@ -238,11 +238,11 @@ def covariance(fitter: Fitter, fit: Fit) -> Tensor:
 def standard_errors(fitter: Fitter, fit: Fit) -> dict[str, float]:
     """Standard errors by full name, at most that of a uniform distribution over the parameter's range."""
     errors = torch.sqrt(torch.diagonal(covariance(fitter, fit)).clamp(min=0.0))
-    errors = torch.minimum(errors, _ranges(fitter, fit) / math.sqrt(12.0))
+    errors = torch.minimum(errors, _widths(fitter, fit) / math.sqrt(12.0))
     return dict(zip(fit.space.names, errors.tolist(), strict=True))
 
 
-def _ranges(fitter: Fitter, fit: Fit) -> Tensor:
+def _widths(fitter: Fitter, fit: Fit) -> Tensor:
     """Widths (P,) of the ranges of a fit's parameters."""
     low, high, _ = fitter.box(fit.space)
     return high - low

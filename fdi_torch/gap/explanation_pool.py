@@ -19,7 +19,13 @@ from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit, Key
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.extensions import ExpectedGain, best_pairs, extended, log_prior_width
-from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, with_estimated_noise
+from fdi_torch.gap.marginal_likelihood import (
+    evidence_under,
+    log_evidence,
+    log_prior,
+    with_estimated_noise,
+    with_likeliest_parameters,
+)
 from fdi_torch.gap.onsets import fine_onsets, likeliest_intervals
 from fdi_torch.gap.screening import Option, ScreeningResult, pairs_of, screen
 from fdi_torch.gap.trajectory_problem import BEHIND, SHARE
@@ -72,11 +78,10 @@ class ExplanationPool:
 
         Effects that were evaluated before are evaluated again only if this fit is likelier under the noise found then.
         The evaluation stops early if the explanation cannot compete: with those of as many effects that will be
-        extended, or with one that has only some of its effects. Otherwise, parameters that only some starts of the
-        fit's candidate have, as an onset, are in the end dropped if they lower the evidence.
+        extended, or with one that has only some of its effects. At its end, improbable onsets and the like are dropped.
         """
         before, candidate = self.explanations.get(fit.key), fit.candidate
-        if before and self._evidence_of(fit, before.fitter) < before.log_evidence + CONVERGED:
+        if before and evidence_under(before.fitter, fit, self.choices) < before.log_evidence + CONVERGED:
             return before
         rivals = self.best_of(len(fit.key))[BEAM - 1 :] + [e for k, e in self.explanations.items() if k < fit.key]
         rival = max((e.log_evidence for e in rivals), default=-math.inf)
@@ -92,36 +97,17 @@ class ExplanationPool:
             if best is None or gain > 0.0:
                 best = updated
             behind = rival - best.log_evidence
-            hopeless = behind > 0.5 * BEHIND and gain < SHARE * behind
-            if hopeless:
+            if behind > 0.5 * BEHIND and gain < SHARE * behind:
                 break
             if climb and not gain > CONVERGED:
-                fit = self._with_likeliest_parameters(best.fitter, best.fit, candidate)
-                best = replace(best, fit=fit, log_evidence=self._evidence_of(fit, best.fitter))
+                fit = with_likeliest_parameters(best.fitter, best.fit, candidate.starts, self.choices)
+                best = replace(best, fit=fit, log_evidence=evidence_under(best.fitter, fit, self.choices))
                 break
             # The search for the correlation time, which takes longest, begins where the rest has converged.
             fit, start, climb = best.fit, best.noise, not gain > CONVERGED
         if before is None or best.log_evidence > before.log_evidence:
             self.explanations[fit.key] = best
         return best
-
-    def _with_likeliest_parameters(self, fitter: Fitter, fit: Fit, candidate: Candidate) -> Fit:
-        """The fit with its own parameters, or with fewer: those that some starts of the candidate have.
-
-        By chance, an onset lowers the cost of an effect that was there from the start.
-        """
-        values, evidence = fit.effect_values, self._evidence_of(fit, fitter)
-        likeliest = fit
-        for free in dict.fromkeys(tuple(sorted(s)) for s in candidate.starts):
-            if set(free) < values.keys():
-                start = Candidate(candidate.placements, ({name: values[name] for name in free},))
-                fewer = fitter.fit(start, fit)
-                if (of_fewer := self._evidence_of(fewer, fitter)) > evidence:
-                    likeliest, evidence = fewer, of_fewer
-        return likeliest
-
-    def _evidence_of(self, fit: Fit, fitter: Fitter) -> float:
-        return log_evidence(fitter, replace(fit, cost=fitter.cost(fit)), self.choices)
 
     def without(self, explanation: RankedExplanation, cause: CauseName) -> RankedExplanation:
         """The explanation without one of its effects, refitted from its present values.
@@ -142,8 +128,7 @@ class ExplanationPool:
 
     def extend_by(self, parent: RankedExplanation, options: Sequence[Option]) -> None:
         """Extend an explanation by one effect, screened under its own noise."""
-        further = [o for o in options if o.cause not in parent.key]
-        self.extend(parent, screen(parent.fitter, parent.fit, further))
+        self.extend(parent, screen(parent.fitter, parent.fit, [o for o in options if o.cause not in parent.key]))
 
     def extend(
         self, parent: RankedExplanation, own_noise: ScreeningResult, sensor_noise: ScreeningResult | None = None
@@ -180,7 +165,7 @@ class ExplanationPool:
             for c in self._extensions(base, screening, own=False)
         ]
         fits = self._fitted(fitter, base, candidates, again=True)[:EVALUATED]
-        return [self._with_likeliest_parameters(fitter, fit, fit.candidate) for fit in fits]
+        return [with_likeliest_parameters(fitter, fit, fit.candidate.starts, self.choices) for fit in fits]
 
     def _fitted(
         self,

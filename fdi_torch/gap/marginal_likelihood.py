@@ -10,8 +10,8 @@ and costs as much as a disturbance of that size.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -21,7 +21,7 @@ from fdi_torch.estimate.evidence import log_prior as prior_of_set
 from fdi_torch.estimate.kalman import KalmanWhitening, Propagation, SensorNoise, StateNoise
 from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.parameters import ParameterSpace
@@ -160,6 +160,26 @@ def log_evidence(fitter: Fitter, fit: Fit, choices: int) -> float:
     if not (math.isfinite(likelihood) and bool(jacobian.isfinite().all())):
         return -math.inf
     return likelihood + occam(fitter, fit.space, fit.theta, jacobian) + log_prior(fit.key, choices)
+
+
+def evidence_under(fitter: Fitter, fit: Fit, choices: int) -> float:
+    """Log evidence of a fit under the noise of a fitter, which may be another than that of its descent."""
+    return log_evidence(fitter, replace(fit, cost=fitter.cost(fit)), choices)
+
+
+def with_likeliest_parameters(fitter: Fitter, fit: Fit, starts: Sequence[Mapping[str, float]], choices: int) -> Fit:
+    """The fit with its own parameters of effects, or refitted with fewer, those of one of the starts.
+
+    By chance, an onset lowers the cost of an effect that was there from the start.
+    """
+    values, evidence = fit.effect_values, evidence_under(fitter, fit, choices)
+    likeliest = fit
+    for free in dict.fromkeys(tuple(sorted(s)) for s in starts):
+        if set(free) < values.keys():
+            fewer = fitter.fit(Candidate(fit.candidate.placements, ({name: values[name] for name in free},)), fit)
+            if (of_fewer := evidence_under(fitter, fewer, choices)) > evidence:
+                likeliest, evidence = fewer, of_fewer
+    return likeliest
 
 
 def occam(fitter: Fitter, space: ParameterSpace, theta: Tensor, jacobian: Tensor) -> float:
