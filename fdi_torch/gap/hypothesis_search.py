@@ -126,7 +126,7 @@ class HypothesisSearch:
         if len(best.explanation.key) < 2:
             return []
         explanations = [self.pool.without(best.explanation, cause) for cause in sorted(best.explanation.key)]
-        return [h for e in explanations for h in self._with_discrepancies(e, sorted({at for _, at in e.key}), best)]
+        return [h for e in explanations for h in self._with_discrepancies(e, self.places, best)]
 
     def _with_more_effects(self, best: CauseHypothesis) -> list[CauseHypothesis]:
         """Variants of a hypothesis with one of the most promising further effects beside the discrepancy."""

@@ -144,14 +144,17 @@ def _commanded(component: FlowComponent, plant: PlantDescription) -> Discrepancy
     actuator = _actuator(plant, name)
 
     def signals(trajectory: Forcing) -> Signals:
+        command = trajectory.commands[actuator]
         return {
-            "command": trajectory.commands[actuator],
+            "command": command,
+            "below": -command,  # its steps are the flow below a command, where a pump may stall
             "flow": trajectory.flows[name],
             "level": trajectory.levels[tank],
         }
 
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
         regressors = [*ends.hinges(s, "command", 9), *lags_and_decays(s["flow"], step, scale)]
+        regressors += [s["flow"] * j for j in ends.steps_in_value(s, "below", 9)]
         regressors += [s["flow"] * b for b in ends.hinges(s, "level", 6)]
         regressors += rate_limits(s["flow"], step, ends("flow"), scale)
         regressors += stictions(s["flow"], ends("flow"))
@@ -161,7 +164,8 @@ def _commanded(component: FlowComponent, plant: PlantDescription) -> Discrepancy
         slow = Curves(torch.stack(rate_limits(s["flow"], step, ends("flow"), scale, finer(TRAVEL_TIMES, FINER))))
         sticking = Curves(torch.stack(stictions(s["flow"], ends("flow"), FINE_STICTION_BANDS)))
         kinks = [ends.kinks(s, "command", 9), ends.kinks(s, "level", 6, s["flow"])]
-        return [*kinks, slow, sticking, ends.fine_backlashes(s, "flow")]
+        jumps = ends.jumps(s, "below", 9, s["flow"])
+        return [*kinks, jumps, slow, sticking, ends.fine_backlashes(s, "flow")]
 
     return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
 

@@ -4,6 +4,8 @@
 - Functions with memory: lags, delays, backlash, stiction, rate limits, relays, decays after a change.
 - Functions of time: steps, ramps, and sinusoids.
 
+None looks ahead: a predicted level depends on all earlier readings, and their noise would explain itself.
+
 Times are those of three_tank; `scale` multiplies them for other plants (`plant.scales.time_scale`).
 """
 
