@@ -212,6 +212,15 @@ def test_a_stiction_with_a_band_between_those_of_the_grid_is_one_regressor(
     assert found[0].gain > found[1].gain + 50.0
 
 
+def test_a_pump_that_stalls_below_a_command_is_one_regressor() -> None:
+    generator = torch.Generator().manual_seed(3)
+    command = (15e-6 + 60e-6 * torch.rand(15, generator=generator, dtype=torch.float64)).repeat_interleave(70)
+    fitter, fit, noise = delivering(command, torch.where(command < 22e-6, 0.0, command), 3)
+    found = localize(fitter, fit, noise, ("Q1", "T1", "P13")).discrepancies
+    assert found[0].location == "Q1" and found[0].parameters == 1
+    assert found[0].gain > found[1].gain + 5.0
+
+
 def test_a_law_with_many_changes_is_found_although_random_flows_explain_each_of_them() -> None:
     """A pump that delivers less now and then, at random."""
     generator = torch.Generator().manual_seed(5)

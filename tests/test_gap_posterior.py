@@ -168,6 +168,19 @@ def test_an_effect_beside_an_unknown_is_found_though_the_unknown_hides_it() -> N
 
 
 @pytest.mark.slow
+def test_a_pump_that_stalls_once_beside_another_cause_is_no_draw_from_its_tank() -> None:
+    """Its stop has the times and the size of a draw, but these three numbers are those of its command."""
+    generator = torch.Generator().manual_seed(11)
+    command = (25e-6 + 45e-6 * torch.rand(15, 2, generator=generator, dtype=torch.float64)).repeat_interleave(70, dim=0)
+    command[350:420, 0] = 20e-6
+    delivered = command.clone()
+    delivered[350:420, 0] = 0.0
+    recording = recorded({"h2.sensor_lag.time_constant": 20.0}, 9, samples=1050, inputs=delivered)
+    answer = diagnose(nominal_plant(), replace(recording, inputs=command))
+    assert {(c.effect, c.location) for c in answer.causes} == {("sensor_lag", "h2"), ("unknown", "Q1")}
+
+
+@pytest.mark.slow
 def test_a_lag_in_place_of_a_delay_that_the_library_lacks_is_not_certain() -> None:
     """The two differ by about 15 % of their influence, more than most errors of a law."""
     recording = recorded({"Q1.pump_delay.delay": 7.0}, 3, std=2e-4)
