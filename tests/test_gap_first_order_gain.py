@@ -34,7 +34,7 @@ def surveyed(request: pytest.FixtureRequest) -> tuple[DiscrepancyRegression, Fit
     if request.param:
         lag = Candidate((Placement(effect("sensor_lag"), "h2"),), ({"h2.sensor_lag.time_constant": 3.0},))
         null = under.fit(lag, null)
-    return DiscrepancyRegression(under, null, 1.0 / 60.0, 40), under, null
+    return DiscrepancyRegression(under, null, (1.0 / 60.0,), 40), under, null
 
 
 def gain_at(survey: DiscrepancyRegression, under: Fitter, null: Fit, place: str) -> float:
@@ -95,7 +95,7 @@ def test_random_flows_that_the_parameters_cannot_explain_promise_nothing_at_a_so
     case = problem_of(nominal_plant(), (real,), (), Settings())
     fitter, null, _ = recalibrate(case.data)
     under, _ = with_estimated_noise(fitter, null)
-    survey = DiscrepancyRegression(under, null, None, 40)
+    survey = DiscrepancyRegression(under, null, (), 40)
     assert max(gain_at(survey, under, null, place) for place in ("P13", "P32", "OUT2")) < 10.0
 
 
@@ -107,7 +107,7 @@ def test_a_step_between_two_nodes_is_expected_to_gain_what_it_does() -> None:
     case = problem_of(nominal_plant(), (replace(recording, outputs=readings),), (), Settings())
     fitter, null, _ = recalibrate(case.data)
     under, _ = with_estimated_noise(fitter, null)
-    survey = DiscrepancyRegression(under, null, None, 40)
+    survey = DiscrepancyRegression(under, null, (), 40)
     step = torch.zeros_like(readings)
     step[404:, 2] = 1.0
     basis = promise.parameter_basis(under, null, survey.at("h3")[1])

@@ -201,11 +201,10 @@ class Fitter:
 
     def box(self, space: ParameterSpace) -> tuple[Tensor, Tensor, Tensor]:
         """Lower and upper bounds of the parameters, and the scale on which each varies, (P,) each."""
-        duration = max(float(part.experiment.nodes[-1]) for part in self.data.parts)
         low, high, scale = [], [], []
         for p in space:
             timed = p.unit == "s"
-            top = min(p.high, duration) if timed else p.high
+            top = min(p.high, self.data.longest_duration) if timed else p.high
             low.append(p.low)
             high.append(max(top, p.nominal))
             finite = math.isfinite(p.std)

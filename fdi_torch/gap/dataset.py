@@ -73,6 +73,11 @@ class DataSet:
         return float(torch.median(torch.diff(self.experiment.sample_times)))
 
     @property
+    def longest_duration(self) -> float:
+        """Duration of the longest recording, s."""
+        return max(float(part.experiment.nodes[-1]) for part in self.parts)
+
+    @property
     def rows(self) -> tuple[slice, ...]:
         """The rows of each recording among all."""
         slices, first = [], 0

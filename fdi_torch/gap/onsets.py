@@ -34,7 +34,7 @@ INTERVALS = 4  # the likeliest intervals of an effect, from each of which a fit 
 
 def fine_onsets(options: Sequence[Option], fitter: Fitter) -> list[Option]:
     """Further onset times of these options, as dense as the random flows in the fitter's noise require."""
-    duration, count = _duration(fitter), _count(fitter)
+    duration, count = fitter.data.longest_duration, _count(fitter)
     further: list[Option] = []
     coarse: dict[tuple[tuple[str, str], tuple[tuple[str, float], ...]], list[Option]] = {}
     for option in options:
@@ -53,7 +53,7 @@ def fine_onsets(options: Sequence[Option], fitter: Fitter) -> list[Option]:
 def likeliest_intervals(options: Sequence[Option], fitter: Fitter, fit: Fit) -> list[Option]:
     """The intervals in which these options explain most in addition to a fit, for effects that begin and end."""
     count = max(_count(fitter), FEWEST)
-    times = torch.arange(count, dtype=torch.float64) * _duration(fitter) / count
+    times = torch.arange(count, dtype=torch.float64) * fitter.data.longest_duration / count
     further: list[Option] = []
     for option in {o.cause: o for o in options}.values():
         begin, lasting = (option.placement.full_name(name) for name in ("begin", "duration"))
@@ -85,13 +85,9 @@ def _best_pairs(score: Tensor, gram: Tensor) -> list[tuple[int, int, float]]:
     return [(i, j, math.copysign(1.0, float(difference[i, j]))) for i, j in pairs if float(gain[i, j]) > 0.0]
 
 
-def _duration(fitter: Fitter) -> float:
-    return max(float(part.experiment.nodes[-1]) for part in fitter.data.parts)
-
-
 def _count(fitter: Fitter) -> int:
     """Number of instants that random flows require."""
-    return min(math.ceil(_duration(fitter) / (SPACING * detection_time(fitter))), MOST)
+    return min(math.ceil(fitter.data.longest_duration / (SPACING * detection_time(fitter))), MOST)
 
 
 def detection_time(fitter: Fitter) -> float:

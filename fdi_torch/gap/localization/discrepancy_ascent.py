@@ -120,6 +120,7 @@ class Ascent:
         under = with_disturbances(self.fitter, fit, noise, discrepancy.linearised)
         if start is None:
             nothing = torch.zeros(len(discrepancy.columns), dtype=torch.bool)
+            discrepancy = with_best_frequency(regression, place, under, fit, discrepancy, nothing) or discrepancy
             positions = Positions(regression, place, under, discrepancy, nothing, self.generator)
             discrepancy = positions.best(discrepancy, nothing) or discrepancy
         whitened = WhitenedDiscrepancy(under, fit, discrepancy)
@@ -140,7 +141,7 @@ class Ascent:
         if any(s.name == place for s in data.plant.sensors):
             right = Fitter(replace(data, readings=data.readings - explained), self.fitter.noise)
         along = with_disturbances(right, fit, self.noise) if self.fitter.whitening else right
-        regression = DiscrepancyRegression(along, fit, selection.frequency, STEPS)
+        regression = DiscrepancyRegression(along, fit, selection.frequencies, STEPS)
         return self.evaluate(regression, regression.of(place, selection.positions), place, noise, selection.precision)
 
     def under_less_and_less_noise(

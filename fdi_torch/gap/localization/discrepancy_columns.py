@@ -51,6 +51,10 @@ class Selection:
     positions: tuple[Position, ...]
     frequency: float | None
 
+    @property
+    def frequencies(self) -> tuple[float, ...]:
+        return () if self.frequency is None else (self.frequency,)
+
 
 @dataclass(frozen=True)
 class Discrepancy:
@@ -81,7 +85,10 @@ class Discrepancy:
         """The regressors in use. precision (M,): infinite for those that are not."""
         used, grid = torch.isfinite(precision), len(precision) - len(self.positions)
         positions = tuple(p for p, kept in zip(self.positions, used[grid:].tolist(), strict=True) if kept)
-        return Selection(torch.cat([precision[:grid], precision[grid:][used[grid:]]]), positions, self.frequency)
+        oscillates = bool((used & self.sinusoids).any())
+        on_grid = precision[:grid] if oscillates else precision[:grid][~self.sinusoids[:grid]]
+        frequency = self.frequency if oscillates else None
+        return Selection(torch.cat([on_grid, precision[grid:][used[grid:]]]), positions, frequency)
 
     def with_sinusoids(self, frequency: float, columns: Tensor) -> Discrepancy:
         """The same with sinusoids of another frequency; columns (S, C, W): their influence."""

@@ -119,12 +119,12 @@ class RecordingLinearisation:
 class DiscrepancyRegression:
     """Influence of the discrepancies of all components of a data set, about one fit.
 
-    frequency: of sinusoids, Hz, or None. steps: number of step functions of time, over all recordings.
+    frequencies: candidates for that of the sinusoids, Hz. steps: number of step functions of time, over all recordings.
     """
 
-    def __init__(self, fitter: Fitter, fit: Fit, frequency: float | None, steps: int) -> None:
+    def __init__(self, fitter: Fitter, fit: Fit, frequencies: Sequence[float], steps: int) -> None:
         self.fitter, self.fit = fitter, fit
-        self.frequencies = torch.tensor([] if frequency is None else [frequency], dtype=fit.theta.dtype)
+        self.frequencies = torch.tensor(frequencies, dtype=fit.theta.dtype)
         self.engine = fitter.engine(fit.candidate, list(fit.effect_values))
         self.theta, self.levels = fit.theta.unsqueeze(0), predicted_levels(fitter, fit)
         self.linearised = self.engine.linearise(self.theta, self.levels)
@@ -143,7 +143,7 @@ class DiscrepancyRegression:
         frequency, columns = None, Columns((grid,))
         if len(self.frequencies):
             frequency = float(self.frequencies[0])
-            columns = Columns((grid, self.sinusoids(place, self.frequencies)[..., 0, :]))
+            columns = Columns((grid, self.sinusoids(place, self.frequencies[:1])[..., 0, :]))
         count = len(columns)
         choices, sinusoids = grid.new_full((count,), count), torch.arange(count) >= grid.shape[-1]
         # A sinusoid is one of those of all frequencies: 1 / (2 dt) over the width sqrt(2 pi) s of the posterior,

@@ -24,6 +24,7 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.breakpoints import Relays
 from fdi_torch.gap.localization.discrepancy_columns import Discrepancy, Position
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
+from fdi_torch.gap.localization.regressors import HARMONICS
 from fdi_torch.gap.localization.single_regressor_gain import (
     adjoints_of,
     gains_of,
@@ -169,20 +170,28 @@ def with_best_frequency(
     basis = parameter_basis(under, fit, discrepancy.linearised, discrepancy.columns[used & ~sinusoids])
     residual = whitened_residual(under, fit, discrepancy.linearised)
     residual = without(basis, residual)
-    frequency = discrepancy.frequency
-    spacing = 1.0 / max(float(part.experiment.nodes[-1]) for part in under.data.parts)
-    for _ in range(FREQUENCY_ROUNDS):
-        spacing *= 2.0 / FREQUENCIES
-        steps = torch.arange(FREQUENCIES, dtype=residual.dtype) - FREQUENCIES // 2
-        frequencies = frequency + spacing * steps
-        columns = regression.sinusoids(place, frequencies)
+
+    def strongest(frequencies: Tensor, harmonics: slice) -> Tensor:
+        columns = regression.sinusoids(place, frequencies)[..., harmonics]
         white = without(basis, under.whiten(columns.flatten(2)).flatten(0, 1))
         white = white.unflatten(1, columns.shape[2:]).transpose(0, 1)  # (F, S C + P, W)
         score, gram = white.mT @ residual, white.mT @ white
         gram = gram + torch.diag_embed(COLLINEAR * torch.diagonal(gram, dim1=1, dim2=2) + VISIBLE)
-        best = int((score * torch.linalg.solve(gram, score)).sum(dim=(1, 2)).argmax())
-        frequency = float(frequencies[best])
-    return discrepancy.with_sinusoids(frequency, columns[:, :, best])
+        return frequencies[(score * torch.linalg.solve(gram, score)).sum(dim=(1, 2)).argmax()]
+
+    # Without harmonics: a third of a frequency would explain as much by its third harmonic. In parts, for memory.
+    candidates = torch.cat([regression.frequencies, residual.new_tensor([discrepancy.frequency])])
+    while len(candidates) > 1:
+        candidates = torch.stack(
+            [strongest(part, slice(None, None, HARMONICS)) for part in candidates.split(FREQUENCIES)]
+        )
+    frequency, spacing = candidates[0], 1.0 / under.data.longest_duration
+    steps = torch.arange(FREQUENCIES, dtype=residual.dtype) - FREQUENCIES // 2
+    for _ in range(FREQUENCY_ROUNDS):
+        spacing *= 2.0 / FREQUENCIES
+        frequency = strongest(frequency + spacing * steps, slice(None))
+    columns = regression.sinusoids(place, frequency.reshape(1))
+    return discrepancy.with_sinusoids(float(frequency), columns[:, :, 0])
 
 
 def _local_maxima(gains: Tensor) -> list[int]:

@@ -28,7 +28,7 @@ from fdi_torch.gap.localization.localized_discrepancy import (
     nearly_without_disturbances,
 )
 from fdi_torch.gap.localization.random_processes import drifting_sensors, random_flows
-from fdi_torch.gap.localization.regressors import dominant_frequency, step_functions
+from fdi_torch.gap.localization.regressors import likely_frequencies, step_functions
 from fdi_torch.gap.localization.single_regressor_gain import SingleRegressorGains
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, occam, with_disturbances
 
@@ -65,8 +65,9 @@ def localize(
     hopeless = _evidence_bound(fitter, fit, replace(noise, scale=scale)) - base < needed
     if hopeless and not places:
         return Localization((), 0.0)
-    frequency = dominant_frequency(fitter.residual(fit.linearised.readings)[0], fitter.data.row_spacing)
-    regression = DiscrepancyRegression(fitter, fit, frequency, STEPS)
+    white = fitter.residual(fit.linearised.readings)[0]
+    frequencies = likely_frequencies(white, fitter.data.row_spacing, fitter.data.longest_duration)
+    regression = DiscrepancyRegression(fitter, fit, frequencies, STEPS)
     if not math.isfinite(base + log_evidence(fitter, fit, noise, regression.linearised)):
         return Localization((), 0.0)
     likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
@@ -113,7 +114,7 @@ def localize_beside(
     """
     base = log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     if at.selection is None:
-        regression = DiscrepancyRegression(fitter, fit, None, STEPS)
+        regression = DiscrepancyRegression(fitter, fit, (), STEPS)
         likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
         processes = [*drifting_sensors(regression, likely, [at.location], base, needed)]
         processes += random_flows(regression, likely, [at.location], base, needed)

@@ -79,8 +79,8 @@ class LocalizedDiscrepancy:
     @property
     def periods(self) -> tuple[float, ...]:
         """Periods of the sinusoids, s."""
-        frequency = self.selection.frequency if self.selection else None
-        return () if frequency is None else tuple(1.0 / (k * frequency) for k in range(1, HARMONICS + 1))
+        frequencies = self.selection.frequencies if self.selection else ()
+        return tuple(1.0 / (k * frequency) for frequency in frequencies for k in range(1, HARMONICS + 1))
 
 
 def log_likelihood(fitter: Fitter, fit: Fit, linearised: Linearised) -> float:

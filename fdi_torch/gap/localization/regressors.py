@@ -30,8 +30,8 @@ FINE_STICTION_BANDS = tuple(0.005 * j for j in range(2, 101))  # the output is n
 TRAVEL_TIMES = (8.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # s, through the full range at the rate limit
 FATIGUE_TIMES = (150.0, 500.0)  # s, of the mean of a flow's recent past that changes it
 RAMPS = 12  # ramps in time, at equal distances
-CYCLES = 8  # periods in a recording from which on a line in its spectrum is sought
-SLOW_CYCLES = tuple(1.0 + 0.25 * j for j in range(4 * (CYCLES - 1)))  # periods of slower sinusoids in time
+CYCLES = 8  # fewest periods in a recording of a line that its spectrum shows
+SLOW_CYCLES = tuple(1.0 + 0.25 * j for j in range(4 * (CYCLES - 1)))  # periods of slower sinusoids
 SAMPLES_A_STEP = 9  # fewest samples per step function of time
 HARMONICS = 3  # of a dominant frequency of the residual
 
@@ -101,11 +101,10 @@ def step_functions(most: int, samples: int, recordings: int) -> int:
 
 
 def time_functions(time: Tensor, duration: float, steps: int) -> list[Tensor]:
-    """1, steps, ramps and slow sinusoids of time."""
+    """1, steps and ramps of time."""
     stepped = [(time >= duration * j / steps).to(time.dtype) for j in range(1, steps)]
     ramps = [(time / duration - j / RAMPS).clamp(min=0.0) for j in range(RAMPS)]
-    phases = [2.0 * math.pi * cycles * time / duration for cycles in SLOW_CYCLES]
-    return [torch.ones_like(time), *stepped, *ramps, *(f(x) for x in phases for f in (torch.sin, torch.cos))]
+    return [torch.ones_like(time), *stepped, *ramps]
 
 
 def harmonics(time: Tensor, frequency: Tensor) -> Tensor:
@@ -186,6 +185,13 @@ def _scanned(keep: Tensor, added: Tensor, first: Tensor) -> Tensor:
 
 ZERO_PADDING = 4  # factor by which the spectrum is interpolated
 SURROUNDINGS = 15  # frequencies of the recording to each side, for the median
+
+
+def likely_frequencies(white: Tensor, spacing: float, duration: float) -> list[float]:
+    """Frequencies (Hz) of sinusoids that a whitened residual (S, C) may contain: of its dominant line, and slower ones,
+    which random flows hide in its spectrum. spacing: of the samples, s. duration: of the longest recording, s."""
+    dominant = dominant_frequency(white, spacing)
+    return [*([] if dominant is None else [dominant]), *(cycles / duration for cycles in SLOW_CYCLES)]
 
 
 def dominant_frequency(white: Tensor, spacing: float) -> float | None:
