@@ -89,14 +89,13 @@ def _meaning(place: str, value: Amount | None, unit: str | None) -> float:
 
 
 def _units(plant: PlantDescription) -> dict[str, str]:
-    return plant.channel_units() | {sensor.column: sensor.unit for sensor in plant.sensors}
+    return plant.channel_units() | plant.output_units()
 
 
 def expect_units(source: str, names: Sequence[str], units: Sequence[str], plant: PlantDescription) -> None:
     """Raises ValueError if a channel's SI unit differs from the plant's."""
     expected = _units(plant)
-    heights = {tank.name: tank.height for tank in plant.tanks}
-    gains = {s.column: f"a level in %: gain: {100.0 / heights[s.tank]:.4g} %/m" for s in plant.sensors}
+    gains = {s.column: f"a level in %: gain: {100.0 / plant.tank(s.tank).height:.4g} %/m" for s in plant.sensors}
     gains |= {p.channel: f"a command in %: gain: {quantity_text(p.max_flow, 'm^3/s')}" for p in plant.metered_flows()}
     for name, unit in zip(names, units, strict=True):
         if unit != expected[name]:
@@ -124,8 +123,7 @@ def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[s
     if not missing:
         return
     inputs = [name for name in missing if name in plant.channels()]
-    sensors = {sensor.column for sensor in plant.sensors}
-    if set(missing) == sensors and not _other_columns(path, plant):
+    if set(missing) == set(plant.outputs()) and not _other_columns(path, plant):
         raise ValueError(
             f"{path}: expected readings of {', '.join(missing)}, got inputs alone; fdi plan and fdi "
             "diagnosability show what planned inputs can reveal"

@@ -92,7 +92,7 @@ def _csv_rows(
     idle: float,
     began: Callable[[float], None] | None,
 ) -> Iterator[Row | str]:
-    inputs, outputs = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
+    inputs, outputs = plant.channels(), plant.outputs()
     file = GrowingCsv(path, inputs, outputs, mapping)
     expect_units(str(path), (*inputs, *outputs), (*file.input_units, *file.output_units), plant)
     return _new_rows(file, idle, began)
@@ -122,7 +122,7 @@ def _mcap_rows(
 ) -> Iterator[Row | str]:
     """Messages grouped by time: inputs are held, a missing reading is NaN."""
     expect_keys_of_logs(path, mapping)
-    inputs, outputs = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
+    inputs, outputs = plant.channels(), plant.outputs()
     sources = {name: mapping.get(name, ChannelSource()) for name in (*inputs, *outputs)}
     places = {n: _place(n, source, n in inputs) for n, source in sources.items() if source.constant is None}
     factors: dict[str, float] = {}

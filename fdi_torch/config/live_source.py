@@ -133,7 +133,7 @@ def _channels(
     config: SourceConfig, plant: PlantDescription, address: Address
 ) -> tuple[list[LiveChannel], list[LiveChannel]]:
     """The plant's inputs and outputs. Raises ValueError for an unknown or unmapped channel, and for a wrong unit."""
-    inputs, outputs = plant.channels(), [sensor.column for sensor in plant.sensors]
+    inputs, outputs = plant.channels(), plant.outputs()
     openings = {p.valve: p.unrecorded for p in plant.pipes if p.valve and p.unrecorded is not None}
     for name in config.tags:
         if name not in (*inputs, *outputs):

@@ -123,7 +123,7 @@ def build_plant(data: dict[str, Any], source: str) -> Plant:
 
 def _valid_units(units: dict[str, str], plant: Plant) -> dict[str, str]:
     """The key `units`. Raises ValueError for an unknown key, and for a unit of another kind than its key."""
-    sensors = {sensor.column: sensor.unit for sensor in plant.sensors}
+    sensors = plant.output_units()
     kinds = dict.fromkeys((*SI_UNITS, *READING_UNITS))
     for key, unit in units.items():
         if key not in sensors and key not in kinds:

@@ -241,7 +241,7 @@ class LoggedMonitor:
     def _log_samples(self, samples: Samples, residuals: Tensor | None) -> None:
         """Log samples, and the rows of `_residual_rows` if they have been tested."""
         units, chart = self.plant.channel_units(), self.monitor.detector.chart
-        names, sensor_units = [s.column for s in self.plant.sensors], [s.unit for s in self.plant.sensors]
+        names, sensor_units = self.plant.outputs(), [s.unit for s in self.plant.sensors]
         mask, readings = samples.readings.isfinite(), torch.nan_to_num(samples.readings, nan=torch.nan)
         signals: list[tuple[Any, ...]] = [
             ("/plant/input", as_array(samples.inputs), list(units), list(units.values()), None, {"hold": samples.hold}),

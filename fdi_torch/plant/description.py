@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, TypeVar
 
+from torch import Tensor
+
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.components import COMMAND_UNITS, OUTSIDE, READING_UNITS, Component, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
@@ -17,6 +19,7 @@ from fdi_torch.plant.kinds.pump import Pump
 from fdi_torch.plant.kinds.transfer import Transfer
 from fdi_torch.plant.kinds.weir import Weir
 from fdi_torch.plant.metered_flow import MeteredFlow
+from fdi_torch.recording import Hold, Recording
 
 __all__ = [
     "COMMAND_UNITS",
@@ -172,6 +175,21 @@ class PlantDescription:
         for channel, unit in (pair for pair in given if pair is not None):
             units.setdefault(channel, unit)
         return units
+
+    def outputs(self) -> tuple[str, ...]:
+        """The output channels of a recording, in the order of the sensors."""
+        return tuple(sensor.column for sensor in self.sensors)
+
+    def output_units(self) -> dict[str, str]:
+        """SI unit of each output channel."""
+        return {sensor.column: sensor.unit for sensor in self.sensors}
+
+    def recording(
+        self, time: Tensor, inputs: Tensor, outputs: Tensor, *, hold: Hold = "zero_order", source: str = "memory"
+    ) -> Recording:
+        """The recording of all channels of the plant: time (T,) s, inputs (T, M) and outputs (T, N) in SI."""
+        units = tuple(self.channel_units().values()), tuple(sensor.unit for sensor in self.sensors)
+        return Recording(time, inputs, outputs, self.channels(), self.outputs(), *units, hold=hold, source=source)
 
 
 def with_tolerances(plant: PlantDescription, kept: Callable[[ParameterName], bool]) -> PlantDescription:

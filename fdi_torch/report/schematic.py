@@ -192,7 +192,7 @@ class _Drawing:
         if sketch.route == "from_above":
             return self.route_from_above(component, sketch)
         x, y = self.corner(component.source)
-        rise = self.tall * min(sketch.height / self.tank_height(component.source), 0.9)
+        rise = self.tall * min(sketch.height / self.plant.tank(component.source).height, 0.9)
         if sketch.route == "over_wall":
             return self.route_over_wall(component, rise)
         flows = [c for c in self.plant.flow_components() if c.sketch().route == sketch.route]
@@ -283,6 +283,3 @@ class _Drawing:
 
     def fed_from_above(self, tank: str) -> bool:
         return any(c.falls and c.target == tank for c in self.plant.flow_components())
-
-    def tank_height(self, name: str) -> float:
-        return next(t.height for t in self.plant.tanks if t.name == name)
