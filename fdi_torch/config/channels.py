@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from fdi_torch.config.recording_config import ColumnConfig, FileConfig
-from fdi_torch.config.strict import Amount, quantity
+from fdi_torch.config.strict import Amount, quantity_at
 from fdi_torch.names import shortened, unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text, si_unit_of
@@ -68,10 +68,7 @@ def _clock_source(column: ColumnConfig) -> ClockSource:
 
 
 def _channel_source(place: str, column: ColumnConfig, unit: str) -> ChannelSource:
-    try:
-        constant = None if column.constant is None else quantity(column.constant, unit)
-    except ValueError as error:
-        raise ValueError(f"{place}.constant: {error}") from error
+    constant = None if column.constant is None else quantity_at(f"{place}.constant", column.constant, unit)
     if not column.recorded:
         constant = float("nan")
     if constant is not None:

@@ -165,7 +165,7 @@ def _factor(
 ) -> float:
     """Factor from the numbers of a message to SI. Raises ValueError for a missing unit or one of another dimension."""
     source = mapping.get(name, ChannelSource())
-    unit = source.unit or dict(message.channel.metadata).get(f"unit.{field}", "")
+    unit = source.unit or message.channel.units.get(field, "")
     if not unit:
         raise ValueError(f"{message.topic}: {name}: expected a unit, got none; give it under columns: {name}")
     expect_units(message.topic, (name,), (si_unit_of(unit),), plant)

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, Field, ValidationError
 
 from fdi_torch.config.flow_sections import flow_sections
 from fdi_torch.config.plant_in_code import Plant, effect_in_si, effect_parameters, si_value, tolerances_in_si
-from fdi_torch.config.problems import ConfigError, explain
+from fdi_torch.config.problems import explain, naming
 from fdi_torch.config.strict import Acceleration, Amount, Area, Length, Strict, quantity
 from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import find_plant, read_yaml
@@ -114,11 +114,9 @@ def build_plant(data: dict[str, Any], source: str) -> Plant:
         config = PlantConfig.model_validate(data)
     except ValidationError as error:
         raise explain(error, source) from None
-    try:
+    with naming(source):
         plant = _plant(config)
         return replace(plant, units=written_units(data) | _valid_units(config.units, plant))
-    except ValueError as error:
-        raise ConfigError([f"{source}: {error}"]) from error
 
 
 def _valid_units(units: dict[str, str], plant: Plant) -> dict[str, str]:
@@ -128,10 +126,8 @@ def _valid_units(units: dict[str, str], plant: Plant) -> dict[str, str]:
     for key, unit in units.items():
         if key not in sensors and key not in kinds:
             raise ValueError(f"units: {unknown('an output channel or an SI unit', key, (*sensors, *kinds))}")
-        try:
+        with naming(f"units.{key}"):
             unit_factor(unit, sensors.get(key, key))
-        except ValueError as error:
-            raise ValueError(f"units.{key}: {error}") from error
     return units
 
 
@@ -162,10 +158,8 @@ def _plant(config: PlantConfig) -> Plant:
 def _matter(name: str, matter: MatterConfig, plant: Plant) -> FaultPriority:
     """The priority of a fault; 'T1.leak' means the leak's size."""
     at = ParameterName.of_effect(name)
-    try:
+    with naming(f"matters.{name}"):
         parameters = effect_parameters(at.effect, at.place, plant)
-    except ValueError as error:
-        raise ValueError(f"matters.{name}: {error}") from error
     size = parameters.get(at.field or next(iter(parameters)))
     if size is None:
         raise ValueError(f"matters.{name}: {unknown('a parameter', at.field, parameters)}")

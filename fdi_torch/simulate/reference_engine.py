@@ -16,13 +16,13 @@ from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.operating_point import Constants
 from fdi_torch.plant.signals import Clock
-from fdi_torch.simulate.engine import EngineText, Readings, expect_columns, expect_problems, gram_of, moments_of
+from fdi_torch.simulate.engine import Engine, expect_columns
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.forward_mode import ZeroSlopes, directions, stack_with_slope, value_and_slope, with_slope
 from fdi_torch.simulate.gradient import expect_no_gradient
 
 
-class ReferenceEngine(EngineText):
+class ReferenceEngine(Engine):
     """Readings of many parameter vectors at once, by torchdiffeq's fixed-step RK4 (3/8 rule) or an adaptive solver.
 
     method: 'rk4' for populations, or any adaptive method of torchdiffeq for single runs (rtol; atol in m). Adaptive
@@ -94,16 +94,6 @@ class ReferenceEngine(EngineText):
             readings, slopes = value_and_slope(engine._run(directions(lanes)))
         assert slopes is not None
         return readings[:, : len(lanes)], slopes.unflatten(1, (lanes.shape[-1], len(lanes))).movedim(1, -1)
-
-    def moments(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C 3"]:
-        """As `Engine.moments`."""
-        expect_problems(theta, data)
-        return moments_of(self.readings(theta), data)
-
-    def gram(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C W W"]:
-        """As `Engine.gram`."""
-        expect_problems(theta, data)
-        return gram_of(*self.linearise(theta), data)
 
     def _run(self, lanes: Tensor) -> Tensor:
         """lanes (L, P) -> readings (S, L, sensors), with slopes if the lanes have them."""
