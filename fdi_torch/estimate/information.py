@@ -133,14 +133,16 @@ def determined_combinations(
 
 def _groups(null: torch.Tensor) -> list[list[int]]:
     """Groups of parameters that share an undetermined direction: connected components of the projector `null`."""
-    # Imported here, because SciPy takes a while to load and most estimates are determined.
-    from scipy.sparse.csgraph import connected_components
-
-    null = null.cpu()
-    involved = (null.diagonal() > _SHARE).nonzero().flatten()
-    linked = null[involved][:, involved].abs() > math.sqrt(_SHARE) * 0.1
-    count, label = connected_components(linked.numpy(), directed=False)
-    return [involved[torch.from_numpy(label == k)].tolist() for k in range(count)]
+    remaining = [i for i in range(len(null)) if null[i, i] > _SHARE]
+    groups = []
+    while remaining:
+        group = [remaining.pop(0)]
+        for member in group:
+            linked = [j for j in remaining if abs(float(null[member, j])) > math.sqrt(_SHARE) * 0.1]
+            remaining = [j for j in remaining if j not in linked]
+            group += linked
+        groups.append(sorted(group))
+    return groups
 
 
 def _reduced(rows: torch.Tensor) -> torch.Tensor:

@@ -161,6 +161,11 @@ class PlantDescription:
         names = [t.name for t in self.tanks]
         return tuple((a, b) for i, a in enumerate(names) for b in names[i + 1 :])
 
+    def tanks_at(self, location: str) -> tuple[str, ...]:
+        """The tank of that name, or the two tanks of a pair 'T1-T2'; none for any other place."""
+        pairs = {f"{a}-{b}": (a, b) for a, b in self.tank_pairs()}
+        return pairs.get(location, tuple(t.name for t in self.tanks if t.name == location))
+
     def locations(self) -> tuple[str, ...]:
         return tuple(c.name for c in self.components()) + tuple(f"{a}-{b}" for a, b in self.tank_pairs())
 
@@ -220,10 +225,10 @@ def _check_names(plant: PlantDescription) -> None:
     if not plant.tanks:
         raise ValueError(f"plant {plant.name}: expected at least one tank, got none; add one under tanks")
     seen: set[str] = {OUTSIDE}
-    for component in plant.components():
-        if component.name in seen:
-            raise ValueError(f"plant {plant.name}: expected each name once, got '{component.name}' twice; rename one")
-        seen.add(component.name)
+    for name in plant.locations():
+        if name in seen:
+            raise ValueError(f"plant {plant.name}: expected each name once, got '{name}' twice; rename one")
+        seen.add(name)
 
 
 def _check_references(plant: PlantDescription) -> None:

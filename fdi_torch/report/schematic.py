@@ -271,10 +271,10 @@ class _Drawing:
 
     def pair(self, location: str) -> None:
         """Draw an unmodelled flow between two tanks, dashed."""
-        pairs = {f"{a}-{b}": (a, b) for a, b in self.plant.tank_pairs()}
-        if location not in pairs:
+        tanks = self.plant.tanks_at(location)
+        if len(tanks) != 2:
             return
-        (x, y), (to_x, to_y) = (self.corner(name) for name in pairs[location])
+        (x, y), (to_x, to_y) = (self.corner(name) for name in tanks)
         points = [(x, y + 0.42), (to_x, to_y + 0.42)]
         alpha = 1.0 if location in self.overlay.marks else strength(self.overlay.probabilities.get(location, 0.0))
         self.axes.plot(*np.array(points).T, color=MARK, lw=1.8, ls="--", alpha=alpha, zorder=1)

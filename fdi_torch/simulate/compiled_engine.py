@@ -116,7 +116,7 @@ class CompiledEngine(Engine):
         self, theta: Float[Tensor, "*batch P"], data: Readings, injection: Injection
     ) -> Float[Tensor, "*batch S columns"]:
         expect_no_gradient(self, theta, "observe")
-        memory = self.network.command_memory() + self.network.reading_memory()
+        memory = self.network.command_memory + self.network.reading_memory
         out = self._empty(theta, self.network.order + memory + self._sensors)
         expect_injectable(self.experiment, injection, memory)
         self._run("observe", theta, out, data=data, injection=injection)

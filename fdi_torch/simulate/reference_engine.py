@@ -161,7 +161,7 @@ class ReferenceEngine(Engine):
 
     def _actuator_outputs(self, channels: Tensor, values: PlaceValues) -> Tensor:
         starts, steps = self.experiment.nodes[:-1], self.experiment.steps
-        if self.network.command_memory() == 0:
+        if self.network.command_memory == 0:
             clock = self._clock(starts.unsqueeze(1), steps.unsqueeze(1))
             outputs, _ = self.network.commands(channels.unbind(-1), (), clock, values)
             return torch.stack([a.expand(channels.shape[:-1]) for a in outputs], dim=-1)
@@ -197,7 +197,7 @@ class ReferenceEngine(Engine):
             measured[i] = late(measured[i], self.experiment.sample_times, delay)
         times = self.experiment.sample_times
         intervals = self.experiment.sample_intervals
-        if self.network.reading_memory() == 0:
+        if self.network.reading_memory == 0:
             clock = self._clock((times - intervals).unsqueeze(1), intervals.unsqueeze(1))
             readings, _ = self.network.read(measured, (), clock, values)
             return torch.stack([r.expand(levels.shape[:2]) for r in readings], dim=-1)
