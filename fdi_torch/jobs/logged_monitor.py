@@ -256,7 +256,7 @@ class LoggedMonitor:
 def _positions(clock: Sequence[float], times: Sequence[tuple[float, bool]]) -> list[int]:
     """Index on the clock of each of the times, which follow it in order; True: after that of the time before.
 
-    The clock may jump back, which causes a notice. Each notice belongs to a sample of its own.
+    The clock may jump back, which causes a notice. No two notices belong to one sample.
     """
     positions, k = [], -1
     for time_of_item, is_later in times:

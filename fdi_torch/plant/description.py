@@ -7,9 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeVar
-
-from torch import Tensor
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.components import COMMAND_UNITS, OUTSIDE, READING_UNITS, Component, Sensor, Tank
@@ -19,7 +17,11 @@ from fdi_torch.plant.kinds.pump import Pump
 from fdi_torch.plant.kinds.transfer import Transfer
 from fdi_torch.plant.kinds.weir import Weir
 from fdi_torch.plant.metered_flow import MeteredFlow
-from fdi_torch.recording import Hold, Recording
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fdi_torch.recording import Hold, Recording
 
 __all__ = [
     "COMMAND_UNITS",
@@ -193,6 +195,8 @@ class PlantDescription:
         self, time: Tensor, inputs: Tensor, outputs: Tensor, *, hold: Hold = "zero_order", source: str = "memory"
     ) -> Recording:
         """The recording of all channels of the plant: time (T,) s, inputs (T, M) and outputs (T, N) in SI."""
+        from fdi_torch.recording import Recording  # a module of torch, which plants do without
+
         units = tuple(self.channel_units().values()), tuple(sensor.unit for sensor in self.sensors)
         return Recording(time, inputs, outputs, self.channels(), self.outputs(), *units, hold=hold, source=source)
 

@@ -38,8 +38,8 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Correction:
-    """Numbers that would be right in another unit. names: which numbers. written, right: their unit, and that other
-    one. ratio: of these units. volumes: of the plant with the numbers in the right unit."""
+    """A probable mistake of units. names: the numbers concerned. written, right: the unit they have, and the one they
+    should have. ratio: of these units. volumes: balance of the plant with the numbers in the right unit."""
 
     names: str
     written: str

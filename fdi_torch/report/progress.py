@@ -77,8 +77,8 @@ def sensor_residuals(material: Material) -> dict[str, SensorResidual]:
 
 
 def residual_size(material: Material) -> tuple[float, str, str]:
-    """Root mean square of the residuals of all sensors, its SI unit, and one of the sensors. NaN if the log has none,
-    or if its sensors have different units.
+    """Root mean square of the residuals of all sensors together, its SI unit, and the name of a sensor, which chooses
+    the unit shown. NaN if the log has none, or if its sensors have different units.
     """
     residuals = sensor_residuals(material)
     sensors = residuals.values()

@@ -85,7 +85,7 @@ class TracedEngine(Engine):
 
 
 class _Run:
-    """One simulation of lanes (L, P)."""
+    """One simulation with L sets of parameters side by side, the lanes (L, P)."""
 
     def __init__(
         self,
