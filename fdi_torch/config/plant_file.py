@@ -6,40 +6,26 @@ import re
 from collections.abc import Callable, Sized
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import Field, ValidationError
 
-from fdi_torch.config.flow_sections import flow_sections
+from fdi_torch.config.component_sections import component_sections
 from fdi_torch.config.plant_in_code import Plant, effect_in_si, effect_parameters, si_value, tolerances_in_si
 from fdi_torch.config.problems import explain, naming
-from fdi_torch.config.strict import Acceleration, Amount, Area, Length, Strict, quantity
+from fdi_torch.config.strict import Acceleration, Amount, Strict, quantity
 from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import find_plant, read_yaml
 from fdi_torch.effects import units_for_display
 from fdi_torch.names import unknown
 from fdi_torch.parameters import ParameterName
-from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, READING_UNITS, FaultPriority, PlacedEffect, Sensor, Tank
+from fdi_torch.plant.description import FLOW_KINDS, READING_UNITS, FaultPriority, PlacedEffect, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.quantities import SI_UNITS, display_in, unit_factor
 from fdi_torch.untrusted_input import MOST_COMPONENTS
 
 MARK = re.compile(r"\s*([\w.-]+):[^#]*#\s*!\s*(.*\S)\s*")
 """An entry whose comment begins with an exclamation mark."""
-
-
-def _start_level(value: Any) -> float | None:
-    return None if value in (None, "equilibrium") else quantity(value, "m")
-
-
-class TankConfig(Strict):
-    area: Area = Field(description="cross-section, m^2")
-    height: Length = Field(description="from the floor to the rim, m")
-    start_level: Annotated[float | None, BeforeValidator(_start_level)] = Field(
-        None, description="level at t = 0, m, or equilibrium (of the first inputs)"
-    )
-    overflow_to: str = Field(OUTSIDE, description="the tank that receives the overflow")
-    leak_reference: str | None = Field(None, description="the pipe whose capacity is a leak of size 1")
 
 
 class SensorConfig(Strict):
@@ -65,10 +51,9 @@ class MatterConfig(Strict):
 class _NamedPlant(Strict):
     name: str = ""
     gravity: Acceleration = Field(9.81, description="m/s^2")
-    tanks: dict[str, TankConfig]
 
 
-class PlantConfig(flow_sections(_NamedPlant)):  # type: ignore[misc]
+class PlantConfig(component_sections(_NamedPlant)):  # type: ignore[misc]
     sensors: dict[str, SensorConfig] = Field(default_factory=dict)
     tolerances: dict[str, Amount] = Field(
         default_factory=dict,
