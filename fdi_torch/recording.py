@@ -86,6 +86,18 @@ class Recording(Shown):
         return len(self.time)
 
     @property
+    def readings(self) -> torch.Tensor:
+        """The outputs (T, N), NaN where masked."""
+        return torch.where(self.mask, self.outputs, torch.nan)
+
+    def valid_readings(self, name: str) -> torch.Tensor:
+        """The valid readings (K,) of an output; none if it is not recorded."""
+        if name not in self.output_names:
+            return self.outputs.new_zeros(0)
+        column = self.output_names.index(name)
+        return self.outputs[self.mask[:, column], column]
+
+    @property
     def headline(self) -> str:
         lasts = float(self.time[-1] - self.time[0]) if len(self) else 0.0
         return f"{self.source}: {len(self)} samples, {lasts:g} s, one every {self.interval:g} s"
@@ -97,12 +109,11 @@ class Recording(Shown):
     @in_its_units
     def table(self) -> Table:
         """One row per channel: role, unit, range in that unit and number of missing samples."""
-        readings = torch.where(self.mask, self.outputs, torch.nan)
         rows = [
             (name, role, *in_display_unit(name, unit, *_range(values)), int((~torch.isfinite(values)).sum()))
             for role, names, units, table in (
                 ("input", self.input_names, self.input_units, self.inputs),
-                ("output", self.output_names, self.output_units, readings),
+                ("output", self.output_names, self.output_units, self.readings),
             )
             for name, unit, values in zip(names, units, table.T, strict=True)
         ]
@@ -133,8 +144,7 @@ class Recording(Shown):
 
         predicted (T, N): outputs of a model.
         """
-        measured = torch.where(self.mask, self.outputs, torch.nan)
-        series = {"measured": measured, "predicted": predicted, "residual": measured - predicted}
+        series = {"measured": self.readings, "predicted": predicted, "residual": self.readings - predicted}
         coordinates = {
             "time": ("time", self.time.cpu().numpy(), {"units": "s"}),
             "sensor": list(self.output_names),
@@ -144,9 +154,8 @@ class Recording(Shown):
         return needed("xarray").Dataset(variables, coordinates, {"source": self.source})
 
     def _columns(self) -> dict[str, Any]:
-        readings = torch.where(self.mask, self.outputs, torch.nan)
         names = (*self.input_names, *self.output_names)
-        return dict(zip(names, torch.cat([self.inputs, readings], dim=1).T.cpu().numpy(), strict=True))
+        return dict(zip(names, torch.cat([self.inputs, self.readings], dim=1).T.cpu().numpy(), strict=True))
 
     def _units(self) -> dict[str, str]:
         names = (*self.input_names, *self.output_names)

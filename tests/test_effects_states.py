@@ -20,9 +20,10 @@ from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.noise_model import learn_noise
 from fdi_torch.monitor.samples import samples_of_recording
-from fdi_torch.parameters import ParameterSpace
+from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.description import Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
-from fdi_torch.plant.effect import Placement, Stage
+from fdi_torch.plant.effect import Effect, Local, Placement, Stage, Values
+from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
@@ -235,15 +236,51 @@ def test_two_joined_tanks_oscillate_with_the_period_of_a_u_tube() -> None:
     assert period == pytest.approx(2.0 * math.pi * math.sqrt(length / (9.81 * area * 200.0)), rel=0.01)
 
 
+class SideChamber(Effect):
+    """A chamber of `size` tank cross-sections beside a tank, its level c behind the tank's: dc/dt = (h - c) / lag."""
+
+    name, stage, places, states = "side_chamber", Stage.BALANCE, ("tank",), 1
+
+    def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
+        return Parameter("size", "1", 0.0, 0.0, 2.0), Parameter("lag", "s", 20.0, 1.0, 100.0)
+
+    def steady_states(self, flow: Tensor, local: Local, p: Values) -> tuple[Tensor, ...]:
+        return (local.level,)
+
+    def state_rates(self, flow: Tensor, local: Local, p: Values) -> tuple[Tensor, ...]:
+        return ((local.level - local.states[0]) / torch.maximum(p["lag"], local.clock.resolution),)
+
+    def inflow(self, local: Local, p: Values) -> Tensor:
+        return -p["size"] * local.area * self.state_rates(torch.zeros_like(local.level), local, p)[0]
+
+
+@pytest.mark.parametrize("kind", ["reference", "traced", "compiled", "collocation"])
+def test_a_chamber_beside_a_tank_fills_as_its_closed_form(kind: str) -> None:
+    """With the pump's flow q from t = 0 on: d' = q / A - (1 + s) d / lag for d = h - c, and h + s c grows by q / A."""
+    area, size, lag, pumped = 0.01, 0.5, 20.0, 2e-5
+    plant = PlantDescription(
+        "chamber", (Tank("T-1", area, 0.6, 0.1),), (), (Pump("P", "T-1", 1e-4),), (Sensor("a", "T-1"),)
+    )
+    network = TankNetwork(plant, [Placement(SideChamber(), "T-1", {"size": size, "lag": lag})])
+    time = torch.arange(61, dtype=torch.float64)
+    blank = blank_recording(plant, torch.full((61, 1), pumped, dtype=torch.float64), time)
+    experiment, theta = lay_out(blank, plant.channels(), STEP), torch.zeros(0, dtype=torch.float64)
+    if kind == "collocation":
+        readings = Collocation(network, ParameterSpace(), experiment).converge(theta.unsqueeze(0)).readings[0]
+    else:
+        readings = make_engine(network, ParameterSpace(), experiment, kind).readings(theta)
+    behind = pumped * lag / (area * (1.0 + size)) * (1.0 - torch.exp(-(1.0 + size) * time / lag))
+    expected = 0.1 + (pumped / area * time + size * behind) / (1.0 + size)
+    assert torch.allclose(readings[:, 0], expected, rtol=0.0, atol=1e-5)
+    assert PlantOde(network, torch.zeros(1, dtype=torch.float64)).start.tolist() == pytest.approx([0.1, 0.1])
+
+
 def test_states_are_refused_where_nothing_integrates_them() -> None:
-    class Chamber(type(PLACES[0].effect)):  # type: ignore[misc]
-        name, stage, places = "chamber", Stage.BALANCE, ("tank",)
+    class Wall(SideChamber):
+        name, stage = "wall", Stage.STORAGE
 
-        def parameters(self, place: str, plant: PlantDescription) -> tuple[()]:
-            return ()
-
-    with pytest.raises(ValueError, match=r"A\.chamber: expected states only in a FLOW effect"):
-        build_network(PLANT, [Placement(Chamber(), "A")])
+    with pytest.raises(ValueError, match=r"A\.wall: expected states only in a BALANCE effect, or in a FLOW effect"):
+        TankNetwork(PLANT, [Placement(Wall(), "A")])
     network = build_network(PLANT, PLACES[:1])
     with pytest.raises(ValueError, match="expected 2 levels or a state of 3 numbers, got 4"):
         network.split([torch.zeros(())] * 4)

@@ -14,7 +14,7 @@ from torch import Tensor
 from fdi_torch.effects import build_network, effect, placements_for
 from fdi_torch.effects.coefficient_drift import elapsed
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.description import PlacedEffect, Sensor, Tank
+from fdi_torch.plant.description import Pipe, PlacedEffect, PlantDescription, Sensor, Tank
 from fdi_torch.plant.effect import Effect, Local, Memory, Placement
 from fdi_torch.plant.operating_range import bounded_by_recording, head_range, interior_points, operating_range_of
 from fdi_torch.plant.signals import Clock
@@ -414,3 +414,19 @@ def test_a_drooping_pump_loses_with_a_power_of_the_level() -> None:
         assert float(pumped) == pytest.approx(5e-5 * expected, rel=1e-12)
     empty = effect("pump_back_pressure").flow(number(5e-5), local(0.0, 0.0), values(loss=0.4, droop=1.5))
     assert float(empty) == pytest.approx(5e-5, rel=1e-6)
+
+
+def test_a_flow_between_two_tanks_whose_names_have_hyphens() -> None:
+    tanks = (Tank("T-1", 0.01, 0.6, 0.3), Tank("T-2", 0.01, 0.6, 0.2))
+    plant = PlantDescription("tags", tanks, (Pipe("P-12", "T-1", "T-2", 1e-4, 0.8),), (), (Sensor("L-1", "T-1"),))
+    assert plant.tanks_at("T-1-T-2") == ("T-1", "T-2") and plant.tanks_at("T-1") == ("T-1",)
+    assert plant.tanks_at("P-12") == ()
+    levels, none = [number(0.3), number(0.2)], Clock(number(0.0), number(1.0), number(1.0))
+    rates = []
+    for effects in ((), (PlacedEffect("cross_flow", "T-1-T-2", {"size": 0.5}),)):
+        network = build_network(replace(plant, effects=effects))
+        rates.append(network.rates(levels, [], none, network.bind(ParameterSpace(), network.nominal[:0])))
+    more = [float(b - a) for a, b in zip(*rates, strict=True)]
+    assert more[0] < -1e-4 and more[1] == pytest.approx(-more[0])
+    with pytest.raises(ValueError, match="expected each name once, got 'T-1-T-2' twice"):
+        replace(plant, sensors=(Sensor("T-1-T-2", "T-1"),))

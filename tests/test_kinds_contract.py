@@ -201,7 +201,7 @@ def smoothing_error(kind: type[FlowComponent], smoothing: float = 1.0) -> float:
             sharp = tank.outflow(level, 1e-12)
             if sharp * tank.step / AREA <= level - datum and tank.slope(level) * tank.step / AREA <= FASTEST:
                 errors.append(abs(tank.outflow(level, tank.resolution) / sharp - 1.0))
-    return max(errors)
+    return worst(errors)
 
 
 def steady_errors(kind: type[FlowComponent], smoothing: float = 1.0) -> tuple[float, float]:
@@ -215,7 +215,12 @@ def steady_errors(kind: type[FlowComponent], smoothing: float = 1.0) -> tuple[fl
             levels = tank.levels(inflow)
             errors.append(abs(float(levels[-1]) - tank.level_of(inflow)) / rise)
             changes.append(float((levels[-20:] - levels[-1]).abs().max()) / rise)
-    return max(errors), max(changes)
+    return worst(errors), worst(changes)
+
+
+def worst(errors: list[float]) -> float:
+    """The greatest error; infinite where steps have grown beyond all numbers, which `max` would pass over."""
+    return max(math.inf if math.isnan(error) else error for error in errors)
 
 
 @draining

@@ -113,7 +113,7 @@ def test_blank_lines_comments_and_quotes_are_passed_over(tmp_path: Path) -> None
     [
         ("", "run.csv: expected a header line .* got an empty file"),
         ("t_s,Q1_cm3_s,h1_cm\n", "run.csv: expected at least two rows of numbers, got 0"),
-        ("t_s,Q1_cm3_s,h_cm\n0,1,2\n", r"expected a column for h1 .* the nearest is h_cm; map it under columns"),
+        ("t_s,Q1_cm3_s,h_cm\n0,1,2\n", r"expected a column for h1 .* the nearest is 'h_cm'; map it under columns"),
         ("Q1_cm3_s,h1_cm\n0,1\n", r"expected a column for t \('t' or 't_UNIT'\), got Q1_cm3_s, h1_cm"),
         ("t_s,Q1_cm3_s,h1\n0,1,2\n", "column h1: expected a header of the form name_unit"),
         (GOOD + "3,fifty,13\n", "run.csv: row 5, column Q1_cm3_s: expected a number or an empty cell, got 'fifty'"),

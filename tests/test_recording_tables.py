@@ -259,7 +259,7 @@ def test_commands_are_added_each_by_its_own_unit_and_unknown_where_one_is(tmp_pa
     path.write_text("t_s,a [l/min],b_cm3_s,h1_cm\n0,6,10,1\n1,,10,1\n2,6,20,1\n")
     found = read_csv(path, *CHANNELS, {"Q1": ChannelSource("a", plus=("b",))})
     assert found.inputs[:, 0].tolist() == pytest.approx([110e-6, math.nan, 120e-6], nan_ok=True)
-    with pytest.raises(ValueError, match=r"expected a column for Q1 .*; the nearest is b_cm3_s"):
+    with pytest.raises(ValueError, match=r"expected a column for Q1 .*; the nearest is 'b_cm3_s'"):
         read_csv(path, *CHANNELS, {"Q1": ChannelSource("a", plus=("b_cm3",))})
     path.write_text("t_s,a_cm,b_cm3_s,h1_cm\n0,6,10,1\n1,6,10,1\n")
     with pytest.raises(ValueError, match=r"column b_cm3_s: expected a unit that converts to m, got 'cm3_s'"):

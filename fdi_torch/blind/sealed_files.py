@@ -123,7 +123,7 @@ def read_plant(out: Path, line: Mapping[str, Any]) -> PlantDescription:
 def read_recording(out: Path, line: Mapping[str, Any], part: str, plant: PlantDescription) -> Recording:
     """One recording of a case, checked against its line of the manifest. Its source names the case and nothing else."""
     path = out / "cases" / f"{line['case']}_{part}.csv.gz"
-    recording = read_csv(path, plant.channels(), [s.column for s in plant.sensors])
+    recording = read_csv(path, plant.channels(), plant.outputs())
     _expect_unchanged(line, part, recording.sha256)
     return replace(recording, source=f"{line['case']}/{part}")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -53,14 +54,18 @@ def rippling(period: float, lasting: float) -> NoiseCorrelation:
     return _of_unit_energy("rippling", np.exp(-_AT / lasting) * np.cos(2 * np.pi * _AT / period))
 
 
+# Share of the rigs with each correlation, and its drawing; the shares add up to 1.
+DRAWN: tuple[tuple[float, Callable[[np.random.Generator], NoiseCorrelation]], ...] = (
+    (0.7, lambda rng: autoregressive(float(rng.uniform(0.6, 0.9)))),
+    (0.15, lambda rng: smoothed(int(rng.integers(3, 9)))),
+    (0.15, lambda rng: rippling(float(rng.uniform(6, 14)), float(rng.uniform(3, 6)))),
+)
+
+
 def draw_correlation(rng: np.random.Generator) -> NoiseCorrelation:
     """A random correlation, mostly AR(1)."""
-    name = rng.choice(["autoregressive", "smoothed", "rippling"], p=[0.7, 0.15, 0.15])
-    if name == "smoothed":
-        return smoothed(int(rng.integers(3, 9)))
-    if name == "rippling":
-        return rippling(float(rng.uniform(6, 14)), float(rng.uniform(3, 6)))
-    return autoregressive(float(rng.uniform(0.6, 0.9)))
+    shares, draws = zip(*DRAWN, strict=True)
+    return draws[rng.choice(len(draws), p=shares)](rng)
 
 
 def _of_unit_energy(name: str, kernel: Array) -> NoiseCorrelation:

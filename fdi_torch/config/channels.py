@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from fdi_torch.config.recording_config import ColumnConfig, FileConfig
-from fdi_torch.config.strict import Amount, quantity
+from fdi_torch.config.strict import Amount, quantity_at
 from fdi_torch.names import shortened, unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text, si_unit_of
@@ -68,10 +68,7 @@ def _clock_source(column: ColumnConfig) -> ClockSource:
 
 
 def _channel_source(place: str, column: ColumnConfig, unit: str) -> ChannelSource:
-    try:
-        constant = None if column.constant is None else quantity(column.constant, unit)
-    except ValueError as error:
-        raise ValueError(f"{place}.constant: {error}") from error
+    constant = None if column.constant is None else quantity_at(f"{place}.constant", column.constant, unit)
     if not column.recorded:
         constant = float("nan")
     if constant is not None:
@@ -89,14 +86,13 @@ def _meaning(place: str, value: Amount | None, unit: str | None) -> float:
 
 
 def _units(plant: PlantDescription) -> dict[str, str]:
-    return plant.channel_units() | {sensor.column: sensor.unit for sensor in plant.sensors}
+    return plant.channel_units() | plant.output_units()
 
 
 def expect_units(source: str, names: Sequence[str], units: Sequence[str], plant: PlantDescription) -> None:
     """Raises ValueError if a channel's SI unit differs from the plant's."""
     expected = _units(plant)
-    heights = {tank.name: tank.height for tank in plant.tanks}
-    gains = {s.column: f"a level in %: gain: {100.0 / heights[s.tank]:.4g} %/m" for s in plant.sensors}
+    gains = {s.column: f"a level in %: gain: {100.0 / plant.tank(s.tank).height:.4g} %/m" for s in plant.sensors}
     gains |= {p.channel: f"a command in %: gain: {quantity_text(p.max_flow, 'm^3/s')}" for p in plant.metered_flows()}
     for name, unit in zip(names, units, strict=True):
         if unit != expected[name]:
@@ -124,8 +120,7 @@ def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[s
     if not missing:
         return
     inputs = [name for name in missing if name in plant.channels()]
-    sensors = {sensor.column for sensor in plant.sensors}
-    if set(missing) == sensors and not _other_columns(path, plant):
+    if set(missing) == set(plant.outputs()) and not _other_columns(path, plant):
         raise ValueError(
             f"{path}: expected readings of {', '.join(missing)}, got inputs alone; fdi plan and fdi "
             "diagnosability show what planned inputs can reveal"

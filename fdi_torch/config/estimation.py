@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity
+from fdi_torch.config.problems import ConfigError, naming
+from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity, quantity_at
 from fdi_torch.effects import all_placements, build_network, full_name, placements_for, unknown_parameter
 from fdi_torch.estimate.evolution_settings import STRATEGIES, EvolutionSettings
 from fdi_torch.names import shortened, unknown
@@ -120,11 +120,9 @@ def matching_names(pattern: str, plant: PlantDescription) -> list[str]:
 def names_in_full(names: Iterable[str], plant: PlantDescription, field: str) -> list[str]:
     """The full names. Raises ConfigError, naming the field, for a name that the plant does not have."""
     short = list(names)
-    try:
+    with naming(field):
         full = [full_name(name, plant) for name in short]
         constants = build_network(plant, placements_for(full)).constants
-    except ValueError as error:
-        raise ConfigError([f"{field}: {error}"]) from error
     for name, name_in_full in zip(short, full, strict=True):
         if name_in_full not in constants:
             raise ConfigError([f"{field}: {unknown_parameter(name, constants, plant)}"])
@@ -151,10 +149,8 @@ def estimated_space(
     ]
     names = {p.name for p in estimated}
     calibrated = [constants[name] for name in _calibrated(config, constants, plant, real_data) if name not in names]
-    try:
+    with naming("estimate.parameters"):
         return ParameterSpace([*estimated, *calibrated])
-    except ValueError as error:
-        raise ConfigError([f"estimate.parameters: {error}"]) from error
 
 
 def _chosen(
@@ -163,12 +159,10 @@ def _chosen(
     if name not in constants:
         raise ConfigError([f"{place}: {unknown_parameter(name, constants, plant)}"])
     unit = constants[name].unit
-    try:
+    with naming(f"{place} ({config.name})"):
         given = {field: getattr(config, field) for field in ("nominal", "low", "high", "std")}
         changes = {field: quantity(value, unit) for field, value in given.items() if value is not None}
         return constants.with_changes(name, **changes)[name]
-    except ValueError as error:
-        raise ConfigError([f"{place} ({config.name}): {error}"]) from error
 
 
 def _calibrated(
@@ -176,13 +170,13 @@ def _calibrated(
 ) -> list[str]:
     if config.calibrate == "auto":
         return list(plant.tolerances) if real_data else []
-    names: list[str] = []
+    names: dict[str, None] = {}
     for pattern in config.calibrate:
         matched = [name for name in constants.names if fnmatchcase(name, pattern)]
         if not matched:
             raise ConfigError([f"estimate.calibrate: {unknown_parameter(pattern, constants, plant)}"])
-        names += [name for name in matched if name not in names]
-    return names
+        names |= dict.fromkeys(matched)
+    return list(names)
 
 
 def parameter_values(values: dict[str, Amount], constants: ParameterSpace, plant: PlantDescription) -> dict[str, float]:
@@ -192,10 +186,7 @@ def parameter_values(values: dict[str, Amount], constants: ParameterSpace, plant
         name = full_name(given, plant)
         if name not in constants:
             raise ConfigError([f"simulate.faults: {unknown_parameter(name, constants, plant)}"])
-        try:
-            si[name] = quantity(value, constants[name].unit)
-        except ValueError as error:
-            raise ConfigError([f"simulate.faults.{given}: {error}"]) from error
+        si[name] = quantity_at(f"simulate.faults.{given}", value, constants[name].unit)
         low, high = constants[name].low, constants[name].high
         if not low <= si[name] <= high:
             unit, scale = display_unit(constants[name].unit, name)

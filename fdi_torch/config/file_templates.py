@@ -21,7 +21,7 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str, rec
     plant: the plant of the file; plant_file: its entry under the key `plant`; name: of the run. recording: the file
     that it reads; None for one of the name of the run, whose header is then told.
     """
-    header = header_of(plant.channel_units(), {s.column: s.unit for s in plant.sensors})
+    header = header_of(plant.channel_units(), plant.output_units())
     file = f"{name}.csv             # with the header {header}" if recording is None else f'"{recording}"'
     indent = "    " if kind == "run" else "  "
     to_complete = [] if recording is None or is_query(recording) else mapped(find_data(recording, Path.cwd()), plant)

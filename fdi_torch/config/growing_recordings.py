@@ -92,7 +92,7 @@ def _csv_rows(
     idle: float,
     began: Callable[[float], None] | None,
 ) -> Iterator[Row | str]:
-    inputs, outputs = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
+    inputs, outputs = plant.channels(), plant.outputs()
     file = GrowingCsv(path, inputs, outputs, mapping)
     expect_units(str(path), (*inputs, *outputs), (*file.input_units, *file.output_units), plant)
     return _new_rows(file, idle, began)
@@ -122,7 +122,7 @@ def _mcap_rows(
 ) -> Iterator[Row | str]:
     """Messages grouped by time: inputs are held, a missing reading is NaN."""
     expect_keys_of_logs(path, mapping)
-    inputs, outputs = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
+    inputs, outputs = plant.channels(), plant.outputs()
     sources = {name: mapping.get(name, ChannelSource()) for name in (*inputs, *outputs)}
     places = {n: _place(n, source, n in inputs) for n, source in sources.items() if source.constant is None}
     factors: dict[str, float] = {}
@@ -165,7 +165,7 @@ def _factor(
 ) -> float:
     """Factor from the numbers of a message to SI. Raises ValueError for a missing unit or one of another dimension."""
     source = mapping.get(name, ChannelSource())
-    unit = source.unit or dict(message.channel.metadata).get(f"unit.{field}", "")
+    unit = source.unit or message.channel.units.get(field, "")
     if not unit:
         raise ValueError(f"{message.topic}: {name}: expected a unit, got none; give it under columns: {name}")
     expect_units(message.topic, (name,), (si_unit_of(unit),), plant)

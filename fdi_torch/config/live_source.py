@@ -10,7 +10,7 @@ from typing import Literal
 from pydantic import Field, field_validator
 
 from fdi_torch.config.channels import expect_units
-from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.problems import naming
 from fdi_torch.config.recording_config import StartLevels
 from fdi_torch.config.strict import Amount, HeldFor, Seconds, Strict, quantity
 from fdi_torch.live.address import Address, address_of
@@ -89,13 +89,11 @@ class LiveRows(Iterator["Row | str"]):
         origin: float | None = None,
         earlier: Iterable[Row] = (),
     ) -> None:
-        try:
+        with naming("source"):
             address = address_of(config.url)
             inputs, outputs = _channels(config, plant, address)
             tags = list(dict.fromkeys(c.tag for c in (*inputs, *outputs) if c.tag is not None))
             self._connection = _connection(config, address, tags)
-        except ValueError as error:
-            raise ConfigError([f"source: {error}"]) from error
         own_stamps = address.scheme == "opcua" or (config.clock is None and address.scheme.startswith("mqtt"))
         align = config.align if config.align is not None else config.period if own_stamps else 0.0
         seen = [row[0] for row in earlier]
@@ -133,7 +131,7 @@ def _channels(
     config: SourceConfig, plant: PlantDescription, address: Address
 ) -> tuple[list[LiveChannel], list[LiveChannel]]:
     """The plant's inputs and outputs. Raises ValueError for an unknown or unmapped channel, and for a wrong unit."""
-    inputs, outputs = plant.channels(), [sensor.column for sensor in plant.sensors]
+    inputs, outputs = plant.channels(), plant.outputs()
     openings = {p.valve: p.unrecorded for p in plant.pipes if p.valve and p.unrecorded is not None}
     for name in config.tags:
         if name not in (*inputs, *outputs):

@@ -93,7 +93,7 @@ def named_recordings(name: str, plant: PlantDescription, base: Path) -> list[Rec
 
 def planned_recordings(name: str, plant: PlantDescription, base: Path) -> list[Recording]:
     """As `named_recordings`, of planned inputs: a sensor without a column counts as not recorded."""
-    sensors = [sensor.column for sensor in plant.sensors]
+    sensors = plant.outputs()
     configs, folder = listed_recordings(name, plant, base, optional=sensors)
     planned = []
     for config in configs:
@@ -155,7 +155,7 @@ def read_recording(
     """
     if not isinstance(config, RecordingConfig):
         config = config_of(config)
-    channels, columns = plant.channels(), tuple(sensor.column for sensor in plant.sensors)
+    channels, columns = plant.channels(), plant.outputs()
     in_memory = (given or {}).get(config.file)
     folder = base or Path.cwd()
     try:

@@ -56,7 +56,7 @@ def logged_gap_settings(log: LoggedRun, overrides: Iterable[str]) -> dict[str, A
 
     Raises ConfigError for an unknown key or a wrong value, and if the log has no settings.
     """
-    logged = log.metadata.get("fdi_torch.config", {})
+    logged = log.about("config")
     values: dict[str, Any] = {
         key: json.loads(text) for key in GapSettings.model_fields if (text := logged.get(f"settings.{key}")) is not None
     }

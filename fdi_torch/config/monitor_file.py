@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from fdi_torch.config.estimation import matching_names, names_in_full
 from fdi_torch.config.live_source import SourceConfig
 from fdi_torch.config.loaded_recordings import separate_recordings
-from fdi_torch.config.problems import ConfigError, naming_source
+from fdi_torch.config.problems import naming, naming_source
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.strict import ScaledSeconds, Seconds, Strict
@@ -125,13 +125,8 @@ def _in_full(config: MonitorConfig, plant: PlantDescription) -> MonitorConfig:
     """Expand names of faults: 'T1.leak' means the leak's size, and a pattern such as '*.leak' all that it matches."""
     ranged = names_in_full(config.ranges, plant, "ranges")
     ranges = dict(zip(ranged, config.ranges.values(), strict=True))
-    faults = names_in_full(_matching(config.faults, plant), plant, "faults")
+    with naming("faults"):
+        matched = [full for name in config.faults for full in matching_names(name, plant)]
+    faults = names_in_full(dict.fromkeys(matched), plant, "faults")
     names_in_full(config.calibrate, plant, "calibrate")
     return config.model_copy(update={"faults": faults, "ranges": ranges})
-
-
-def _matching(names: Sequence[str], plant: PlantDescription) -> list[str]:
-    try:
-        return list(dict.fromkeys(full for name in names for full in matching_names(name, plant)))
-    except ValueError as error:
-        raise ConfigError([f"faults: {error}"]) from error

@@ -6,40 +6,26 @@ import re
 from collections.abc import Callable, Sized
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import BeforeValidator, Field, ValidationError
+from pydantic import Field, ValidationError
 
-from fdi_torch.config.flow_sections import flow_sections
+from fdi_torch.config.component_sections import component_sections
 from fdi_torch.config.plant_in_code import Plant, effect_in_si, effect_parameters, si_value, tolerances_in_si
-from fdi_torch.config.problems import ConfigError, explain
-from fdi_torch.config.strict import Acceleration, Amount, Area, Length, Strict, quantity
+from fdi_torch.config.problems import explain, naming
+from fdi_torch.config.strict import Acceleration, Amount, Strict, quantity
 from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import find_plant, read_yaml
 from fdi_torch.effects import units_for_display
 from fdi_torch.names import unknown
 from fdi_torch.parameters import ParameterName
-from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, READING_UNITS, FaultPriority, PlacedEffect, Sensor, Tank
+from fdi_torch.plant.description import FLOW_KINDS, READING_UNITS, FaultPriority, PlacedEffect, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.quantities import SI_UNITS, display_in, unit_factor
 from fdi_torch.untrusted_input import MOST_COMPONENTS
 
 MARK = re.compile(r"\s*([\w.-]+):[^#]*#\s*!\s*(.*\S)\s*")
 """An entry whose comment begins with an exclamation mark."""
-
-
-def _start_level(value: Any) -> float | None:
-    return None if value in (None, "equilibrium") else quantity(value, "m")
-
-
-class TankConfig(Strict):
-    area: Area = Field(description="cross-section, m^2")
-    height: Length = Field(description="from the floor to the rim, m")
-    start_level: Annotated[float | None, BeforeValidator(_start_level)] = Field(
-        None, description="level at t = 0, m, or equilibrium (of the first inputs)"
-    )
-    overflow_to: str = Field(OUTSIDE, description="the tank that receives the overflow")
-    leak_reference: str | None = Field(None, description="the pipe whose capacity is a leak of size 1")
 
 
 class SensorConfig(Strict):
@@ -65,10 +51,9 @@ class MatterConfig(Strict):
 class _NamedPlant(Strict):
     name: str = ""
     gravity: Acceleration = Field(9.81, description="m/s^2")
-    tanks: dict[str, TankConfig]
 
 
-class PlantConfig(flow_sections(_NamedPlant)):  # type: ignore[misc]
+class PlantConfig(component_sections(_NamedPlant)):  # type: ignore[misc]
     sensors: dict[str, SensorConfig] = Field(default_factory=dict)
     tolerances: dict[str, Amount] = Field(
         default_factory=dict,
@@ -114,24 +99,20 @@ def build_plant(data: dict[str, Any], source: str) -> Plant:
         config = PlantConfig.model_validate(data)
     except ValidationError as error:
         raise explain(error, source) from None
-    try:
+    with naming(source):
         plant = _plant(config)
         return replace(plant, units=written_units(data) | _valid_units(config.units, plant))
-    except ValueError as error:
-        raise ConfigError([f"{source}: {error}"]) from error
 
 
 def _valid_units(units: dict[str, str], plant: Plant) -> dict[str, str]:
     """The key `units`. Raises ValueError for an unknown key, and for a unit of another kind than its key."""
-    sensors = {sensor.column: sensor.unit for sensor in plant.sensors}
+    sensors = plant.output_units()
     kinds = dict.fromkeys((*SI_UNITS, *READING_UNITS))
     for key, unit in units.items():
         if key not in sensors and key not in kinds:
             raise ValueError(f"units: {unknown('an output channel or an SI unit', key, (*sensors, *kinds))}")
-        try:
+        with naming(f"units.{key}"):
             unit_factor(unit, sensors.get(key, key))
-        except ValueError as error:
-            raise ValueError(f"units.{key}: {error}") from error
     return units
 
 
@@ -162,10 +143,8 @@ def _plant(config: PlantConfig) -> Plant:
 def _matter(name: str, matter: MatterConfig, plant: Plant) -> FaultPriority:
     """The priority of a fault; 'T1.leak' means the leak's size."""
     at = ParameterName.of_effect(name)
-    try:
+    with naming(f"matters.{name}"):
         parameters = effect_parameters(at.effect, at.place, plant)
-    except ValueError as error:
-        raise ValueError(f"matters.{name}: {error}") from error
     size = parameters.get(at.field or next(iter(parameters)))
     if size is None:
         raise ValueError(f"matters.{name}: {unknown('a parameter', at.field, parameters)}")

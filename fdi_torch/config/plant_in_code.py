@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
+from fdi_torch.config.problems import naming
 from fdi_torch.config.strict import quantity
 from fdi_torch.config.written_units import written_units
 from fdi_torch.effects import build_network, effect_at, full_name, placements_for
@@ -171,21 +172,17 @@ def si_value(place: str, value: float | str, unit: str, read: Read | None = None
     """The SI value of a quantity: text by its unit, a number unchanged; or by `read`. Raises ValueError naming
     `place`.
     """
-    try:
+    with naming(place):
         if read is None:
             return quantity(value, unit) if isinstance(value, str) else quantity(value, "1")
         return read(value, unit)
-    except ValueError as error:
-        raise ValueError(f"{place}: {error}") from error
 
 
 def effect_in_si(index: int, placed: PlacedEffect, plant: PlantDescription, read: Read | None = None) -> PlacedEffect:
     """The effect with its parameters in SI. Raises ValueError for an impossible place or an unknown parameter."""
     place = f"effects.{index}"
-    try:
+    with naming(place):
         known = effect_parameters(placed.effect, placed.location, plant)
-    except ValueError as error:
-        raise ValueError(f"{place}: {error}") from error
     for name in placed.parameters:
         if name not in known:
             raise ValueError(f"{place}.parameters: {unknown(f'a parameter of {placed.effect}', name, known)}")
@@ -230,10 +227,8 @@ def tolerances_in_si(
 
 def _varying(patterns: Iterable[str], tolerances: dict[str, float]) -> tuple[str, ...]:
     """The matching constants. Raises ValueError for a pattern without any constant that has a tolerance."""
-    try:
+    with naming("varying"):
         return tuple(matching("a constant with a tolerance", patterns, tolerances))
-    except ValueError as error:
-        raise ValueError(f"varying: {error}") from error
 
 
 def absolute_units(plant: PlantDescription) -> dict[str, str]:

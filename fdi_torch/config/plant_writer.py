@@ -4,23 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from fdi_torch.config.flow_sections import written_fields
+from fdi_torch.config.component_sections import written_fields
 from fdi_torch.config.plant_in_code import absolute_units, effect_parameters
 from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import write_yaml
 from fdi_torch.effects import effect_at
 from fdi_torch.parameters import ParameterName
-from fdi_torch.plant.description import (
-    FLOW_KINDS,
-    OUTSIDE,
-    READING_UNITS,
-    FaultPriority,
-    PlacedEffect,
-    PlantDescription,
-    Sensor,
-    Tank,
-)
-from fdi_torch.plant.flow_component import FlowComponent
+from fdi_torch.plant.components import Component
+from fdi_torch.plant.description import FLOW_KINDS, READING_UNITS, FaultPriority, PlacedEffect, PlantDescription, Sensor
 from fdi_torch.quantities import display_unit, displayed_in, parse_quantity
 
 _UNITS = {
@@ -47,9 +38,9 @@ def plant_mapping(plant: PlantDescription) -> dict[str, Any]:
     """The description as the mapping that `build_plant` reads, in the plant's units where these are exact."""
     with displayed_in(plant.units):
         data: dict[str, Any] = {"name": plant.name, "gravity": f"{plant.gravity!r} m/s^2"}
-        data["tanks"] = {t.name: _tank_mapping(t) for t in plant.tanks}
+        data["tanks"] = {t.name: _component_mapping(t) for t in plant.tanks}
         for kind in FLOW_KINDS:
-            data[kind.part()] = {c.name: _flow_mapping(c) for c in getattr(plant, kind.part())}
+            data[kind.part()] = {c.name: _component_mapping(c) for c in getattr(plant, kind.part())}
         data["sensors"] = {s.name: _sensor_mapping(s) for s in plant.sensors}
         units = absolute_units(plant)
         shares = _shares({n: v for n, v in plant.tolerances.items() if n not in units})
@@ -68,20 +59,8 @@ def _matter_mapping(matter: FaultPriority, plant: PlantDescription) -> dict[str,
     return _given(smallest=smallest, urgency=matter.urgency or None)
 
 
-def _tank_mapping(tank: Tank) -> dict[str, Any]:
-    start = None if tank.start_level is None else _text(tank.start_level, "m")
-    outside = None if tank.overflow_to == OUTSIDE else tank.overflow_to
-    return _given(
-        area=_text(tank.area, "m^2"),
-        height=_text(tank.height, "m"),
-        start_level=start,
-        overflow_to=outside,
-        leak_reference=tank.leak_reference,
-    )
-
-
-def _flow_mapping(component: FlowComponent) -> dict[str, Any]:
-    """The keys of a flow component whose values differ from their defaults, `target` always."""
+def _component_mapping(component: Component) -> dict[str, Any]:
+    """The keys of a tank or flow component whose values differ from their defaults, `target` always."""
     mapping: dict[str, Any] = {}
     for f in written_fields(type(component)):
         value, unit = getattr(component, f.name), f.metadata.get("unit", "")

@@ -33,6 +33,15 @@ def explain(error: ValidationError, source: str, known: Mapping[str, str] | None
 
 
 @contextmanager
+def naming(place: str) -> Iterator[None]:
+    """A context in which ValueErrors become ConfigErrors that begin with the place that they are about."""
+    try:
+        yield
+    except ValueError as error:
+        raise ConfigError([f"{place}: {error}"]) from error
+
+
+@contextmanager
 def naming_source(source: str) -> Iterator[None]:
     """A context in which ConfigErrors are prefixed with the file."""
     try:

@@ -27,7 +27,6 @@ from fdi_torch.monitor.monte_carlo.simulated_runs import SimulatedRig
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import parse_quantity
-from fdi_torch.recording import Recording
 from fdi_torch.simulate.equilibrium import equilibrium
 
 Metres = Annotated[float, BeforeValidator(lambda value: quantity(value, "m"))]
@@ -172,8 +171,6 @@ def _rig(
 
 def _fitting(c: RehearsalConfig, plant: PlantDescription, r: RivalConfig, samples: int) -> Fitting:
     inputs, time = _inputs(c, plant), c.sampling * torch.arange(samples, dtype=torch.float64)
-    columns, units = tuple(s.column for s in plant.sensors), tuple(s.unit for s in plant.sensors)
-    unread = torch.full((samples, len(columns)), torch.nan, dtype=torch.float64)
-    channels, channel_units = tuple(plant.channels()), tuple(plant.channel_units().values())
-    blank = Recording(time, inputs.expand(samples, -1), unread, channels, columns, channel_units, units)
+    unread = torch.full((samples, len(plant.sensors)), torch.nan, dtype=torch.float64)
+    blank = plant.recording(time, inputs.expand(samples, -1), unread)
     return set_up(plant, [blank], [full_name(name, plant) for name in r.faults], "equilibrium")

@@ -41,6 +41,9 @@ class _WithOutput(Protocol):
     @property
     def output(self) -> OutputConfig: ...
 
+    @property
+    def seed(self) -> int: ...
+
     def model_dump(self, *, mode: str) -> dict[str, Any]: ...
 
 
@@ -68,6 +71,11 @@ class ResolvedFile(Generic[AnyConfig]):
     def resolved(self) -> dict[str, Any]:
         """All values, including defaults, as plain nested values."""
         return self.config.model_dump(mode="json") | {"plant": plant_mapping(self.plant)}
+
+    def log_records(self, data: Iterable[Mapping[str, str]] = ()) -> dict[str, Any]:
+        """Configuration, seed and the origin of the data, as arguments of `RunLog`."""
+        seeds = {"seed": self.config.seed}
+        return {"config_text": self.text, "config": self.resolved, "seeds": seeds, "data": list(data)}
 
 
 def values_in(path: str | Path, overrides: Iterable[str] = ()) -> tuple[dict[str, Any], Path]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import PurePath
 from typing import Annotated, Any, Literal
 
 import torch
@@ -11,12 +10,13 @@ from pydantic import BeforeValidator, Field
 from torch import Tensor
 
 from fdi_torch.capacity import expect_room
-from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.problems import ConfigError, naming
 from fdi_torch.config.recording_config import StartLevels
-from fdi_torch.config.strict import Amount, Decibel, Seconds, Strict, quantity
+from fdi_torch.config.strict import Amount, Decibel, Seconds, Strict, quantity_at
 from fdi_torch.names import shortened, unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
+from fdi_torch.simulate.resampling import interpolate
 from fdi_torch.simulate.simulated_recording import noise_level
 
 
@@ -94,18 +94,9 @@ def planned_recording(config: SimulationConfig, plant: PlantDescription) -> Reco
     if missing:
         raise ConfigError([f"simulate.inputs: expected every channel of the plant, got none for {', '.join(missing)}"])
     columns = [_series(name, config.inputs[name], unit, time, config) for name, unit in units.items()]
-    sensors = plant.sensors
-    return Recording(
-        time=time,
-        inputs=torch.stack(columns, dim=1) if columns else time.new_zeros(len(time), 0),
-        outputs=time.new_full((len(time), len(sensors)), float("nan")),
-        input_names=tuple(units),
-        output_names=tuple(sensor.column for sensor in sensors),
-        input_units=tuple(units.values()),
-        output_units=tuple(sensor.unit for sensor in sensors),
-        hold=config.hold,
-        source=str(PurePath("simulated")),
-    )
+    inputs = torch.stack(columns, dim=1) if columns else time.new_zeros(len(time), 0)
+    unread = time.new_full((len(time), len(plant.sensors)), torch.nan)
+    return plant.recording(time, inputs, unread, hold=config.hold, source="simulated")
 
 
 def noise_std(config: NoiseConfig, plant: PlantDescription, clean: Tensor) -> Tensor:
@@ -113,7 +104,7 @@ def noise_std(config: NoiseConfig, plant: PlantDescription, clean: Tensor) -> Te
 
     From the signal-to-noise ratio, or as configured.
     """
-    names = [sensor.column for sensor in plant.sensors]
+    names = plant.outputs()
     std = clean.new_zeros(len(names))
     if config.snr_db is not None:
         std = noise_level(clean, config.snr_db, config.definition)
@@ -125,7 +116,7 @@ def noise_std(config: NoiseConfig, plant: PlantDescription, clean: Tensor) -> Te
     for name, value in config.std.items():
         if name not in names:
             raise ConfigError([f"simulate.noise.std.{name}: {unknown('an output of the plant', name, names)}"])
-        std[names.index(name)] = _amount(f"simulate.noise.std.{name}", value, plant.sensors[names.index(name)].unit)
+        std[names.index(name)] = quantity_at(f"simulate.noise.std.{name}", value, plant.sensors[names.index(name)].unit)
     return std
 
 
@@ -133,10 +124,8 @@ def _expect_room_for_samples(config: SimulationConfig, plant: PlantDescription) 
     samples = config.duration / config.sample_time
     what = f"{samples:.3g} samples, one every {config.sample_time:g} s for {config.duration:g} s"
     columns = 1 + len(plant.channel_units()) + len(plant.sensors)
-    try:
+    with naming("simulate"):
         expect_room(columns * samples, what, "simulate a shorter time, or sample more slowly")
-    except ValueError as error:
-        raise ConfigError([f"simulate: {error}"]) from error
 
 
 def _clock(config: SimulationConfig, plant: PlantDescription) -> Tensor:
@@ -153,30 +142,13 @@ def _series(name: str, config: InputConfig, unit: str, time: Tensor, run: Simula
     if (config.value is None) == (not config.steps):
         raise ConfigError([f"{place}: expected either value or steps, got {'neither' if not config.steps else 'both'}"])
     if config.value is not None:
-        return torch.full_like(time, _amount(place, config.value, unit))
+        return torch.full_like(time, quantity_at(place, config.value, unit))
     times = torch.tensor([t for t, _ in config.steps], dtype=torch.float64)
-    values = torch.tensor([_amount(f"{place}.steps", v, unit) for _, v in config.steps], dtype=torch.float64)
+    values = torch.tensor([quantity_at(f"{place}.steps", v, unit) for _, v in config.steps], dtype=torch.float64)
     if float(times[0]) != 0.0 or not bool((torch.diff(times) > 0).all()):
         raise ConfigError([f"{place}.steps: expected times that start at 0 s and increase, got {times.tolist()}"])
     if run.hold == "linear":
-        return _interpolated(time, times, values)
+        return interpolate(time, times, values)
     if bool(((times / run.sample_time - (times / run.sample_time).round()).abs() > 1e-9).any()):
         raise ConfigError([f"{place}.steps: expected times at samples (every {run.sample_time:g} s), got others"])
     return values[torch.searchsorted(times, time + 1e-9 * run.sample_time, right=True) - 1]
-
-
-def _interpolated(time: Tensor, times: Tensor, values: Tensor) -> Tensor:
-    """Linear interpolation of the given points, constant after the last."""
-    if len(times) == 1:
-        return values.expand_as(time).clone()
-    right = torch.searchsorted(times, time, right=True).clamp(1, len(times) - 1)
-    left = right - 1
-    share = ((time - times[left]) / (times[right] - times[left])).clamp(max=1.0)
-    return values[left] + share * (values[right] - values[left])
-
-
-def _amount(place: str, value: Amount, unit: str) -> float:
-    try:
-        return quantity(value, unit)
-    except ValueError as error:
-        raise ConfigError([f"{place}: {error}"]) from error

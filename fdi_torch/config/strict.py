@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AllowInfNan, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.fields import FieldInfo
 
-from fdi_torch.config.problems import UnknownKeyError
+from fdi_torch.config.problems import UnknownKeyError, naming
 from fdi_torch.names import unknown
 from fdi_torch.quantities import parse_quantity
 from fdi_torch.recording import LARGEST
@@ -47,6 +47,12 @@ def quantity(value: Any, unit: str) -> float:
     if not abs(number) <= LARGEST:
         raise ValueError(f"expected a quantity in {unit} within {LARGEST:g}, got {value}")
     return number
+
+
+def quantity_at(place: str, value: Any, unit: str) -> float:
+    """As `quantity`; an error names the place of the value."""
+    with naming(place):
+        return quantity(value, unit)
 
 
 def _held(value: Any) -> float:

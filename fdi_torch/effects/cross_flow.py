@@ -42,7 +42,7 @@ class CrossFlow(Effect):
         )
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        first, second = (operating_range.levels[tank] for tank in place.split("-"))
+        first, second = (operating_range.levels[tank] for tank in plant.tanks_at(place))
         highest = min(max(first[1], second[1]), _lowest_rim(place, plant))
         heights = interior_points((0.0, highest), 2)
         narrow = {"size": 0.1, "transition_head": 0.05 * NARROWEST * _lowest_rim(place, plant)}
@@ -58,4 +58,4 @@ class CrossFlow(Effect):
 
 def _lowest_rim(place: str, plant: PlantDescription) -> float:
     """Upper limit of the path's height, m: just below the lower of both rims."""
-    return 0.95 * min(t.height for t in plant.tanks if t.name in place.split("-"))
+    return 0.95 * min(t.height for t in map(plant.tank, plant.tanks_at(place)))

@@ -250,10 +250,7 @@ def levels_shown_first(plant: PlantDescription, network: TankNetwork, recording:
     """Level of each tank, m, from the median of its sensor's first readings; None for a tank without readings."""
     readings, observed_tanks = [], set()
     for sensor in plant.sensors:
-        valid = recording.outputs[:0, 0]
-        if sensor.column in recording.output_names:
-            column = recording.output_names.index(sensor.column)
-            valid = recording.outputs[:, column][recording.mask[:, column]][:FIRST_READINGS]
+        valid = recording.valid_readings(sensor.column)[:FIRST_READINGS]
         observed_tanks |= {sensor.tank} if len(valid) else set()
         readings.append(valid.median() if len(valid) else network.nominal.new_tensor(torch.nan))
     values = network.bind(ParameterSpace(), network.nominal.new_zeros(0))
@@ -265,9 +262,8 @@ def levels_shown_first(plant: PlantDescription, network: TankNetwork, recording:
 
 def _expect_variation(recording: Recording, plant: PlantDescription) -> None:
     """Raise ValueError if the valid readings of a sensor are constant: their correlation is undefined."""
-    for sensor in (s for s in plant.sensors if s.column in recording.output_names):
-        column = recording.output_names.index(sensor.column)
-        readings = recording.outputs[recording.mask[:, column], column]
+    for sensor in plant.sensors:
+        readings = recording.valid_readings(sensor.column)
         if len(readings) and bool((readings == readings[0]).all()):
             value = quantity_text(float(readings[0]), sensor.unit, 6, sensor.column)
             raise ValueError(

@@ -72,7 +72,7 @@ def unexplained_ratio(rms: torch.Tensor, values: torch.Tensor, weight: torch.Ten
 
 
 def least_noise(values: Float[torch.Tensor, "S C"], weight: Float[torch.Tensor, "S C"]) -> Float[torch.Tensor, " C"]:
-    """The least noise (C,) of such readings: of rounding, and the error of simulated readings.
+    """The least standard deviation (C,) that such readings can have: that of their rounding or of simulated readings.
 
     Rounding in steps of q adds q^2 / 12 to the variance of the readings, which second differences of a slow level do
     not show.

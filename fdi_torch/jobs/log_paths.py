@@ -70,6 +70,14 @@ def find_unfinished(folder: Path, name: str, text: str) -> tuple[Path, Log | Non
     return path, unfinished(path)
 
 
+def expect_unfinished(folder: Path, name: str, text: str) -> tuple[Path, Log | None]:
+    """As `find_unfinished`. Raises ValueError if there is no log of that name either."""
+    unfinished = find_unfinished(folder, name, text)
+    if unfinished is None:
+        raise ValueError(f"{folder}: expected an unfinished log {name}.mcap, got none; start without --resume")
+    return unfinished
+
+
 def _logs_of(folder: Path, name: str) -> list[Path]:
     """NAME.mcap, NAME_2.mcap ... and their `.partial` files; each log comes after its `.partial` file."""
     pattern = re.compile(re.escape(name) + r"(_\d+)?\.mcap(\.partial)?")
@@ -77,7 +85,7 @@ def _logs_of(folder: Path, name: str) -> list[Path]:
 
 
 def _has_ended(path: Path, log: Log | None) -> bool:
-    status = {} if log is None or path.suffix == ".partial" else log.metadata.get("fdi_torch.status", {})
+    status = {} if log is None or path.suffix == ".partial" else log.about("status")
     return status.get("status") in ENDED
 
 
@@ -94,10 +102,7 @@ def _read_log(path: Path) -> Log | None:
 
 def unfinished_search(folder: Path, run: Run) -> tuple[Path, tuple[Message, ...], Search | None]:
     """Path of the log to write, and messages and search state of an unfinished run at its last complete generation."""
-    unfinished = find_unfinished(folder, run.name, run.text)
-    if unfinished is None:
-        raise ValueError(f"{folder}: expected an unfinished log {run.name}.mcap, got none; start without --resume")
-    path, before = unfinished
+    path, before = expect_unfinished(folder, run.name, run.text)
     state = None if before is None else last_state(before)
     if before is None or state is None:
         return path, (), None

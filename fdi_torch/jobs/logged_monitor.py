@@ -241,7 +241,7 @@ class LoggedMonitor:
     def _log_samples(self, samples: Samples, residuals: Tensor | None) -> None:
         """Log samples, and the rows of `_residual_rows` if they have been tested."""
         units, chart = self.plant.channel_units(), self.monitor.detector.chart
-        names, sensor_units = [s.column for s in self.plant.sensors], [s.unit for s in self.plant.sensors]
+        names, sensor_units = self.plant.outputs(), [s.unit for s in self.plant.sensors]
         mask, readings = samples.readings.isfinite(), torch.nan_to_num(samples.readings, nan=torch.nan)
         signals: list[tuple[Any, ...]] = [
             ("/plant/input", as_array(samples.inputs), list(units), list(units.values()), None, {"hold": samples.hold}),
@@ -256,7 +256,7 @@ class LoggedMonitor:
 def _positions(clock: Sequence[float], times: Sequence[tuple[float, bool]]) -> list[int]:
     """Index on the clock of each of the times, which follow it in order; True: after that of the time before.
 
-    The clock may jump back, which causes a notice. Each notice belongs to a sample of its own.
+    The clock may jump back, which causes a notice. No two notices belong to one sample.
     """
     positions, k = [], -1
     for time_of_item, is_later in times:

@@ -27,7 +27,7 @@ def log_prediction(log: RunLog, recording: Recording, predicted: Any, group: str
 
 def logged_recording(log: LoggedRun, group: str, number: int) -> Recording:
     """A logged recording with name and hash of its original file."""
-    signals, about = own_signals(log, group), log.metadata.get("fdi_torch.data", {})
+    signals, about = own_signals(log, group), log.about("data")
     time, inputs, outputs = (torch.as_tensor(a) for a in (signals.time, signals.inputs, signals.outputs))
     names = (*signals.input_names, *signals.output_names)
     stamped = about.get(f"{number}.began")

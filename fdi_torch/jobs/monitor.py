@@ -14,7 +14,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 from fdi_torch.clock import clock_text, show_clock
 from fdi_torch.config.growing_recordings import Row, growing_rows
@@ -23,7 +22,7 @@ from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.jobs.event_messages import event_key
 from fdi_torch.jobs.live_batches import DelayWatch, LiveBatches
-from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path, partial_path
+from fdi_torch.jobs.log_paths import RESUMES, expect_unfinished, free_path, partial_path
 from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.monitor_rows import (
     ALARM,
@@ -35,7 +34,6 @@ from fdi_torch.jobs.monitor_rows import (
 )
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook import RunLog
-from fdi_torch.recording import Recording
 
 IDLE = 60.0
 """Time without a sample after which a growing file counts as complete, s."""
@@ -78,7 +76,8 @@ def run_monitor(
         if unfinished is not None:
             os.replace(unfinished.path, partial_path(path))  # for the next attempt to resume
         raise
-    with RunLog(path, "monitor", **origin_of(run, whole), listener=callbacks.log, after_interruption=RESUMES) as log:
+    records = run.log_records([] if whole is None else [whole.origin])
+    with RunLog(path, "monitor", **records, listener=callbacks.log, after_interruption=RESUMES) as log:
         monitor = LoggedMonitor(run, log, callbacks, reported)
         try:
             if whole is None:
@@ -94,25 +93,10 @@ def run_monitor(
     return MonitorSummary(monitor.events, monitor.lasted, monitor.spent, path)
 
 
-def origin_of(run: MonitorRun, whole: Recording | None) -> dict[str, Any]:
-    """Configuration, seed and data of a run, as its log records them."""
-    return {
-        "config_text": run.text,
-        "config": run.resolved,
-        "seeds": {"seed": run.config.seed},
-        "data": [] if whole is None else [whole.origin],
-    }
-
-
 def _log_to_write(run: MonitorRun, resume: bool) -> tuple[Path, LoggedRun | None]:
     """Path of the log to write, and with `resume` the unfinished log to continue."""
     folder = Path(run.config.output.folder)
-    if not resume:
-        return free_path(folder, run.name), None
-    unfinished = find_unfinished(folder, run.name, run.text)
-    if unfinished is None:
-        raise ValueError(f"{folder}: expected an unfinished log {run.name}.mcap, got none; start without --resume")
-    return unfinished
+    return expect_unfinished(folder, run.name, run.text) if resume else (free_path(folder, run.name), None)
 
 
 def _source(

@@ -62,17 +62,8 @@ def recording_of_rows(rows: Sequence[Row], run: MonitorRun) -> Recording:
     unique = [rows[0], *(after for before, after in pairwise(rows) if after[0] != before[0])]
     jumps = [k for k in range(1, len(unique)) if unique[k][0] < unique[k - 1][0]]
     samples = samples_of_rows(unique[jumps[-1] if jumps else 0 :], run)
-    plant = run.plant
-    return Recording(
-        samples.time,
-        samples.inputs,
-        samples.readings,
-        tuple(plant.channels()),
-        tuple(sensor.column for sensor in plant.sensors),
-        tuple(plant.channel_units().values()),
-        tuple(sensor.unit for sensor in plant.sensors),
-        hold=samples.hold,
-        source=run.config.recording.file,
+    return run.plant.recording(
+        samples.time, samples.inputs, samples.readings, hold=samples.hold, source=run.config.recording.file
     )
 
 

@@ -140,14 +140,13 @@ class FreeRun(Shown):
     @in_its_units
     def picture(self) -> str:
         """Measured and predicted readings, as SVG."""
-        columns = [sensor.column for sensor in self.plant.sensors]
-        figure = fit_figure(self.recording, {self.plant.name: self.prediction.readings}, self.headline, columns)
+        predictions = {self.plant.name: self.prediction.readings}
+        figure = fit_figure(self.recording, predictions, self.headline, self.plant.outputs())
         return notebook_svg(figure, "free-run", self.headline)
 
     def to_xarray(self) -> Any:
         """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI."""
-        columns = [sensor.column for sensor in self.plant.sensors]
-        return self.recording.selected((), columns).compared(self.prediction.readings)
+        return self.recording.selected((), self.plant.outputs()).compared(self.prediction.readings)
 
 
 @dataclass(frozen=True, repr=False)

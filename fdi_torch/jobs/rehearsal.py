@@ -39,16 +39,8 @@ def rehearse(
     folder = Path(rehearsal.config.output.folder)
     path, before = new_and_unfinished_log(folder, rehearsal.name, rehearsal.text, resume)
     tasks = [task for plan in rehearsal.plans for task in plan.tasks()]
-    seeds = {"seed": rehearsal.config.seed}
-    with RunLog(
-        path,
-        "rehearsal",
-        config_text=rehearsal.text,
-        config=rehearsal.resolved,
-        seeds=seeds,
-        listener=listener,
-        after_interruption=RESUMES,
-    ) as log:
+    records = rehearsal.log_records()
+    with RunLog(path, "rehearsal", **records, listener=listener, after_interruption=RESUMES) as log:
         results: dict[int, tuple[str, Mapping[str, Any]]] = {
             n: (done.setting, done.numbers) for n, done in copied_trials(log, before).items()
         }

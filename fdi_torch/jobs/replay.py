@@ -13,7 +13,6 @@ from fdi_torch.config.run_file import Run, build_run
 from fdi_torch.config.study_file import build_study
 from fdi_torch.config.yaml_files import with_overrides
 from fdi_torch.gap.diagnose import Settings
-from fdi_torch.jobs import monitor as monitor_job
 from fdi_torch.jobs import study as study_job
 from fdi_torch.jobs.gap import groups, run_gap
 from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
@@ -21,7 +20,7 @@ from fdi_torch.jobs.logged_recordings import logged_recording
 from fdi_torch.jobs.monitor_rows import logged_items, recording_of_rows, rows_until
 from fdi_torch.jobs.run_setup import fitting_of, requested_space
 from fdi_torch.jobs.study import TRIAL, log_summary, log_trials
-from fdi_torch.jobs.train import STATE, estimate_logged, log_recordings, origin_of, state_is_due
+from fdi_torch.jobs.train import STATE, estimate_logged, log_recordings, state_is_due
 from fdi_torch.logbook import LogError, Message, RunLog, series
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook.replay import Select
@@ -40,7 +39,7 @@ def repeat_run(
     Returns the new log's path. trials: of a study, only these; by default all logged ones. Raises LogError for other
     logs, ConfigError for an invalid configuration, ValueError for overrides of the data and for unknown trials.
     """
-    about = log.metadata.get("fdi_torch.run", {})
+    about = log.about("run")
     kind, parent = about.get("kind", ""), about.get("run_id", "")
     tell = tell or (lambda share, text: None)
     if trials and kind != "study":
@@ -69,7 +68,8 @@ def replay_estimate(log: LoggedRun, path: Path, overrides: Iterable[str], tell: 
         )
     space, loaded = requested_space(run), logged_recordings(log, run)
     fitting = fitting_of(run, space, loaded)
-    with RunLog(path, "train", **origin_of(run, loaded), parent_run_id=parent) as again:
+    records = run.log_records(part.recording.origin for part in loaded)
+    with RunLog(path, "train", **records, parent_run_id=parent) as again:
         log_recordings(again, loaded, logged_truth(log))
         estimate_logged(run, fitting, again, tell)
 
@@ -82,9 +82,9 @@ def replay_monitor(log: LoggedRun, path: Path, overrides: Iterable[str], tell: T
     callbacks = MonitorCallbacks(tell, lambda event: None, lambda prepared: None)
     items = logged_items(log, run)
     rows = [item for item in items if not isinstance(item, str)]
-    about = log.metadata.get("fdi_torch.data", {})
+    about = log.about("data")
     data = [{"path": about["0.path"], "sha256": about.get("0.sha256", "")}] if "0.path" in about else []
-    with RunLog(path, "monitor", **monitor_job.origin_of(run, None) | {"data": data}, parent_run_id=parent) as again:
+    with RunLog(path, "monitor", **run.log_records(data), parent_run_id=parent) as again:
         monitor = LoggedMonitor(run, again, callbacks)
         monitor.learn(recording_of_rows(rows_until(rows, run.config.fault_free[1]) or rows, run))
         monitor.process_items(items)
@@ -193,8 +193,8 @@ def replay_gap(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell,
     overrides: changed settings, such as library=pump_lag,leak@T1, leave_out=pump_lag, step=0.5, named_only=true.
     """
     settings = settings_of(log, overrides)
-    sources = [name for name in log.metadata.get("fdi_torch.data", {}) if name.endswith(".path")]
-    diagnosed = int(log.metadata.get("fdi_torch.config", {}).get("recordings", 1))
+    sources = [name for name in log.about("data") if name.endswith(".path")]
+    diagnosed = int(log.about("config").get("recordings", 1))
     names = groups(max(len(sources) - diagnosed, 0), diagnosed)
     recordings = [logged_recording(log, group, k) for k, group in enumerate(names)]
     run_gap(path, logged_plant(log), recordings[:diagnosed], recordings[diagnosed:], settings, tell, parent)

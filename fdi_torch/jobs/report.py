@@ -105,7 +105,7 @@ def plant_of(log: Run, notes: list[str]) -> PlantDescription | None:
     """The logged plant. None, with a note, if it cannot be read, and None for a blind benchmark, which
     has many rigs.
     """
-    if log.metadata.get("fdi_torch.run", {}).get("kind") == "challenge":
+    if log.about("run").get("kind") == "challenge":
         return None
     try:
         return logged_plant(log)

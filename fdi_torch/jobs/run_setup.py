@@ -9,7 +9,7 @@ import torch
 
 from fdi_torch.config.estimation import EstimationConfig, estimated_space, parameter_values, placements_of
 from fdi_torch.config.loaded_recordings import LoadedRecording, load_recordings
-from fdi_torch.config.problems import ConfigError, naming_source
+from fdi_torch.config.problems import ConfigError, naming, naming_source
 from fdi_torch.config.run_file import Run
 from fdi_torch.config.simulation import noise_std, planned_recording
 from fdi_torch.device import usable_device
@@ -99,10 +99,8 @@ def requested_space(run: Run) -> ParameterSpace:
         raise ValueError(
             f"{run.source}: estimate.parameters: expected at least one, got none; name some, as in T1.leak"
         )
-    try:
+    with naming(f"{run.source}: estimate.parameters"):
         network = build_network(run.plant, placements_of([p.name for p in config.parameters], run.plant))
-    except ValueError as error:
-        raise ConfigError([f"{run.source}: estimate.parameters: {error}"]) from error
     with naming_source(run.source):
         return estimated_space(config, network.constants, run.plant, bool(run.config.recordings))
 

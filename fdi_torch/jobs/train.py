@@ -114,7 +114,8 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False, listener: Li
     truth = simulated_truth(run)
     folder = Path(run.config.output.folder)
     path, before, search = unfinished_search(folder, run) if resume else (free_path(folder, run.name), (), None)
-    with RunLog(path, "train", **origin_of(run, loaded), listener=listener, after_interruption=RESUMES) as log:
+    records = run.log_records(part.recording.origin for part in loaded)
+    with RunLog(path, "train", **records, listener=listener, after_interruption=RESUMES) as log:
         if not log.carry_over(before):
             log_recordings(log, loaded, truth)
         result, profiles = estimate_logged(run, fitting, log, tell, search)
@@ -141,16 +142,6 @@ def estimate_logged(
         group = group_of(k, len(fitting.recordings))
         log_prediction(log, recording, predicted, group, result.estimate.noise_std)
     return result, profiles
-
-
-def origin_of(run: Run, loaded: Sequence[LoadedRecording]) -> dict[str, Any]:
-    """Configuration, seed and data of a run, as its log records them."""
-    return {
-        "config_text": run.text,
-        "config": run.resolved,
-        "seeds": {"seed": run.config.seed},
-        "data": [part.recording.origin for part in loaded],
-    }
 
 
 class SearchLogger:

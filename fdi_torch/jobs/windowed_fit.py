@@ -17,7 +17,7 @@ from fdi_torch.effects import without_startup_effects
 from fdi_torch.estimate.windows import Stretch, Window, cut_up, noise_of, stretches_of, window_of, window_step
 from fdi_torch.jobs.log_paths import STARTS_OVER, free_path
 from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, requested_space
-from fdi_torch.jobs.train import log_recordings, origin_of
+from fdi_torch.jobs.train import log_recordings
 from fdi_torch.logbook import RunLog
 from fdi_torch.parameters import is_effect_parameter
 
@@ -48,7 +48,8 @@ def fit_windows(run: Run, tell: Callable[[float, str], None] = lambda share, tex
     suspects = {p.name for p in space if is_effect_parameter(p.name)}
     free: dict[str, StartLevel] = dict.fromkeys((t.name for t in run.plant.tanks), "free")
     path = free_path(Path(run.config.output.folder), run.name)
-    with RunLog(path, "train", **origin_of(run, loaded), after_interruption=STARTS_OVER) as log:
+    records = run.log_records(part.recording.origin for part in loaded)
+    with RunLog(path, "train", **records, after_interruption=STARTS_OVER) as log:
         log_recordings(log, loaded, {})
         noise = [noise_of(part.recording, run.plant) for part in loaded]
         cuts = [(c, std) for part, std in zip(loaded, noise, strict=True) for c in cut_up(part.recording, length)]

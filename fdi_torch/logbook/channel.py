@@ -15,3 +15,8 @@ class Channel:
     schema_encoding: str = ""
     schema_data: bytes = field(default=b"", hash=False)  # too long to be hashed for each message
     metadata: tuple[tuple[str, str], ...] = field(default=(), hash=False)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The SI unit of each field that has one."""
+        return {key.removeprefix("unit."): unit for key, unit in self.metadata if key.startswith("unit.")}

@@ -126,14 +126,14 @@ def chi2_p_value(values: Sequence[float], std: Sequence[float]) -> float:
 
 
 def _differing(runs: Sequence[Run], section: str) -> dict[str, tuple[str, ...]]:
-    records = [run.metadata.get(f"fdi_torch.{section}", {}) for run in runs]
+    records = [run.about(section) for run in runs]
     keys = dict.fromkeys(key for record in records for key in record if key not in _WALL.get(section, ()))
     table = {key: tuple(record.get(key, "") for record in records) for key in keys}
     return {key: texts for key, texts in table.items() if len(set(texts)) > 1}
 
 
 def _hashes(run: Run) -> dict[str, str]:
-    return {key: text for key, text in run.metadata.get("fdi_torch.data", {}).items() if key.endswith("sha256")}
+    return {key: text for key, text in run.about("data").items() if key.endswith("sha256")}
 
 
 def _results(runs: Sequence[Run]) -> tuple[Result, ...]:

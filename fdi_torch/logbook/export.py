@@ -91,7 +91,7 @@ def _columns(messages: Sequence[Message]) -> tuple[list[str], dict[str, str]]:
     units: dict[str, str] = {}
     for message in messages:
         names.update(dict.fromkeys(message.payload))
-        units.update((k.removeprefix("unit."), v) for k, v in message.channel.metadata if k.startswith("unit."))
+        units |= message.channel.units
     return sorted(names, key=lambda name: name != "t"), units
 
 

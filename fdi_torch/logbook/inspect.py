@@ -11,7 +11,6 @@ from pathlib import Path
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Statistics
 
-from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.reader import Attachment, Message, Run, read_run
 from fdi_torch.logbook.scan import Damage, Frame, body_of, stream_of
 
@@ -102,14 +101,10 @@ def _topics(run: Run) -> dict[str, TopicInfo]:
     topics: dict[str, TopicInfo] = {}
     for message in run.messages():
         if message.topic not in topics:
-            topics[message.topic] = _info(message.channel)
+            channel = message.channel
+            topics[message.topic] = TopicInfo(channel.topic, channel.schema_name, channel.encoding, channel.units)
         topics[message.topic].count(message)
     return topics
-
-
-def _info(channel: Channel) -> TopicInfo:
-    units = {k.removeprefix("unit."): v for k, v in channel.metadata if k.startswith("unit.")}
-    return TopicInfo(channel.topic, channel.schema_name, channel.encoding, units)
 
 
 def _ending(run: Run) -> Iterator[str]:

@@ -75,11 +75,11 @@ def numeric_fields(run: Run) -> dict[str, dict[str, str]]:
         if channel in seen or not _PLAIN_TOPIC.fullmatch(channel.topic):
             continue
         seen.add(channel)
-        units = dict(channel.metadata)
+        units = channel.units
         known = fields.setdefault(channel.topic, {})
         for name, part in _properties(channel.schema_data).items():
             if part.get("type") in ("number", "integer") and _PLAIN.fullmatch(name):
-                known[name] = units.get(f"unit.{name}", "")
+                known[name] = units.get(name, "")
     return fields
 
 

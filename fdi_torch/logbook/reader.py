@@ -94,9 +94,13 @@ class Run:
 
     def __repr__(self) -> str:
         """What was run, when, and how it ended."""
-        run, status = (self.metadata.get(f"fdi_torch.{name}", {}) for name in ("run", "status"))
+        run, status = self.about("run"), self.about("status")
         started, ended = run.get("started", "at an unknown time")[:19], status.get("status", "unfinished")
         return f"{self.path}: {run.get('kind', 'a log of another program')}, started {started}, {ended}"
+
+    def about(self, record: str) -> dict[str, str]:
+        """A metadata record of this program, such as "status"; empty if the log has none."""
+        return self.metadata.get(f"fdi_torch.{record}", {})
 
     @property
     def ours(self) -> bool:

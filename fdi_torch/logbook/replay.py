@@ -105,7 +105,7 @@ def compare_events(
 
 def version_changes(run: Run, now: Mapping[str, str]) -> dict[str, tuple[str, str]]:
     """Differences of the environment since the log was written."""
-    then = run.metadata.get("fdi_torch.env", {})
+    then = run.about("env")
     names = dict.fromkeys([*then, *now])
     return {name: (then.get(name, ""), now.get(name, "")) for name in names if then.get(name, "") != now.get(name, "")}
 

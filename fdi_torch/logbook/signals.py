@@ -195,8 +195,8 @@ def _names(channel: Channel) -> tuple[str, ...]:
 
 
 def _units(channel: Channel) -> tuple[str, ...]:
-    metadata = dict(channel.metadata)
-    return tuple(metadata.get(f"unit.{name}", "") for name in _names(channel))
+    units = channel.units
+    return tuple(units.get(name, "") for name in _names(channel))
 
 
 def _own_table(run: Run, channel: Channel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -18,27 +18,27 @@ class Topic:
     schema: str
     meaning: str
     fields: Mapping[str, tuple[Kind, str, str]] = field(default_factory=dict)
-    named: bool = False
+    named: bool = True
 
 
 _EVENT: dict[str, tuple[Kind, str, str]] = {"problem": ("integer", "", "which of the batched problems")}
 
 TOPICS: dict[str, Topic] = {
-    "/plant/input": Topic("fdi_torch.plant_input", "what was commanded", named=True),
+    "/plant/input": Topic("fdi_torch.plant_input", "what was commanded"),
     "/plant/output": Topic(
         "fdi_torch.plant_output",
         "what was read",
         {"masked": ("texts", "", "readings that do not count")},
-        named=True,
     ),
-    "/plant/truth": Topic("fdi_torch.plant_truth", "true states and faults of a simulated plant", named=True),
+    "/plant/truth": Topic("fdi_torch.plant_truth", "true states and faults of a simulated plant"),
     "/source/clock": Topic(
         "fdi_torch.source_clock",
         "the clock of a live source",
         {"origin": ("number", "s", "time 0 of the plant, since 1970-01-01 UTC")},
+        named=False,
     ),
     "/observer/residual": Topic(
-        "fdi_torch.residual", "reading less observer's output; *_statistic, *_threshold where tested", named=True
+        "fdi_torch.residual", "reading less observer's output; *_statistic, *_threshold where tested"
     ),
     "/observer/alarm": Topic(
         "fdi_torch.alarm",
@@ -51,7 +51,6 @@ TOPICS: dict[str, Topic] = {
             "onset": ("number", "s", "estimated time of the change"),
             "message": ("text", "", "the event in words"),
         },
-        named=True,
     ),
     "/estimator/de/generation": Topic(
         "fdi_torch.generation",
@@ -64,13 +63,11 @@ TOPICS: dict[str, Topic] = {
             "spread": ("number", "", "spread of the population"),
             "evaluations": ("integer", "", "simulations so far"),
         },
-        named=True,
     ),
     "/estimator/de/population": Topic(
         "fdi_torch.population",
         "state of the search: arrays as base64 of little-endian bytes, each with *_shape and *_dtype",
         {**_EVENT, "generation": ("integer", "", "0 is the first population")},
-        named=True,
     ),
     "/estimator/refine/iteration": Topic(
         "fdi_torch.refine_iteration",
@@ -84,7 +81,6 @@ TOPICS: dict[str, Topic] = {
             "damping": ("number", "", "Levenberg-Marquardt damping"),
             "accepted": ("boolean", "", "was the step taken?"),
         },
-        named=True,
     ),
     "/estimate/final": Topic(
         "fdi_torch.estimate",
@@ -102,15 +98,11 @@ TOPICS: dict[str, Topic] = {
             "at_bound": ("texts", "", "parameters at a bound"),
             "unidentifiable": ("texts", "", "directions the data do not determine"),
         },
-        named=True,
     ),
-    "/estimate/output": Topic(
-        "fdi_torch.estimated_output", "readings that the model predicts at the estimate", named=True
-    ),
+    "/estimate/output": Topic("fdi_torch.estimated_output", "readings that the model predicts at the estimate"),
     "/estimate/residual": Topic(
         "fdi_torch.estimate_residual",
         "reading less prediction at the estimate; *_low, *_high: 95 % band of the noise, where its level is known",
-        named=True,
     ),
     "/diagnosis/fault": Topic(
         "fdi_torch.fault",
@@ -127,7 +119,6 @@ TOPICS: dict[str, Topic] = {
             "hole_diameter": ("number", "m", "size as equivalent hole"),
             "message": ("text", "", "the finding in words"),
         },
-        named=True,
     ),
     "/gap/where": Topic(
         "fdi_torch.gap_where",
@@ -137,7 +128,6 @@ TOPICS: dict[str, Topic] = {
             "share": ("number", "1", "probability"),
             "p_value": ("number", "1", "of no gap there"),
         },
-        named=True,
     ),
     "/gap/verdict": Topic(
         "fdi_torch.gap_verdict",
@@ -155,7 +145,6 @@ TOPICS: dict[str, Topic] = {
             "certain": ("texts", "", "effect@location, there with 95 % whatever else is"),
             "answer": ("text", "", "the whole answer as JSON text"),
         },
-        named=True,
     ),
     "/study/trial": Topic(
         "fdi_torch.trial",
@@ -166,13 +155,11 @@ TOPICS: dict[str, Topic] = {
             "seed": ("text", "", "its seed"),
             "status": ("text", "", "how it ended"),
         },
-        named=True,
     ),
     "/study/summary": Topic(
         "fdi_torch.summary",
         "a setting of a study, summed up",
         {"group": ("text", "", "setting"), "trials": ("integer", "", "how many")},
-        named=True,
     ),
     "/log": Topic(
         "foxglove.Log",
@@ -185,6 +172,7 @@ TOPICS: dict[str, Topic] = {
             "file": ("text", "", "unused"),
             "line": ("integer", "", "unused"),
         },
+        named=False,
     ),
 }
 

@@ -22,15 +22,22 @@ READING_UNITS = {"1": "m", "Pa/m": "Pa", "V/m": "V", "A/m": "A", "1/m": "1"}
 
 
 def quantity_field(
-    unit: str, meaning: str = "", *, role: str = "", least: float | None = None, most: float | None = None, **given: Any
+    unit: str,
+    meaning: str,
+    *,
+    role: str = "",
+    least: float | None = None,
+    most: float | None = None,
+    none: str | None = None,
+    **given: Any,
 ) -> Any:
     """A dataclass field that holds a quantity of that unit.
 
     meaning: of its key in a plant file. role: 'estimated' for a positive constant that can be estimated and have a
     relative tolerance, 'constant' for one whose value can only be varied. least, most: the values that a file may have.
-    given: further arguments of `dataclasses.field`.
+    none: the word for None. given: further arguments of `dataclasses.field`.
     """
-    metadata = {"unit": unit, "meaning": meaning, "role": role, "least": least, "most": most}
+    metadata = {"unit": unit, "meaning": meaning, "role": role, "least": least, "most": most, "none": none}
     return field(metadata=metadata, **given)
 
 
@@ -58,6 +65,8 @@ class Component:
     def __post_init__(self) -> None:
         for each in fields(self):  # type: ignore[arg-type]
             if "unit" in each.metadata:
+                if getattr(self, each.name) == each.metadata["none"]:
+                    object.__setattr__(self, each.name, None)
                 self._convert(each.name, [each.metadata["unit"]])
 
     @property
@@ -93,16 +102,13 @@ class Tank(Component):
     """
 
     name: str
-    area: float = quantity_field("m^2")
-    height: float = quantity_field("m")
-    start_level: float | None = quantity_field("m", default=None)
-    overflow_to: str = OUTSIDE
-    leak_reference: str | None = None
-
-    def __post_init__(self) -> None:
-        if self.start_level == "equilibrium":  # the word for None in a plant file
-            object.__setattr__(self, "start_level", None)
-        super().__post_init__()
+    area: float = quantity_field("m^2", "cross-section, m^2")
+    height: float = quantity_field("m", "from the floor to the rim, m")
+    start_level: float | None = quantity_field(
+        "m", "level at t = 0, m, or equilibrium (of the first inputs)", none="equilibrium", default=None
+    )
+    overflow_to: str = word_field("the tank that receives the overflow", default=OUTSIDE)
+    leak_reference: str | None = word_field("the pipe whose capacity is a leak of size 1", default=None)
 
 
 @dataclass(frozen=True)

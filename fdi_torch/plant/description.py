@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.components import COMMAND_UNITS, OUTSIDE, READING_UNITS, Component, Sensor, Tank
@@ -17,6 +17,11 @@ from fdi_torch.plant.kinds.pump import Pump
 from fdi_torch.plant.kinds.transfer import Transfer
 from fdi_torch.plant.kinds.weir import Weir
 from fdi_torch.plant.metered_flow import MeteredFlow
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from fdi_torch.recording import Hold, Recording
 
 __all__ = [
     "COMMAND_UNITS",
@@ -158,6 +163,11 @@ class PlantDescription:
         names = [t.name for t in self.tanks]
         return tuple((a, b) for i, a in enumerate(names) for b in names[i + 1 :])
 
+    def tanks_at(self, location: str) -> tuple[str, ...]:
+        """The tank of that name, or the two tanks of a pair 'T1-T2'; none for any other place."""
+        pairs = {f"{a}-{b}": (a, b) for a, b in self.tank_pairs()}
+        return pairs.get(location, tuple(t.name for t in self.tanks if t.name == location))
+
     def locations(self) -> tuple[str, ...]:
         return tuple(c.name for c in self.components()) + tuple(f"{a}-{b}" for a, b in self.tank_pairs())
 
@@ -172,6 +182,23 @@ class PlantDescription:
         for channel, unit in (pair for pair in given if pair is not None):
             units.setdefault(channel, unit)
         return units
+
+    def outputs(self) -> tuple[str, ...]:
+        """The output channels of a recording, in the order of the sensors."""
+        return tuple(sensor.column for sensor in self.sensors)
+
+    def output_units(self) -> dict[str, str]:
+        """SI unit of each output channel."""
+        return {sensor.column: sensor.unit for sensor in self.sensors}
+
+    def recording(
+        self, time: Tensor, inputs: Tensor, outputs: Tensor, *, hold: Hold = "zero_order", source: str = "memory"
+    ) -> Recording:
+        """The recording of all channels of the plant: time (T,) s, inputs (T, M) and outputs (T, N) in SI."""
+        from fdi_torch.recording import Recording  # a module of torch, which plants do without
+
+        units = tuple(self.channel_units().values()), tuple(sensor.unit for sensor in self.sensors)
+        return Recording(time, inputs, outputs, self.channels(), self.outputs(), *units, hold=hold, source=source)
 
 
 def with_tolerances(plant: PlantDescription, kept: Callable[[ParameterName], bool]) -> PlantDescription:
@@ -202,10 +229,10 @@ def _check_names(plant: PlantDescription) -> None:
     if not plant.tanks:
         raise ValueError(f"plant {plant.name}: expected at least one tank, got none; add one under tanks")
     seen: set[str] = {OUTSIDE}
-    for component in plant.components():
-        if component.name in seen:
-            raise ValueError(f"plant {plant.name}: expected each name once, got '{component.name}' twice; rename one")
-        seen.add(component.name)
+    for name in plant.locations():
+        if name in seen:
+            raise ValueError(f"plant {plant.name}: expected each name once, got '{name}' twice; rename one")
+        seen.add(name)
 
 
 def _check_references(plant: PlantDescription) -> None:

@@ -45,10 +45,10 @@ class Effect:
     which it can be placed, of 'pump', 'pipe', 'outlet', 'valve', 'tank', 'tank_pair', 'sensor'; a flow component can
     accept further effects (`FlowComponent.accepts`). memory: number of its memory states, for a COMMAND or READING
     effect whose output depends on the past of its signal alone. states: number of its integrated states, for a FLOW
-    effect coupled to the levels; each is in m and of the order of a level, since one tolerance holds for all. smooth:
-    whether the gradient with respect to its size is non-zero at nominal. mistaken_for: effects that explain nearly the
-    same data. delays: whether it adds dead time to its signal. quantizes: whether it rounds the reading. startup_only:
-    whether it acts only until its component has run for the first time.
+    or BALANCE effect coupled to the levels; each is in m and of the order of a level, since one tolerance holds for
+    all. smooth: whether the gradient with respect to its size is non-zero at nominal. mistaken_for: effects that
+    explain nearly the same data. delays: whether it adds dead time to its signal. quantizes: whether it rounds the
+    reading. startup_only: whether it acts only until its component has run for the first time.
 
     The first parameter is the effect's size: at its nominal value the effect is absent. The others are its shape; their
     nominal values are typical ones, or those that keep the effect simple (onset 0, ramp 0).
@@ -101,13 +101,15 @@ class Effect:
         return flow
 
     def steady_states(self, flow: torch.Tensor, local: Local, p: Values) -> tuple[torch.Tensor, ...]:
-        """FLOW: its states in steady state, m, where the flow before the effect has been `flow` (m^3/s) for a long
-        time.
+        """FLOW, BALANCE: its states in steady state, m, where the flow before the effect has been `flow` (m^3/s) for a
+        long time; at BALANCE it is 0.
         """
         return ()
 
     def state_rates(self, flow: torch.Tensor, local: Local, p: Values) -> tuple[torch.Tensor, ...]:
-        """FLOW: rate of change of each of its states `local.states`, m/s; flow (m^3/s) is the one before the effect."""
+        """FLOW, BALANCE: rate of change of each of its states `local.states`, m/s; flow (m^3/s) is the one before the
+        effect, 0 at BALANCE.
+        """
         return ()
 
     def inflow(self, local: Local, p: Values) -> torch.Tensor:
@@ -150,7 +152,7 @@ class Placement:
 
 def place_kind(plant: PlantDescription, location: str) -> str:
     """'tank', 'sensor', 'tank_pair' or one of a flow kind's `place_kinds`. Raises ValueError for an unknown place."""
-    if location in {f"{a}-{b}" for a, b in plant.tank_pairs()}:
+    if len(plant.tanks_at(location)) == 2:
         return "tank_pair"
     return plant.component(location).place_kind
 

@@ -27,7 +27,7 @@ from fdi_torch.plant.signal_chain import SignalChain
 from fdi_torch.plant.signals import Clock
 
 FlowBefore = tuple[Placement, Tensor, Local]
-"""An effect with states, the flow before it (m^3/s), and its conditions with the states."""
+"""An effect with states, the flow before it (m^3/s; 0 at BALANCE), and its conditions with the states."""
 
 
 class TankNetwork(nn.Module):
@@ -66,12 +66,13 @@ class TankNetwork(nn.Module):
         self._by_place: dict[tuple[str, Stage], list[Placement]] = {}
         for placement in placements:
             self._by_place.setdefault((placement.location, placement.effect.stage), []).append(placement)
+        self._tanks_at = {p.location: self.description.tanks_at(p.location) for p in placements}
         self._with_states = [p for p in placements if p.effect.states]
         self.order = len(self.description.tanks) + sum(p.effect.states for p in self._with_states)
-        sensors = [sensor.name for sensor in self.description.sensors]
         self._actuator_names = [name for name, _ in self.actuators()]
         self._command_chain = SignalChain(Stage.COMMAND, self._actuator_names, placements)
-        self._reading_chain = SignalChain(Stage.READING, sensors, placements)
+        self._reading_chain = SignalChain(Stage.READING, [s.name for s in self.description.sensors], placements)
+        self.command_memory, self.reading_memory = self._command_chain.memory, self._reading_chain.memory
 
     def without_overflow(self) -> TankNetwork:
         """The same plant without the overflow terms, for trajectories that stay below all rims."""
@@ -151,8 +152,11 @@ class TankNetwork(nn.Module):
     def _at_states(self, point: OperatingPoint) -> list[FlowBefore]:
         """Each effect with states, the flow before it and its conditions, in the order of the state vector."""
         places = {p.location for p in self._with_states}
-        components = [component for component in self._first_flows if component.name in places]
-        found = [each for component in components for each in self._through_effects(point, component)[1]]
+        found = [each for c in self._first_flows if c.name in places for each in self._through_effects(point, c)[1]]
+        for placement in self._with_states:
+            if placement.effect.stage is Stage.BALANCE:
+                local = self._at_balance(point, placement)
+                found.append((placement, torch.zeros_like(local.level), local))
         return sorted(found, key=lambda each: self._with_states.index(each[0]))
 
     def commands(
@@ -190,10 +194,8 @@ class TankNetwork(nn.Module):
             local = replace(local, head=placement.effect.head(local.head, local, p))
         flow = component.law(local)
         for placement, p in effects:
-            own = local
+            own = point.with_states(local, placement, flow)
             if placement.effect.states:
-                states = point.states.get(placement.prefix) or placement.effect.steady_states(flow, local, p)
-                own = replace(local, states=states)
                 before.append((placement, flow, own))
             flow = placement.effect.flow(flow, own, p)
         return component.limited(flow, local), before
@@ -266,12 +268,6 @@ class TankNetwork(nn.Module):
     def start_levels(self, values: PlaceValues) -> list[Tensor]:
         return [values[tank.name]["start_level"] for tank in self.description.tanks]
 
-    def command_memory(self) -> int:
-        return self._command_chain.memory
-
-    def reading_memory(self) -> int:
-        return self._reading_chain.memory
-
     def _signals(self, levels: Sequence[Tensor], values: PlaceValues) -> list[Tensor]:
         """The level at each sensor in the sensor's unit."""
         constants = [values[sensor.name] for sensor in self.description.sensors]
@@ -287,12 +283,17 @@ class TankNetwork(nn.Module):
         if target != OUTSIDE:
             net[self._tank_index[target]] = net[self._tank_index[target]] + flow
 
+    def _at_balance(self, point: OperatingPoint, placement: Placement, net: Sequence[Tensor] | None = None) -> Local:
+        """Conditions of a BALANCE effect, with its states. net: inflows that are already computed, m^3/s."""
+        tanks = self._tanks_at[placement.location]
+        local = point.at_tank(tanks[0], tanks[-1], None if net is None else net[self._tank_index[tanks[0]]])
+        return point.with_states(local, placement, torch.zeros_like(local.level))
+
     def transfer_by_effect(self, net: list[Tensor], placement: Placement, point: OperatingPoint) -> None:
         """Add the flow of a BALANCE effect to the net inflows (m^3/s), in place."""
-        location, parameters = placement.location, point.values[placement.prefix]
-        at_tank = location in self._tank_index
-        first, last = (location, location) if at_tank else location.split("-")
-        flow = placement.effect.inflow(point.at_tank(first, last, net[self._tank_index[first]]), parameters)
-        self.transfer(net, *((OUTSIDE, location) if at_tank else (first, last)), flow)
+        parameters = point.values[placement.prefix]
+        flow = placement.effect.inflow(self._at_balance(point, placement, net), parameters)
+        *first, last = self._tanks_at[placement.location]
+        self.transfer(net, first[0] if first else OUTSIDE, last, flow)
         for tank, share in placement.effect.recipients(parameters).items():
             self.transfer(net, tank, OUTSIDE, share * flow)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from fdi_torch.plant.constants import inverse_areas, leak_pipe
 from fdi_torch.plant.description import OUTSIDE, PlantDescription, Tank
+from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.plant.local_conditions import Local, Values
 from fdi_torch.plant.orifice import rim_strength
@@ -114,6 +115,15 @@ class OperatingPoint:
             gravity=self.gravity,
             constants=constants,
         )
+
+    def with_states(self, local: Local, placement: Placement, flow: Tensor) -> Local:
+        """Conditions of an effect with its states: those of this point, else those in steady state. flow: the flow
+        before it, m^3/s.
+        """
+        effect, prefix = placement.effect, placement.prefix
+        if not effect.states:
+            return local
+        return replace(local, states=self.states.get(prefix) or effect.steady_states(flow, local, self.values[prefix]))
 
     def width(self, component: FlowComponent) -> Tensor:
         """Head below which the square root of a component's law is smoothed, m."""

@@ -31,13 +31,13 @@ def expect_fit(plant: PlantDescription, placement: Placement) -> None:
     if not fits(placement.effect, plant, placement.location):
         kinds = " or ".join(place_kinds_of(placement.effect))
         raise ValueError(f"{placement.prefix}: expected a place of kind {kinds}, got {placement.location}")
-    component = plant.component(placement.location) if placement.effect.states else None
-    if component is not None and not (
-        placement.effect.stage is Stage.FLOW
-        and isinstance(component, FlowComponent)
-        and component.order <= FlowOrder.BY_LEVELS
-    ):
+    stage = placement.effect.stage
+    if not placement.effect.states or stage is Stage.BALANCE:
+        return
+    component = plant.component(placement.location)
+    by_levels = isinstance(component, FlowComponent) and component.order <= FlowOrder.BY_LEVELS
+    if stage is not Stage.FLOW or not by_levels:
         raise ValueError(
-            f"{placement.prefix}: expected states only in a FLOW effect of a component whose flow depends on levels "
-            f"and commands alone, got {placement.effect.stage.name} at {placement.location}"
+            f"{placement.prefix}: expected states only in a BALANCE effect, or in a FLOW effect of a component whose "
+            f"flow depends on levels and commands alone, got {stage.name} at {placement.location}"
         )

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from math import isnan
 from pathlib import Path
 
-from fdi_torch.names import shortened
+from fdi_torch.names import nearest, shortened
 from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_cells import BAD, GOOD_WORDS, Columns, Rule
 from fdi_torch.recordings.csv_text import Heading
@@ -109,9 +109,7 @@ def column_of(path: Path, header: Sequence[str], column: str) -> str:
     """
     if column in header:
         return column
-    nearest = difflib.get_close_matches(column, header, n=1, cutoff=0.5)
-    hint = f"; the nearest is {nearest[0]}" if nearest else ""
-    raise ValueError(f"{path}: expected a column '{column}', got {', '.join(header)}{hint}")
+    raise ValueError(f"{path}: expected a column '{column}', got {', '.join(header)}{nearest(column, header)}")
 
 
 def _rule(path: Path, header: Sequence[str], name: str, source: ChannelSource) -> Rule | None:
@@ -143,11 +141,9 @@ def _find_column(path: Path, header: Sequence[str], name: str, column: str | Non
     if matches:
         return matches[0]
     names = {pair[0]: h for h, pair in names_and_units if pair}
-    nearest = difflib.get_close_matches(requested, [*header, *names], n=1, cutoff=0.5)
-    nearest = (
-        [h for h in header if h.lower().startswith(requested.lower())] or nearest if len(requested) > 1 else nearest
-    )
-    hint = f"; the nearest is {shortened(names.get(nearest[0], nearest[0]))}" if nearest else ""
+    longer = [h for h in header if h.lower().startswith(requested.lower())] if len(requested) > 1 else []
+    similar = longer or difflib.get_close_matches(requested, [*header, *names], n=1, cutoff=0.5)
+    hint = f"; the nearest is '{shortened(names.get(similar[0], similar[0]))}'" if similar else ""
     without = ", or give the time between its rows: columns: {t: {period: 50 ms}}" if name == "t" else ""
     raise ValueError(
         f"{path}: expected a column for {name} ('{requested}' or '{requested}_UNIT'), got "

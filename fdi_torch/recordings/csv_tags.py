@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fdi_torch.names import nearest
 from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_binding import Bound, bind_clock, column_of, rule_of
 from fdi_torch.recordings.csv_cells import apply_rule, number_in
@@ -95,11 +95,9 @@ def read_tags(file: FileSource, names: Sequence[str]) -> tuple[Bound, list[Tagge
 def _tagged(path: Path, name: str, source: ChannelSource, rows: _Rows, other_tags: set[str]) -> Tagged:
     tag = source.column or name
     if not rows.time:
-        nearest = difflib.get_close_matches(tag, sorted(other_tags), n=1, cutoff=0.5)
         known = ", ".join(sorted(other_tags)[:12]) or "none"
-        hint = f"; the nearest is {nearest[0]}" if nearest else ""
         raise ValueError(
-            f"{path}: expected rows of the tag {tag} for {name}, got {known}{hint}; "
+            f"{path}: expected rows of the tag {tag} for {name}, got {known}{nearest(tag, sorted(other_tags))}; "
             f"name it under columns: {{{name}: {{column: ..., unit: ...}}}}"
         )
     if source.unit is None:

@@ -23,8 +23,7 @@ def write_csv(recording: Recording, path: Path | str) -> Path:
     inputs = dict(zip(recording.input_names, recording.input_units, strict=True))
     outputs = dict(zip(recording.output_names, recording.output_units, strict=True))
     factors = [unit_factor(si, _file_unit(name, si)) for name, si in (*inputs.items(), *outputs.items())]
-    readings = torch.where(recording.mask, recording.outputs, torch.nan)
-    table = torch.cat([recording.inputs, readings], dim=1).cpu().numpy() * np.asarray(factors)
+    table = torch.cat([recording.inputs, recording.readings], dim=1).cpu().numpy() * np.asarray(factors)
     with replacing(path) as new, new.open("w", encoding="utf-8", newline="") as handle:
         handle.write(header_of(inputs, outputs) + "\n")
         for t, row in zip(recording.time.tolist(), table, strict=True):

@@ -83,14 +83,13 @@ def inputs_not_held(recording: Recording, plant: PlantDescription) -> list[str]:
 
 def _score_of_the_next(recording: Recording, plant: PlantDescription, pump: MeteredFlow) -> float:
     """b[1] of a pump's command over its standard error, in the direction of its flow; least squares."""
-    column = next((s.column for s in plant.sensors if s.tank == pump.near_tank), None)
-    if column not in recording.output_names:
+    sensor = next((s for s in plant.sensors if s.tank == pump.near_tank), None)
+    if sensor is None or sensor.column not in recording.output_names:
         return 0.0
-    channel, rows = recording.output_names.index(column), torch.arange(PAST, len(recording) - 1)
-    readings = torch.where(recording.mask, recording.outputs, torch.nan)[:, channel]
-    gain = next(s.gain for s in plant.sensors if s.column == column)
+    rows = torch.arange(PAST, len(recording) - 1)
+    readings = recording.readings[:, recording.output_names.index(sensor.column)]
     into = 1.0 if pump.target == pump.near_tank else -1.0
-    change = torch.diff(readings)[rows] / torch.diff(recording.time)[rows] * into * math.copysign(1.0, gain)
+    change = torch.diff(readings)[rows] / torch.diff(recording.time)[rows] * into * math.copysign(1.0, sensor.gain)
     command = recording.inputs[:, recording.input_names.index(pump.channel)]
     # The command to come is the last regressor: by QR, its coefficient and variance need the last row of R alone.
     regressors = torch.stack([command[rows + lag] for lag in range(-PAST, 2)], dim=1)
@@ -110,9 +109,7 @@ def _scatter(recording: Recording, plant: PlantDescription, tank: str) -> float:
     """Least noise or resolution of a tank's readings, as a level, m; infinite without a sensor."""
     scatters = [torch.inf]
     for sensor in plant.sensors:
-        if sensor.tank == tank and sensor.column in recording.output_names:
-            column = recording.output_names.index(sensor.column)
-            values = recording.outputs[recording.mask[:, column], column] / sensor.gain
-            if len(values) > 2:
-                scatters.append(max(float(sample_noise(values[:, None])), resolution(values)))
+        values = recording.valid_readings(sensor.column) / sensor.gain
+        if sensor.tank == tank and len(values) > 2:
+            scatters.append(max(float(sample_noise(values[:, None])), resolution(values)))
     return min(scatters)

@@ -37,7 +37,7 @@ def _level_findings(
     sensor: Sensor, plant: PlantDescription, readings: Tensor, time: Tensor
 ) -> Iterator[ChannelFinding]:
     """Findings about the valid readings (K,) of a sensor at the times (K,) s."""
-    rim = next(tank.height for tank in plant.tanks if tank.name == sensor.tank)
+    rim = plant.tank(sensor.tank).height
     levels = (readings - sensor.offset) / sensor.gain
     if not len(levels):
         return

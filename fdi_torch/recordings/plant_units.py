@@ -38,8 +38,8 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Correction:
-    """Numbers that would be right in another unit. names: which numbers. written, right: their unit, and that other
-    one. ratio: of these units. volumes: of the plant with the numbers in the right unit."""
+    """A probable mistake of units. names: the numbers concerned. written, right: the unit they have, and the one they
+    should have. ratio: of these units. volumes: balance of the plant with the numbers in the right unit."""
 
     names: str
     written: str
@@ -99,7 +99,7 @@ def _corrections(plant: PlantDescription, recording: Recording, as_is: Volumes) 
     for right, ratio in _other_units("m^3/s", written):
         slower = replace(as_is, metered=as_is.metered / ratio)
         yield Correction(f"the flows of {', '.join(channels)} are", written, right, ratio, slower)
-    columns = [sensor.column for sensor in plant.sensors]
+    columns = plant.outputs()
     written = _written("m", columns[0], recording)
     for right, ratio in _other_units("m", written):
         corrected = replace(plant, sensors=tuple(replace(s, gain=ratio * s.gain) for s in plant.sensors))
@@ -110,11 +110,9 @@ def _corrections(plant: PlantDescription, recording: Recording, as_is: Volumes) 
 
 def _fits_into_tanks(plant: PlantDescription, recording: Recording) -> bool:
     """Whether no reading shows a level above the rim of its tank, whose height may deviate as other constants do."""
-    heights = {tank.name: tank.height for tank in plant.tanks}
-    for sensor in (s for s in plant.sensors if s.column in recording.output_names):
-        column = recording.output_names.index(sensor.column)
-        readings = recording.outputs[recording.mask[:, column], column]
-        if bool(((readings - sensor.offset) / sensor.gain > (1.0 + DEVIATION) * heights[sensor.tank]).any()):
+    for sensor in plant.sensors:
+        levels = (recording.valid_readings(sensor.column) - sensor.offset) / sensor.gain
+        if bool((levels > (1.0 + DEVIATION) * plant.tank(sensor.tank).height).any()):
             return False
     return True
 

@@ -96,8 +96,7 @@ def _levels(network: TankNetwork, recording: Recording, values: PlaceValues) -> 
     levels = {tank.name: unknown for tank in network.description.tanks}
     for sensor in reversed(network.description.sensors):
         if sensor.column in recording.output_names:
-            i = recording.output_names.index(sensor.column)
-            readings = torch.where(recording.mask[:, i], recording.outputs[:, i], unknown)
+            readings = recording.readings[:, recording.output_names.index(sensor.column)]
             constants = values[sensor.name]
             levels[sensor.tank] = (readings - constants["offset"]) / constants["gain"]
     return list(levels.values())

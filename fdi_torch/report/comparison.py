@@ -13,7 +13,7 @@ from fdi_torch.report.comparison_headline import comparison_headline, left_out_w
 from fdi_torch.report.html import folded, short, table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, shown_unit, with_error
-from fdi_torch.report.predictions import predicted
+from fdi_torch.report.predictions import residuals
 from fdi_torch.report.section import Picture, Section, signals
 from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT
 
@@ -100,11 +100,10 @@ def _residuals(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:
     """Residuals of each sensor, for the runs whose log has predictions."""
     lines: dict[tuple[str, str], list[Line]] = {}
     for label, run, colour in zip(compared.labels, runs, COLOURS, strict=False):
-        recording = run.recordings[0] if run.groups else None
-        model = predicted(run.arrays, 0, len(run.groups) > 1, recording.outputs.shape) if recording else None
-        if recording is None or model is None:
+        residual = residuals(run, 0) if run.groups else None
+        if residual is None:
             continue
-        residual = np.where(recording.mask, recording.outputs - model, np.nan)
+        recording = run.recordings[0]
         for i, name in enumerate(recording.output_names):
             unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
             lines.setdefault((name, unit), []).append(Line(label, recording.time, scale * residual[:, i], colour))

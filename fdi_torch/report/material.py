@@ -54,7 +54,7 @@ class Material:
 
     def about(self, record: str) -> dict[str, str]:
         """A metadata record of ours, such as "status"."""
-        return self.run.metadata.get(f"fdi_torch.{record}", {})
+        return self.run.about(record)
 
     def listed(self, name: str) -> list[Any]:
         """A list in the run's result; empty if it is missing or unreadable."""
@@ -170,8 +170,7 @@ def gather(run: Run, plant: PlantDescription | None = None) -> Material:
     for message in run.messages():
         topic = message.topic
         if topic not in material.counts:
-            pairs = message.channel.metadata
-            material.units[topic] = {k.removeprefix("unit."): v for k, v in pairs if k.startswith("unit.")}
+            material.units[topic] = message.channel.units
         material.counts[topic] = material.counts.get(topic, 0) + 1
         if topic not in EVENTS or material.counts[topic] > MOST_EVENTS:
             continue

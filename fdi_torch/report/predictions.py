@@ -13,10 +13,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 
+from fdi_torch.report.material import Material
 from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT
 
 # Models of a gap diagnosis: array -> label on the page and colour.
@@ -28,19 +27,21 @@ MODELS = {
 }
 
 
-def predicted(
-    arrays: Mapping[str, np.ndarray], number: int, several: bool, shape: Sequence[int], group: str = ""
-) -> np.ndarray | None:
-    """Predicted readings of the recording with this number (from 0) at the estimate; None if the log has none.
-
-    group: the recording's group in the log of a gap diagnosis.
-    """
-    of_gap = f"{group}_augmented" if group else "augmented"
-    for name in (f"predicted_{number + 1}", *(() if several else ("predicted",)), of_gap):
+def predicted(material: Material, k: int) -> np.ndarray | None:
+    """Readings of recording k (from 0) that the run predicts, at its estimate or with its cause; None without any."""
+    arrays, group, shape = material.arrays, material.groups[k], material.recordings[k].outputs.shape
+    alone = ("predicted",) if len(material.groups) == 1 else ()
+    for name in (f"predicted_{k + 1}", *alone, f"{group}_augmented" if group else "augmented"):
         values = arrays.get(name)
-        if values is not None and values.dtype.kind == "f" and values.shape == tuple(shape):
+        if values is not None and values.dtype.kind == "f" and values.shape == shape:
             return values
     return None
+
+
+def residuals(material: Material, k: int) -> np.ndarray | None:
+    """Readings of recording k less their predictions, NaN where masked; None without predictions."""
+    model, recording = predicted(material, k), material.recordings[k]
+    return None if model is None else np.where(recording.mask, recording.outputs - model, np.nan)
 
 
 def holdout_prefix(number: int) -> str:

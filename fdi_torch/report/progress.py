@@ -11,7 +11,7 @@ import numpy as np
 from fdi_torch.names import counted
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
-from fdi_torch.report.predictions import predicted
+from fdi_torch.report.predictions import residuals
 
 
 @dataclass(frozen=True)
@@ -66,9 +66,8 @@ def sensor_residuals(material: Material) -> dict[str, SensorResidual]:
     The estimate is the run's prediction, or the observer's in a monitor.
     """
     squares: dict[tuple[str, str], list[np.ndarray]] = {}
-    for k, (group, recording) in enumerate(zip(material.groups, material.recordings, strict=True)):
-        model = predicted(material.arrays, k, len(material.groups) > 1, recording.outputs.shape, group)
-        residual = None if model is None else np.where(recording.mask, recording.outputs - model, np.nan)
+    for k, recording in enumerate(material.recordings):
+        residual = residuals(material, k)
         for i, key in enumerate(zip(recording.output_names, recording.output_units, strict=True)):
             column = material.residuals.get(key[0]) if residual is None else residual[:, i]
             if column is not None:
@@ -78,8 +77,8 @@ def sensor_residuals(material: Material) -> dict[str, SensorResidual]:
 
 
 def residual_size(material: Material) -> tuple[float, str, str]:
-    """Root mean square of the residuals of all sensors, its SI unit, and one of the sensors. NaN if the log has none,
-    or if its sensors have different units.
+    """Root mean square of the residuals of all sensors together, its SI unit, and the name of a sensor, which chooses
+    the unit shown. NaN if the log has none, or if its sensors have different units.
     """
     residuals = sensor_residuals(material)
     sensors = residuals.values()

@@ -192,7 +192,7 @@ class _Drawing:
         if sketch.route == "from_above":
             return self.route_from_above(component, sketch)
         x, y = self.corner(component.source)
-        rise = self.tall * min(sketch.height / self.tank_height(component.source), 0.9)
+        rise = self.tall * min(sketch.height / self.plant.tank(component.source).height, 0.9)
         if sketch.route == "over_wall":
             return self.route_over_wall(component, rise)
         flows = [c for c in self.plant.flow_components() if c.sketch().route == sketch.route]
@@ -271,10 +271,10 @@ class _Drawing:
 
     def pair(self, location: str) -> None:
         """Draw an unmodelled flow between two tanks, dashed."""
-        pairs = {f"{a}-{b}": (a, b) for a, b in self.plant.tank_pairs()}
-        if location not in pairs:
+        tanks = self.plant.tanks_at(location)
+        if len(tanks) != 2:
             return
-        (x, y), (to_x, to_y) = (self.corner(name) for name in pairs[location])
+        (x, y), (to_x, to_y) = (self.corner(name) for name in tanks)
         points = [(x, y + 0.42), (to_x, to_y + 0.42)]
         alpha = 1.0 if location in self.overlay.marks else strength(self.overlay.probabilities.get(location, 0.0))
         self.axes.plot(*np.array(points).T, color=MARK, lw=1.8, ls="--", alpha=alpha, zorder=1)
@@ -283,6 +283,3 @@ class _Drawing:
 
     def fed_from_above(self, tank: str) -> bool:
         return any(c.falls and c.target == tank for c in self.plant.flow_components())
-
-    def tank_height(self, name: str) -> float:
-        return next(t.height for t in self.plant.tanks if t.name == name)

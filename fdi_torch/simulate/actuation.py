@@ -33,7 +33,7 @@ class Actuation:
 
     def commands(self, values: PlaceValues, lanes: int) -> list[Tensor]:
         """Output of each actuator over the K steps, one tensor (L, K) each."""
-        signals, count = self._channels(values, lanes), self.network.command_memory()
+        signals, count = self._channels(values, lanes), self.network.command_memory
         stage = self._stage(values)
         memory = solve_memory(stage.step, stage.first, signals, [], count, signals[0].shape) if signals else []
         return self.network.commands(signals, tuple(memory), self.clock, values)[0]
@@ -55,7 +55,7 @@ class Actuation:
             channel_slopes = partials(
                 lambda x: self._channels(with_parameters(values, self.names, x), lanes), theta, shape
             )[1]
-        linearised = linearise_stage(stage.step, stage.first, channels, theta, self.network.command_memory(), shape)
+        linearised = linearise_stage(stage.step, stage.first, channels, theta, self.network.command_memory, shape)
         by_channel = {p for row in channel_slopes for p, slope in enumerate(row) if slope is not None}
         columns = sorted({*by_channel, *linearised.moved_by()})
         signals = [_columns([row[p] for p in columns]) for row in channel_slopes]

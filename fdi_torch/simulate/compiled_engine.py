@@ -15,7 +15,7 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.build import load_library
 from fdi_torch.simulate.cpp_source import emit
-from fdi_torch.simulate.engine import EngineText, Readings, expect_columns, expect_problems
+from fdi_torch.simulate.engine import Engine, Readings, expect_columns, expect_problems
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.gradient import expect_no_gradient, is_differentiated, readings_with_gradient
 from fdi_torch.simulate.injection import Injection, expect_injectable
@@ -59,7 +59,7 @@ _PYTHON = _Python(*(ctypes.cast(getattr(ctypes.pythonapi, name), ctypes.c_void_p
 _RUN = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)  # called with Python's global lock, which the loop releases
 
 
-class CompiledEngine(EngineText):
+class CompiledEngine(Engine):
     """Readings of many parameter vectors at once, by the same fixed-step RK4 as the reference engine.
 
     Each variant (values or sensitivities; float64 or float32, as theta) is compiled at its first use and cached on the
@@ -116,7 +116,7 @@ class CompiledEngine(EngineText):
         self, theta: Float[Tensor, "*batch P"], data: Readings, injection: Injection
     ) -> Float[Tensor, "*batch S columns"]:
         expect_no_gradient(self, theta, "observe")
-        memory = self.network.command_memory() + self.network.reading_memory()
+        memory = self.network.command_memory + self.network.reading_memory
         out = self._empty(theta, self.network.order + memory + self._sensors)
         expect_injectable(self.experiment, injection, memory)
         self._run("observe", theta, out, data=data, injection=injection)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import torch
 from jaxtyping import Float
@@ -58,42 +57,12 @@ class Readings:
         return self if self.values.dim() == 2 else Readings(self.values[lanes], self.weight[lanes])
 
 
-class Engine(Protocol):
+class Engine:
     """A plant in one experiment, simulated for many parameter vectors (lanes) at once. C sensors, S samples, P
     parameters.
+
+    why: the reason for the choice of this engine, one sentence.
     """
-
-    name: str
-    why: str  # the reason for the choice of this engine, one sentence
-
-    def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
-        """Readings in SI; differentiable if theta requires a gradient."""
-        ...
-
-    def levels(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S tanks"]:
-        """Tank levels at the samples, m."""
-        ...
-
-    def linearise(
-        self, theta: Float[Tensor, "*batch P"]
-    ) -> tuple[Float[Tensor, "*batch S C"], Float[Tensor, "*batch S C P"]]:
-        """Readings and their Jacobian, by forward mode."""
-        ...
-
-    def moments(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C 3"]:
-        """Weighted sums of r, r^2 and r y' over the samples.
-
-        r = y - prediction, y' = y - mean(y). Likelihood and correlation follow from them and the sums of y.
-        """
-        ...
-
-    def gram(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C W W"]:
-        """Weighted sums of the products of [d prediction/d theta, r, y', 1]; W = P + 3."""
-        ...
-
-
-class EngineText:
-    """The text by which an engine prints: what it simulates, and the columns of theta."""
 
     name: str
     why: str
@@ -109,8 +78,36 @@ class EngineText:
             f"columns of theta: {', '.join(self.space.names)}"
         )
 
+    def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
+        """Readings in SI; differentiable if theta requires a gradient."""
+        raise NotImplementedError
 
-def expect_columns(engine: EngineText, theta: object) -> None:
+    def levels(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S tanks"]:
+        """Tank levels at the samples, m."""
+        raise NotImplementedError
+
+    def linearise(
+        self, theta: Float[Tensor, "*batch P"]
+    ) -> tuple[Float[Tensor, "*batch S C"], Float[Tensor, "*batch S C P"]]:
+        """Readings and their Jacobian, by forward mode."""
+        raise NotImplementedError
+
+    def moments(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C 3"]:
+        """Weighted sums of r, r^2 and r y' over the samples.
+
+        r = y - prediction, y' = y - mean(y). Likelihood and correlation follow from them and the sums of y.
+        """
+        expect_problems(theta, data)
+        return moments_of(self.readings(theta), data)
+
+    def gram(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C W W"]:
+        """Weighted sums of the products of [d prediction/d theta, r, y', 1]; W = P + 3."""
+        expect_problems(theta, data)
+        readings, jacobian = self.linearise(theta)
+        return gram_of(readings, jacobian, data)
+
+
+def expect_columns(engine: Engine, theta: object) -> None:
     """Raises ValueError unless theta is a floating-point tensor (*batch, P) with the columns of the engine's space."""
     names = engine.space.names
     if isinstance(theta, Tensor):

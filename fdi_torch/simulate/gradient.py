@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fdi_torch.simulate.engine import Engine, EngineText, expect_columns
+from fdi_torch.simulate.engine import Engine, expect_columns
 
 
 def is_differentiated(theta: Tensor) -> bool:
@@ -25,7 +25,7 @@ def readings_with_gradient(engine: Engine, theta: Float[Tensor, "*batch P"]) -> 
     return _Readings.apply(theta, engine)
 
 
-def expect_no_gradient(engine: EngineText, theta: Tensor, what: str) -> None:
+def expect_no_gradient(engine: Engine, theta: Tensor, what: str) -> None:
     """Raises ValueError if theta does not fit the engine or requires a gradient that this operation would lose."""
     expect_columns(engine, theta)
     if is_differentiated(theta):

@@ -49,7 +49,7 @@ class PlantOde(nn.Module):
         like = self.network.nominal
         self._values = network.bind(space, like.new_zeros(0) if theta is None else theta)
         delayed = bool(network.command_delays(self._values))
-        if network.command_memory() or delayed:
+        if network.command_memory or delayed:
             names = sorted({p.prefix for p in network.placements if p.effect.stage.value == "command"})
             raise ValueError(
                 f"expected actuators without memory or dead time, got {', '.join(names)}; leave them out, or use an "

@@ -91,7 +91,7 @@ class OutputMap:
         for i, delay in self.network.reading_delays(values).items():
             measured[i] = self._late(delay, len(path), []).of(measured[i])
         shape, stage = (len(path), len(self.times)), self._stage(values)
-        memory = solve_memory(stage.step, stage.first, measured, [], self.network.reading_memory(), shape)
+        memory = solve_memory(stage.step, stage.first, measured, [], self.network.reading_memory, shape)
         readings = stage.step(measured, tuple(memory), [])[0]
         return torch.stack([r.expand(shape) for r in readings], dim=1)
 
@@ -106,7 +106,7 @@ class OutputMap:
             late_slopes[i] = late[i].by_delay(measured[i])
             measured[i] = late[i].of(measured[i])
         stage = self._stage(values)
-        stage_outputs = linearise_stage(stage.step, stage.first, measured, theta, self.network.reading_memory(), shape)
+        stage_outputs = linearise_stage(stage.step, stage.first, measured, theta, self.network.reading_memory, shape)
         return LinearisedOutputs(
             torch.stack(stage_outputs.outputs, dim=1), stage_outputs, late, late_slopes, tanks, self.samples
         )

@@ -130,8 +130,8 @@ class _Builder:
             sensors=len(network.description.sensors),
             channels=tuple(channel for _, channel in network.actuators()),
             sensor_tanks=tuple(network.sensor_tanks()),
-            command_memory=network.command_memory(),
-            reading_memory=network.reading_memory(),
+            command_memory=network.command_memory,
+            reading_memory=network.reading_memory,
             late_actuators=late_actuators,
             late_sensors=late_sensors,
             prepare=prepare,
@@ -167,7 +167,7 @@ class _Builder:
             late_inputs[late.index(i)] if i in late else graph.input("channel", channel, Varies.STEP)
             for i, (_, channel) in enumerate(network.actuators())
         ]
-        memory = self._inputs("command_memory", network.command_memory())
+        memory = self._inputs("command_memory", network.command_memory)
         levels = self._inputs("level", len(network.description.tanks))
         with self.tracer:
             steady = network.steady_command_memory([tensor(c) for c in channels], self.clock, self.values)
@@ -228,7 +228,7 @@ class _Builder:
     def _readings(self) -> tuple[Section, Section]:
         network, tensor, node = self.network, self.tracer.tensor, self.tracer.node
         measured = self._inputs("seen", len(network.description.sensors))
-        memory = self._inputs("reading_memory", network.reading_memory())
+        memory = self._inputs("reading_memory", network.reading_memory)
         with self.tracer:
             steady = network.steady_reading_memory([tensor(s) for s in measured], self.clock, self.values)
             readings, new_memory = network.read(

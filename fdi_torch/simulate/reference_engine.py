@@ -16,13 +16,13 @@ from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.operating_point import Constants
 from fdi_torch.plant.signals import Clock
-from fdi_torch.simulate.engine import EngineText, Readings, expect_columns, expect_problems, gram_of, moments_of
+from fdi_torch.simulate.engine import Engine, expect_columns
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.forward_mode import ZeroSlopes, directions, stack_with_slope, value_and_slope, with_slope
 from fdi_torch.simulate.gradient import expect_no_gradient
 
 
-class ReferenceEngine(EngineText):
+class ReferenceEngine(Engine):
     """Readings of many parameter vectors at once, by torchdiffeq's fixed-step RK4 (3/8 rule) or an adaptive solver.
 
     method: 'rk4' for populations, or any adaptive method of torchdiffeq for single runs (rtol; atol in m). Adaptive
@@ -95,16 +95,6 @@ class ReferenceEngine(EngineText):
         assert slopes is not None
         return readings[:, : len(lanes)], slopes.unflatten(1, (lanes.shape[-1], len(lanes))).movedim(1, -1)
 
-    def moments(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C 3"]:
-        """As `Engine.moments`."""
-        expect_problems(theta, data)
-        return moments_of(self.readings(theta), data)
-
-    def gram(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C W W"]:
-        """As `Engine.gram`."""
-        expect_problems(theta, data)
-        return gram_of(*self.linearise(theta), data)
-
     def _run(self, lanes: Tensor) -> Tensor:
         """lanes (L, P) -> readings (S, L, sensors), with slopes if the lanes have them."""
         values = self.network.bind(self.space, lanes)
@@ -171,7 +161,7 @@ class ReferenceEngine(EngineText):
 
     def _actuator_outputs(self, channels: Tensor, values: PlaceValues) -> Tensor:
         starts, steps = self.experiment.nodes[:-1], self.experiment.steps
-        if self.network.command_memory() == 0:
+        if self.network.command_memory == 0:
             clock = self._clock(starts.unsqueeze(1), steps.unsqueeze(1))
             outputs, _ = self.network.commands(channels.unbind(-1), (), clock, values)
             return torch.stack([a.expand(channels.shape[:-1]) for a in outputs], dim=-1)
@@ -207,7 +197,7 @@ class ReferenceEngine(EngineText):
             measured[i] = late(measured[i], self.experiment.sample_times, delay)
         times = self.experiment.sample_times
         intervals = self.experiment.sample_intervals
-        if self.network.reading_memory() == 0:
+        if self.network.reading_memory == 0:
             clock = self._clock((times - intervals).unsqueeze(1), intervals.unsqueeze(1))
             readings, _ = self.network.read(measured, (), clock, values)
             return torch.stack([r.expand(levels.shape[:2]) for r in readings], dim=-1)

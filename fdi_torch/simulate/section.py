@@ -25,7 +25,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Output:
-    """The place of a result, the node that computes it, and its change with theta."""
+    """A result of a section: where it is stored, the node of the graph that computes it, and its change with theta."""
 
     place: Place
     node: int

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.simulate.engine import EngineText, Readings, expect_columns, expect_problems, gram_of, moments_of
+from fdi_torch.simulate.engine import Engine, Readings, expect_columns
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.gradient import expect_no_gradient, is_differentiated, readings_with_gradient
 from fdi_torch.simulate.implicit import ImplicitStep
@@ -24,7 +24,7 @@ from fdi_torch.simulate.reference_engine import hermite
 from fdi_torch.simulate.step_control import accept_steps, next_step
 
 
-class TracedEngine(EngineText):
+class TracedEngine(Engine):
     """Readings and their Jacobians (forward mode) of many parameter vectors at once, by fixed-step RK4 or adaptive
     steps.
     """
@@ -54,13 +54,7 @@ class TracedEngine(EngineText):
 
     def moments(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C 3"]:
         expect_no_gradient(self, theta, "moments")
-        expect_problems(theta, data)
-        return moments_of(self.readings(theta), data)
-
-    def gram(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C W W"]:
-        expect_no_gradient(self, theta, "gram")
-        expect_problems(theta, data)
-        return gram_of(*self.linearise(theta), data)
+        return super().moments(theta, data)
 
     def observe(
         self, theta: Float[Tensor, "*batch P"], data: Readings, injection: Injection
@@ -91,7 +85,7 @@ class TracedEngine(EngineText):
 
 
 class _Run:
-    """One simulation of lanes (L, P)."""
+    """One simulation with L sets of parameters side by side, the lanes (L, P)."""
 
     def __init__(
         self,

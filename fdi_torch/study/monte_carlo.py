@@ -83,7 +83,7 @@ def _records(plan: Plan, block: Block, results: dict[str, Tensor], refined: Refi
 
 
 class Fits:
-    """Readings of B trials and the engines at each integration step, with the estimators applied to them."""
+    """The estimates of B simulated trials from their readings, with one engine for each integration step."""
 
     def __init__(self, plan: Plan, data: Readings) -> None:
         self.method, self.fitting, self.data = plan.method, plan.fitting, data
@@ -93,7 +93,7 @@ class Fits:
     def searched(
         self, seeds: Int[Tensor, " B"], lanes: Int[Tensor, " B"] | None = None, again: int = 0
     ) -> Float[Tensor, "B K P"]:
-        """Best distant members of differential evolution for each trial.
+        """The best K parameter vectors of a global search for each trial, far apart from each other.
 
         Repeated searches alternate between the objectives, because their best basins may differ: the correlation is
         insensitive to gain and offset.

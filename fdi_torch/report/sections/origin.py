@@ -27,7 +27,7 @@ def configuration_section(material: Material) -> Section | None:
 
 
 def provenance_section(material: Material) -> Section | None:
-    """Versions, seeds, hashes of the data, and the log's name; arrays of the result are in its own sections."""
+    """Versions, seeds, hashes of the data, and the log's name; lists and tables have sections of their own."""
     blocks = [pairs([("log", material.run.path.name), ("written by", material.run.library)])]
     for record, title in RECORDS.items():
         values = material.about(record)

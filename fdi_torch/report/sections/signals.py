@@ -21,7 +21,7 @@ def fit_section(material: Material) -> Section | None:
     fitted = False
     for k, (recording, group) in enumerate(zip(material.recordings, material.groups, strict=True)):
         several = len(material.recordings) > 1
-        model = predicted(material.arrays, k, several, recording.outputs.shape, group)
+        model = predicted(material, k)
         fitted |= model is not None
         blocks += [tag("h4", recording_name(group))] if several else []
         blocks.append(_output_panels(recording, model, f"_{k + 1}" if several else "", clock_of(group)))
