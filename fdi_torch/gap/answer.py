@@ -169,7 +169,7 @@ def _same_flow(placed: PlacedEffect, before: PlantDescription, after: PlantDescr
     """The effect with an unchanged flow if its size is a share of a pipe's capacity that has changed."""
     if placed.effect not in SHARES_OF_CAPACITY:
         return placed
-    tank = placed.location.split("-")[0]
+    tank = before.tanks_at(placed.location)[0]
     old, new = (nominal_capacity(p, leak_pipe(p, tank)) for p in (before, after))
     return replace(placed, parameters={**placed.parameters, "size": placed.parameters["size"] * old / new})
 

@@ -132,12 +132,12 @@ def _local(
         rates, readings = engine.rates(middle, before), engine.read(linearised.levels, before)
     else:
         rates, readings = fitted_engine.rates(middle, theta), fitted_engine.read(linearised.levels, theta)
-    component = None if "-" in place and place not in _names(fitter) else plant.component(place)
+    component = None if len(plant.tanks_at(place)) == 2 else plant.component(place)
     if isinstance(component, Sensor):
         index = [s.name for s in plant.sensors].index(place)
         return (engine.read(linearised.levels, rows) - readings)[..., index]
     tanks = {t.name: i for i, t in enumerate(plant.tanks)}
-    name, sign = _tank_and_sign(component, place)
+    name, sign = _tank_and_sign(component, place, plant)
     after = engine.rates(middle, rows)[..., tanks[name]]
     before_rate = rates[..., tanks[name]]
     if any(p.effect.stage is Stage.STORAGE for p in placements):
@@ -146,17 +146,13 @@ def _local(
     return sign * (after - before_rate) * plant.tanks[tanks[name]].area
 
 
-def _names(fitter: Fitter) -> set[str]:
-    return {c.name for c in fitter.data.plant.components()}
-
-
-def _tank_and_sign(component: Any, place: str) -> tuple[str, float]:
+def _tank_and_sign(component: Any, place: str, plant: PlantDescription) -> tuple[str, float]:
     """The tank whose balance contains the component's flow, and the sign of the flow there."""
     if isinstance(component, FlowComponent):
         return component.near_tank, 1.0 if component.source == OUTSIDE else -1.0
     if isinstance(component, Tank):
         return component.name, 1.0
-    return place.split("-")[0], -1.0
+    return plant.tanks_at(place)[0], -1.0
 
 
 def _quantity(fitter: Fitter, free: Sequence[Placement], place: str) -> tuple[str, str]:
@@ -173,7 +169,7 @@ def _variables(fitter: Fitter, fit: Fit, place: str) -> list[tuple[str, str, Ten
     middle = 0.5 * (linearised.levels[0, 1:] + linearised.levels[0, :-1])
     tanks = {t.name: middle[:, i] for i, t in enumerate(plant.tanks)}
     clock = ("time", "s", experiment.nodes[:-1] + 0.5 * experiment.steps)
-    component = plant.component(place) if place in _names(fitter) else None
+    component = None if len(plant.tanks_at(place)) == 2 else plant.component(place)
     if isinstance(component, Sensor):
         index = [s.name for s in plant.sensors].index(place)
         read = (f"{component.name} read", component.unit, linearised.readings[0, :, index])
@@ -188,7 +184,7 @@ def _variables(fitter: Fitter, fit: Fit, place: str) -> list[tuple[str, str, Ten
         return [(name, "m", tanks[near] - (tanks[far[0]] if far else 0.0)), clock]
     if isinstance(component, Tank):
         return [(f"level of {component.name}", "m", tanks[component.name]), clock]
-    first, second = place.split("-")
+    first, second = plant.tanks_at(place)
     return [(f"{first} − {second}", "m", tanks[first] - tanks[second]), clock]
 
 

@@ -170,7 +170,7 @@ def _free_at(place: str, plant: PlantDescription, reach: OperatingRange, periods
     kind, length = place_kind(plant, place), length_scale(plant)
     time = _grid((0.0, reach.duration), TIME_NODES, time_scale(plant))
     if kind == "tank_pair":
-        first, second = place.split("-")
+        first, second = plant.tanks_at(place)
         ends = reach.levels[first], reach.levels[second]
         grid = _root_grid((ends[0][0] - ends[1][1], ends[0][1] - ends[1][0]), HEAD_NODES, length)
         return [FreeInflow({"difference": grid, "time": time}, 0.3 * flow_scale(plant, first), periods)]

@@ -86,10 +86,9 @@ def _plain(name: str) -> str:
 
 def _known(entry: str, place: str, plant: PlantDescription) -> str:
     """A place of the plant; a pair of tanks in either order. Raises ValueError for an unknown place."""
-    turned = "-".join(reversed(place.split("-")))
-    for name in (place, turned):
-        if name in plant.locations():
-            return name
+    turned = {f"{b}-{a}": f"{a}-{b}" for a, b in plant.tank_pairs()}
+    if (name := turned.get(place, place)) in plant.locations():
+        return name
     raise ValueError(f"library: {entry}: {unknown(f'a place of plant {plant.name}', place, plant.locations())}")
 
 
@@ -105,7 +104,7 @@ def tanks_of(place: str, plant: PlantDescription) -> tuple[str, ...]:
     for component in plant.flow_components():
         if component.name == place:
             return tuple(dict.fromkeys((component.near_tank, component.target)))
-    return tuple(t.name for t in plant.tanks if t.name in place.split("-"))
+    return plant.tanks_at(place)
 
 
 def canonical(cause: CauseName, plant: PlantDescription) -> CauseName:

@@ -47,8 +47,8 @@ def structure_of(plant: PlantDescription, placements: Iterable[Placement]) -> St
 
 
 def _violated(plant: PlantDescription, placement: Placement) -> list[str]:
-    if placement.effect.stage is Stage.BALANCE and "-" in placement.location:
-        return [f"balance {tank}" for tank in placement.location.split("-")]
+    if placement.effect.stage is Stage.BALANCE:
+        return [f"balance {tank}" for tank in plant.tanks_at(placement.location)]
     equation = {"tank": "balance", "sensor": "sensor"}.get(place_kind(plant, placement.location), "law")
     return [f"{equation} {placement.location}"]
 

@@ -204,7 +204,7 @@ def _actuator(plant: PlantDescription, name: str) -> int:
 
 
 def _pair(place: str, plant: PlantDescription) -> DiscrepancyModel:
-    first, second = place.split("-")
+    first, second = plant.tanks_at(place)
 
     def signals(trajectory: Forcing) -> Signals:
         head = trajectory.levels[_index(plant, first)] - trajectory.levels[_index(plant, second)]
