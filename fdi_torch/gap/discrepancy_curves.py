@@ -19,7 +19,7 @@ from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.free_form import UNIT, free_form, is_free_coefficient
 from fdi_torch.gap.free_form_coefficients import coefficients_of, fitted_coefficients
-from fdi_torch.plant.description import OUTSIDE, Sensor, Tank
+from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor, Tank
 from fdi_torch.plant.effect import Placement, Stage
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.plant.operating_range import OperatingRange
