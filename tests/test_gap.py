@@ -22,7 +22,7 @@ from fdi_torch.gap.channel_noise import (
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
 from fdi_torch.gap.identifiability import planned_identifiability
-from fdi_torch.gap.library import STANDARD, canonical, library_of
+from fdi_torch.gap.library import STANDARD, canonical, equivalent_causes, library_of
 from fdi_torch.gap.screening import Pairs
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
@@ -213,7 +213,15 @@ def test_the_answer_follows_the_protocol() -> None:
 
 def test_the_library_offers_65_effects_at_places_of_the_three_tanks() -> None:
     assert len(library_of(nominal_plant(), STANDARD)) == 65
-    assert canonical(("plugging", "OUT2"), nominal_plant()) == ("leak", "T2")
+
+
+def test_a_leak_at_the_floor_and_a_plugged_outlet_without_a_valve_are_one_cause() -> None:
+    plant, plugged, leak = nominal_plant(), ("plugging", "OUT2"), ("leak", "T2")
+    assert canonical(plugged, plant) == leak
+    assert equivalent_causes(leak, plant, {}) == (plugged,) and equivalent_causes(plugged, plant, {}) == (leak,)
+    assert equivalent_causes(leak, plant, {"T2.leak.height": 0.3}) == ()
+    with_valve = replace(plant, pipes=tuple(replace(p, valve="v") if p.name == "OUT2" else p for p in plant.pipes))
+    assert canonical(plugged, with_valve) == plugged and equivalent_causes(leak, with_valve, {}) == ()
 
 
 def test_a_pair_of_tanks_is_accepted_in_either_order() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from fdi_torch.effects import EFFECTS, effect
 from fdi_torch.gap.answer import CauseName
@@ -108,17 +108,26 @@ def tanks_of(place: str, plant: PlantDescription) -> tuple[str, ...]:
 
 
 def canonical(cause: CauseName, plant: PlantDescription) -> CauseName:
-    """One name for equivalent causes: plugging of an outlet at its tank's floor is a leak of the tank."""
+    """One name for equivalent causes: plugging of an outlet at its tank's floor, without a valve, is a leak of the tank
+    there."""
     name, place = cause
     for pipe in plant.pipes:
-        to_outside = pipe.target == OUTSIDE and pipe.elevation == 0.0
-        if to_outside and name == "plugging" and place == pipe.name:
+        is_hole = pipe.target == OUTSIDE and pipe.elevation == 0.0 and pipe.valve is None
+        if is_hole and name == "plugging" and place == pipe.name:
             return "leak", pipe.source
     return cause
 
 
-def equivalent_causes(cause: CauseName, plant: PlantDescription) -> tuple[CauseName, ...]:
-    """Other names of the same cause."""
+def is_above_floor(cause: CauseName, values: Mapping[str, float]) -> bool:
+    """Whether a cause is a leak above its tank's floor, by the values of a fit: no outlet's plugging is the same."""
+    name, place = cause
+    return name == "leak" and values.get(f"{place}.leak.height", 0.0) > 0.0
+
+
+def equivalent_causes(cause: CauseName, plant: PlantDescription, values: Mapping[str, float]) -> tuple[CauseName, ...]:
+    """Other names of the same cause. values: of the fit."""
+    if is_above_floor(cause, values):
+        return ()
     name, place = canonical(cause, plant)
     others = [("plugging", p.name) for p in plant.pipes if canonical(("plugging", p.name), plant) == (name, place)]
     return tuple(c for c in dict.fromkeys([(name, place), *others]) if c != cause) if others else ()

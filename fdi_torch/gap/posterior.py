@@ -11,7 +11,7 @@ from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.cause_hypothesis import CauseHypothesis
 from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.hypothesis_search import HypothesisSearch
-from fdi_torch.gap.library import canonical
+from fdi_torch.gap.library import canonical, is_above_floor
 from fdi_torch.gap.screening import Option
 from fdi_torch.gap.structure_search import SearchResult
 from fdi_torch.plant.description import PlantDescription
@@ -59,9 +59,10 @@ def posterior_of(
     best = max(e.log_weight for e in result.explanations)
     named = [search.alone(e, best) for e in result.explanations]
     hypotheses = named if named_only else search.search(result, named)
-    by_causes: dict[tuple[frozenset[CauseName], str | None], CauseHypothesis] = {}
+    by_causes: dict[tuple[frozenset[tuple[CauseName, bool]], str | None], CauseHypothesis] = {}
     for h in sorted(hypotheses, key=lambda h: -h.weight):
-        by_causes.setdefault((frozenset(canonical(c, plant) for c in h.causes), h.unknown_at), h)
+        causes = frozenset((canonical(c, plant), is_above_floor(c, h.fit.values)) for c in h.causes)
+        by_causes.setdefault((causes, h.unknown_at), h)
     ranked = list(by_causes.values())
     unfitted = named[0].weight + math.log(max(result.unexamined, 1e-300))
     *probabilities, unexamined = posterior([*(h.weight for h in ranked), unfitted])
