@@ -44,13 +44,15 @@ def test_the_true_cause_is_found_although_the_rim_in_the_plant_file_is_wrong(tmp
     assert found.adopted().tanks == LOW.tanks, "the plant file is the user's to correct"
 
 
-def test_train_and_monitor_refuse_until_the_plant_file_is_right(tmp_path: Path) -> None:
+def test_train_refit_and_monitor_refuse_until_the_plant_file_is_right(tmp_path: Path) -> None:
     leaking, output = recorded(**{"A.leak": 0.2}), {"output": {"folder": str(tmp_path)}}
     train: dict[str, Any] = {"recordings": [leaking], "estimate": {"parameters": ["A.leak"]}}
     monitor: dict[str, Any] = {"recording": leaking, "fault_free": ["0 s", "600 s"]}
     for job, keys in ((fdi_torch.train, train), (fdi_torch.monitor, monitor)):
         with pytest.raises(ValueError, match=TOLD):
             job({"plant": LOW, **keys, **output})
+    with pytest.raises(ValueError, match=TOLD):
+        fdi_torch.refit(LOW, leaking)
     trusted = replace(leaking, trusted=True)
     assert fdi_torch.train({"plant": LOW, **train, "recordings": [trusted], **output}).estimate.status
 

@@ -15,6 +15,7 @@ from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.channel_finding import ChannelFinding
+from fdi_torch.recordings.plant_units import refusal
 from fdi_torch.sample_noise import sample_noise
 
 RIM_MARGIN = 0.02
@@ -57,6 +58,12 @@ def denied_rims(plant: PlantDescription, recording: Recording) -> list[DeniedRim
     located = {effect.location for effect in plant.effects}
     sensors = [s for s in plant.sensors if s.column in recording.output_names and s.name not in located]
     return [denied for sensor in sensors if (denied := _denied(plant, sensor, recording))]
+
+
+def expect_no_denied_rim(plant: PlantDescription, recording: Recording) -> None:
+    """Raises ValueError if the recording denies a rim, unless it is trusted."""
+    if not recording.trusted and (denied := denied_rims(plant, recording)):
+        raise ValueError(refusal(recording, "; ".join(each.text for each in denied)))
 
 
 def _denied(plant: PlantDescription, sensor: Sensor, recording: Recording) -> DeniedRim | None:
