@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
@@ -17,6 +18,7 @@ from fdi_torch.gap.cause_hypothesis import CauseHypothesis, causes_in_order
 from fdi_torch.gap.diagnose import recalibrate
 from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
 from fdi_torch.gap.hypothesis_weights import HypothesisWeights
+from fdi_torch.gap.library import equivalent_causes
 from fdi_torch.gap.localization.localized_discrepancy import Estimate, LocalizedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import log_evidence
 from fdi_torch.gap.problem import PLAIN, problem_of
@@ -95,3 +97,13 @@ def test_held_parameters_keep_their_values_and_the_others_are_fitted(sound: tupl
     assert held.values[name] == factor and held.converged
     moved = [n for n in null.space.names if abs(held.values[n] - null.values[n]) > 1e-3 * abs(null.values[n])]
     assert moved and held.cost > null.cost + 10.0
+
+
+def test_a_narrowed_outlet_is_no_leak_but_a_wider_one_is() -> None:
+    plant = replace(THREE_TANK, pipes=tuple(replace(p, elevation=0.0) for p in THREE_TANK.pipes))
+    outlet = next(p for p in plant.pipes if p.target == "outside")
+    plugged, leak = ("plugging", outlet.name), ("leak", outlet.source)
+    assert equivalent_causes(plugged, 0.4, plant) == ()
+    assert equivalent_causes(plugged, -0.4, plant) == (leak,)
+    assert equivalent_causes(leak, 0.4, plant) == (plugged,)
+    assert equivalent_causes(("plugging", "P13"), -0.4, plant) == ()

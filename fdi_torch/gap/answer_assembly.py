@@ -149,7 +149,9 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
             ParameterName.parse(name).field: Amount(value, stds[name], fit.space[name].unit)
             for name, value in fit.values_of([p]).items()
         }
-        causes.append(Cause(p.effect.name, p.location, amounts, equivalent_causes((p.effect.name, p.location), plant)))
+        size = amounts["size"].value if "size" in amounts else 0.0
+        same_as = equivalent_causes((p.effect.name, p.location), size, plant)
+        causes.append(Cause(p.effect.name, p.location, amounts, same_as))
     if result.posterior.best.unknown_at:
         causes.append(Cause(UNKNOWN, result.posterior.best.unknown_at))
     steps = {s.name: ("step", step) for s, step in zip(plant.sensors, result.quantization_steps, strict=True)}

@@ -118,8 +118,10 @@ def canonical(cause: CauseName, plant: PlantDescription) -> CauseName:
     return cause
 
 
-def equivalent_causes(cause: CauseName, plant: PlantDescription) -> tuple[CauseName, ...]:
-    """Other names of the same cause."""
+def equivalent_causes(cause: CauseName, size: float, plant: PlantDescription) -> tuple[CauseName, ...]:
+    """Other names of the same cause. A leak is the same as a wider outlet, never as a narrowed one (size > 0)."""
+    if cause[0] == "plugging" and size > 0.0:
+        return ()
     name, place = canonical(cause, plant)
     others = [("plugging", p.name) for p in plant.pipes if canonical(("plugging", p.name), plant) == (name, place)]
     return tuple(c for c in dict.fromkeys([(name, place), *others]) if c != cause) if others else ()
