@@ -77,7 +77,7 @@ def _denied(plant: PlantDescription, sensor: Sensor, recording: Recording) -> De
     margin = RIM_MARGIN * tank.height + NormalDist().inv_cdf(1.0 - CHANCE) * (noise + inexact)
     above = levels > tank.height + margin
     needed = 2 + int(math.log(max(len(levels), 1)) / math.log(1.0 / CHANCE))
-    if len(levels) < needed or not bool(above.unfold(0, needed, 1).all(dim=1).any()):
+    if len(levels) < max(needed, 3) or not bool(above.unfold(0, needed, 1).all(dim=1).any()):
         return None
     return DeniedRim(sensor, tank, int(above.sum()), float(levels.max()))
 
