@@ -38,6 +38,7 @@ _HOMES: dict[str, tuple[str, ...]] = {
     ),
     "fdi_torch.jobs.python_results": ("FreeRun", "GapResult", "MonitorResult", "RefitResult"),
     "fdi_torch.jobs.report": ("Report", "report"),
+    "fdi_torch.jobs.run_comparison": ("ComparisonResult", "compare"),
     "fdi_torch.jobs.run_setup": ("simulate_recording",),
     "fdi_torch.jobs.study": ("StudyResult",),
     "fdi_torch.jobs.train": ("TrainResult",),

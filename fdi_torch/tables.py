@@ -23,7 +23,7 @@ WITH_ERROR = ("value", "estimate", "median", *ERRORS, "95 % low", "95 % high")
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Table:
     """Columns of equal length, by name."""
 
@@ -33,6 +33,12 @@ class Table:
     def of_rows(cls, names: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
         """The table with these rows, each with one value per name."""
         return cls({name: [row[k] for row in rows] for k, name in enumerate(names)})
+
+    def __repr__(self) -> str:
+        return self.text()
+
+    def _repr_html_(self) -> str:
+        return self.html()
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))

@@ -13,6 +13,7 @@ import fdi_torch
 from fdi_torch import Plant, Recording
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, placements_for
+from fdi_torch.estimate.fitting import EngineKind
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.engine import Engine, Readings
@@ -216,3 +217,20 @@ def test_an_engine_prints_what_it_simulates(kind: str) -> None:
     shown = repr(engine)
     assert shown.startswith(f"{kind} engine: ") and f"{samples} samples" in shown
     assert f"columns of theta: {', '.join(names)}" in shown
+
+
+@pytest.mark.parametrize("kind", ["reference", "compiled"])
+def test_an_onset_at_a_sample_has_the_slope_of_a_later_one(kind: EngineKind) -> None:
+    """Two steps meet there; the shift of the onset must not count in both."""
+    steps = {"Q1": {"steps": [["0 s", "50 cm^3/s"], ["20 s", "70 cm^3/s"]]}, "Q2": "40 cm^3/s"}
+    played = fdi_torch.simulate("three_tank", inputs=steps, duration="60 s")
+    for ramp in (0.0, 7.0):
+        names = ["T1.leak.onset", "T1.leak.ramp", "T1.leak.size"]
+        fitting = fdi_torch.set_up(load_plant("three_tank"), played, names, "equilibrium", kind)
+        (engine,) = fitting.engines(1.0)
+        at = torch.tensor([[30.0, ramp, 0.3]], dtype=torch.float64)
+        theta = at.clone().requires_grad_(True)
+        (slope,) = torch.autograd.grad(engine.readings(theta).sum(), theta)
+        later = at + torch.tensor([1e-4, 0.0, 0.0], dtype=torch.float64)
+        difference = (engine.readings(later).sum() - engine.readings(at).sum()) / 1e-4
+        assert float(slope[0, 0]) == pytest.approx(float(difference), rel=1e-4)

@@ -123,9 +123,11 @@ def test_check_says_first_that_readings_lie_beyond_a_tank(tmp_path: Path, capsys
     assert cli.main(["new", "plant", "--out", str(plant), "--quiet"]) == cli.DONE
     plant.write_text(plant.read_text().replace("# !", "#"))
     words = ["--plant", str(plant), "--recording", str(tmp_path / "run.csv")]
-    assert cli.main(["check", *words]) == cli.DONE
+    assert cli.main(["check", *words]) == cli.NOT_EXPLAINED
     findings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("- ")]
-    assert "lie above the rim of A" in findings[0]
+    told = "readings lie above the rim of A, up to 1.912 m of 60 cm, which neither noise nor tolerances explain"
+    assert told in findings[0].replace("191.2 cm", "1.912 m") and "correct tanks.A.height, or gain" in findings[0]
+    assert sum("above the rim of A" in line for line in findings) == 1
 
 
 def test_a_file_with_other_names_is_refused_with_the_lines_that_map_it(

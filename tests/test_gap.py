@@ -220,6 +220,9 @@ def test_a_leak_at_the_floor_and_a_plugged_outlet_without_a_valve_are_one_cause(
     assert canonical(plugged, plant) == leak
     assert equivalent_causes(leak, plant, {}) == (plugged,) and equivalent_causes(plugged, plant, {}) == (leak,)
     assert equivalent_causes(leak, plant, {"T2.leak.height": 0.3}) == ()
+    assert equivalent_causes(plugged, plant, {"OUT2.plugging.size": -0.4}) == (leak,)
+    assert equivalent_causes(plugged, plant, {"OUT2.plugging.size": 0.4}) == ()
+    assert equivalent_causes(("plugging", "P13"), plant, {"P13.plugging.size": -0.4}) == ()
     with_valve = replace(plant, pipes=tuple(replace(p, valve="v") if p.name == "OUT2" else p for p in plant.pipes))
     assert canonical(plugged, with_valve) == plugged and equivalent_causes(leak, with_valve, {}) == ()
 

@@ -16,6 +16,7 @@ import fdi_torch
 from fdi_torch import Pipe, PlacedEffect, Plant, Pump, Recording, Sensor, Tank
 from fdi_torch.config import plant_in_code
 from fdi_torch.config.plant_file import build_plant
+from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.run_file import build_run
 from fdi_torch.config.yaml_files import shipped_plants
 from fdi_torch.quantities import displayed_in
@@ -146,6 +147,34 @@ def simulated(**faults: Any) -> Recording:
     return fdi_torch.simulate(RIG, inputs=STEPS, duration="300 s", noise=noise, faults=faults, seed=3)
 
 
+def test_every_job_takes_a_run_as_a_mapping_or_a_file(tmp_path: Path) -> None:
+    """One run for all: simulate it, then gap, predict and refit of what it simulates equal those of the recording."""
+    recording = simulated(**{"A.leak": 0.3})
+    keys = {"inputs": STEPS, "duration": "300 s", "noise": {"std": {"h": "1 mm"}}, "faults": {"A.leak": 0.3}}
+    run = {"plant": RIG, "simulate": keys, "seed": 3}
+    assert torch.equal(fdi_torch.simulate(run).outputs, recording.outputs)
+    assert torch.equal(
+        fdi_torch.simulate({**run, "simulate": {**keys, "seed": 3}, "seed": 0}).outputs, recording.outputs
+    )
+    file = tmp_path / "run.yaml"
+    file.write_text(yaml.safe_dump({**run, "plant": plant_mapping(RIG)}))
+    assert torch.equal(fdi_torch.simulate(file).outputs, recording.outputs)
+    real = {"plant": RIG, "recordings": [recording]}
+    for of_run in (run, file, real):
+        assert fdi_torch.predict(of_run).headline == fdi_torch.predict(RIG, recording).headline
+    assert fdi_torch.refit(real).fit.fitted == fdi_torch.refit(RIG, recording).fit.fitted
+    library = {"library": "leak", "out": tmp_path}
+    assert fdi_torch.gap(real, **library).headline == fdi_torch.gap(RIG, recording, **library).headline  # type: ignore[arg-type]
+    with pytest.raises(fdi_torch.ConfigError, match=r"simulate.inputs: expected every channel of the plant, .* for Q"):
+        fdi_torch.simulate(RIG)
+    with pytest.raises(TypeError, match=r"simulate: expected either a run or a plant with .* of simulate, got both"):
+        fdi_torch.simulate(run, duration="100 s")
+    with pytest.raises(ValueError, match=r"expected simulate, got none"):
+        fdi_torch.simulate(real)
+    with pytest.raises(TypeError, match=r"expected the name of a file, or its keys .* got a Plant"):
+        fdi_torch.predict(RIG)
+
+
 def test_a_rig_in_code_from_simulation_to_report(tmp_path: Path) -> None:
     recording = simulated(**{"A.leak": 0.3})
     again = simulated(**{"A.leak": 0.3})
@@ -203,6 +232,38 @@ def test_a_monitor_runs_along_a_recording_in_memory(tmp_path: Path) -> None:
     assert found._repr_html_().count("<svg") == 1 and "threshold" in found._repr_html_()
     isolated = table["kind"].index("isolated")
     assert table["onset"][isolated] == pytest.approx(400.0, abs=3.0) and table["units"][isolated] == ("1",)
+
+
+def test_runs_are_compared_in_python_as_by_the_command(tmp_path: Path) -> None:
+    """Two estimates of one leak from two recordings, in the units of the first run's plant."""
+    rig = replace(RIG, units={**RIG.units, "m": "mm"})
+    noise, logs = {"std": {"h": "1 mm"}}, []
+    for seed in (3, 4):
+        recording = fdi_torch.simulate(
+            rig, inputs=STEPS, duration="300 s", noise=noise, faults={"A.leak": 0.3}, seed=seed
+        )
+        run = {"plant": rig, "recordings": [recording], "estimate": {"parameters": ["A.leak"]}}
+        logs.append(fdi_torch.train(run | {"output": {"folder": str(tmp_path), "name": f"seed{seed}"}}).log)
+    found = fdi_torch.compare(logs)
+    estimates = {row[0]: row for row in zip(*found.table().columns.values(), strict=True)}
+    names = ["parameter", "unit", "seed3", "seed3 std error", "seed4", "seed4 std error", "p", "agree"]
+    assert list(found.table().columns) == names
+    for name, wanted in zip(("A.leak.size", "A.start_level"), ("1", "mm"), strict=True):
+        (result,) = (each for each in found.comparison.results if each.name == name)
+        scale = 1000.0 if wanted == "mm" else 1.0
+        numbers = [scale * x for pair in zip(result.values, result.std, strict=True) for x in pair]
+        assert estimates[name] == (name, wanted, *map(pytest.approx, numbers), result.p_value, result.agree)
+    assert found.headline.startswith("seed3: Fault: leak at A") and found.headline.endswith("the results agree.")
+    assert "They read different recordings" in found.headline and not found.comparison.same_data
+    shown = re.search(r"A.leak.size +1 +(\S+ ± \S+) +(\S+ ± \S+) +\S+ +yes", repr(found))
+    assert repr(found).startswith("ComparisonResult: seed3: ") and shown
+    for each in zip(shown.groups(), estimates["A.leak.size"][2:6:2], estimates["A.leak.size"][3:6:2], strict=True):
+        assert [*map(float, each[0].split(" ± "))] == [pytest.approx(x, rel=0.05) for x in each[1:]]
+    html = found._repr_html_()
+    assert "<table>" in html and html.count("<svg") == len(found.pictures) > 0 and "var(--" not in html
+    assert "seed4" in found.settings().columns and len(found.to_pandas()) == len(estimates)
+    with pytest.raises(ValueError, match="expected at least two logs to compare, got 1"):
+        fdi_torch.compare(logs[:1])
 
 
 def test_tables_are_in_the_units_that_the_user_wrote(tmp_path: Path) -> None:

@@ -83,10 +83,10 @@ def test_inspect_shows_estimates_and_correlations_as_tables_with_units(
     assert cli.main(["inspect", str(log.path)]) == cli.DONE
     shown = capsys.readouterr().out
     rows = [line.split() for line in shown.splitlines()]
-    assert ["T1.leak.size", "1", "0.300", "±", "0.010"] in rows
-    assert ["T1.start_level", "cm", "40.00", "±", "0.20"] in rows
-    assert ["link.plugging.size", "1", "not", "determined"] in rows
-    assert ["2", "T1.start_level", "-0.50", "1.00"] in rows
+    assert ["T1.leak.size", "1", "0.300", "±", "0.010", "0.280", "…", "0.320"] in rows
+    assert ["T1.start_level", "cm", "40.00", "±", "0.20", "39.61", "…", "40.39"] in rows
+    assert ["link.plugging.size", "1", "not", "determined", "–"] in rows
+    assert ["2", "T1.start_level", "−0.50", "1.00"] in rows
     assert ["result", "noise_std", "0.001015,", "0.001014"] in rows and ["result", "status", "converged"] in rows
     assert "covariance" not in shown and "[" not in shown and "undetermined" not in shown
 

@@ -122,12 +122,21 @@ def test_the_command_prints_json_alone(tmp_path: Path, capsys: pytest.CaptureFix
     assert Path(answer["log"]).is_file()
 
 
-def test_the_command_prints_a_table_with_units(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_a_table_with_units_as_do_inspect_and_the_page(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     changes = [word for change in QUICK for word in ("--set", change)]
     assert main(["train", "--out", str(tmp_path), *changes]) == DONE
     shown = capsys.readouterr()
     assert "T1.leak.size" in shown.out and "cm^3/s at the mean levels" in shown.out and "log: " in shown.out
     assert "default 100% done" in shown.err
+    rows = [re.split(r"  +", line.strip())[:4] for line in shown.out.splitlines() if " ± " in line]
+    assert len(rows) == 5 and all(re.fullmatch(r"\S+ … \S+", row[3]) for row in rows)
+    log = str(tmp_path / "default.mcap")
+    assert main(["inspect", log]) == main(["report", "--quiet", log]) == DONE
+    page = re.sub(r"\s*<[^>]*>\s*", "|", Path(log).with_suffix(".html").read_text(encoding="utf-8"))
+    inspected = [re.split(r"  +", line.strip()) for line in capsys.readouterr().out.splitlines()]
+    assert all(row in inspected and "|".join(row[2:]).replace("||", "|") in page.replace("||", "|") for row in rows)
 
 
 @pytest.mark.parametrize(

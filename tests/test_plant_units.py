@@ -11,7 +11,7 @@ import torch
 import yaml
 
 import fdi_torch
-from fdi_torch.cli import DONE, MISUSE, main
+from fdi_torch.cli import MISUSE, NOT_EXPLAINED, main
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_in
@@ -101,7 +101,7 @@ def test_check_names_what_is_wrong_and_what_to_write(
     folder: Path, name: str, change: Callable[[str], str], sentence: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / name).write_text(change((folder / name).read_text()))
-    assert main(["check", "run.csv", "--plant", "rig.yaml"]) == DONE
+    assert main(["check", "run.csv", "--plant", "rig.yaml"]) == NOT_EXPLAINED
     shown = capsys.readouterr().out
     assert f"- units: by the volume balance of the tanks, {sentence}" in shown
     assert " or " not in shown.split(sentence)[1].splitlines()[0]

@@ -51,13 +51,13 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         _show(check, screen)
         if spans := usable_spans(recording, config, plant):
             screen.say(f"usable with all inputs known: {spans}")
+    wrong = bool(guesses) or any(f.kind in WRONG for check in checks for f in check.findings)
     if checks and arguments.config is None:
         named = f"--plant {arguments.plant} --recording {arguments.recording or arguments.file}"
-        wrong = bool(guesses) or any(f.kind in WRONG for check in checks for f in check.findings)
         correct = "correct the plant file or the columns, then check again; " if wrong else ""
         screen.say(f"next: {correct}fdi gap {named} says whether the plant file explains it")
     screen.result({"format": "fdi_torch.check/1", "plant": plant, "recordings": checks, "placeholders": guesses})
-    return NOT_EXPLAINED if guesses else DONE
+    return NOT_EXPLAINED if wrong else DONE
 
 
 def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[RecordingConfig], Path]:

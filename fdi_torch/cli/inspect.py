@@ -13,14 +13,13 @@ from pathlib import Path
 import numpy as np
 import orjson
 
-from fdi_torch.amounts import with_error
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import named_errors, write_text
 from fdi_torch.logbook import Inspection, export, export_attachment, foxglove_layout, inspect_log, read_run
-from fdi_torch.quantities import display_unit
+from fdi_torch.report.estimate_table import HEADER, correlation_table, estimate_cells
 
-MOST_RESULTS, MOST_CORRELATIONS = 12, 10
+MOST_RESULTS, MOST_COLUMNS = 12, 11
 ESTIMATE = ("names", "units", "value", "std", "covariance", "covariance_shape")  # results that are shown as tables
 DRAWS = ("draws.parameter", "draws.unit", "draws.median", "draws.std")
 ShownTable = tuple[str, list[str], list[list[str]]]
@@ -114,34 +113,22 @@ def estimate_tables(result: Mapping[str, str]) -> list[ShownTable]:
     try:
         names, units, values, std, covariance = (orjson.loads(result.get(key, "[]")) for key in ESTIMATE[:5])
         drawn = [orjson.loads(result.get(key, "[]")) for key in DRAWS]
-        tables = [("estimates", ["parameter", "unit", "estimate"], _rows(names, units, values, std))]
-        tables += [("draws", ["parameter", "unit", "median and standard deviation"], _rows(*drawn))]
-        sigma = np.array([np.nan if s is None else s for s in std], dtype=float)
+        tables = [("estimates", ["parameter", *HEADER], _rows(names, units, values, std))]
         matrix = np.array(covariance, dtype=float).reshape(len(names), -1)
+        if matrix.shape == (len(names),) * 2 and len(names) > 1:
+            tables += [("correlations of the estimates", *correlation_table(names, matrix))]
+        tables += [("draws: median and standard deviation", ["parameter", *HEADER], _rows(*drawn))]
     except (ValueError, TypeError, AttributeError):
         return []
-    determined = np.flatnonzero(sigma > 0.0)
-    if matrix.shape == (len(names),) * 2 and 1 < len(determined) <= MOST_CORRELATIONS:
-        rho = matrix[np.ix_(determined, determined)] / np.outer(sigma[determined], sigma[determined])
-        below = [[f"{rho[i, j]:z.2f}" if j <= i else "" for j in range(len(rho))] for i in range(len(rho))]
-        numbers = [str(k + 1) for k in range(len(rho))]
-        cells = [[n, names[i], *row] for n, i, row in zip(numbers, determined, below, strict=True)]
-        tables.insert(1, ("correlations of the estimates", ["", "parameter", *numbers], cells))
-    return [table for table in tables if table[2]]
+    return [(title, header, rows) for title, header, rows in tables if rows and len(header) <= MOST_COLUMNS]
 
 
 def _rows(
     names: Sequence[str], units: Sequence[str], values: Sequence[float | None], std: Sequence[float | None]
 ) -> list[list[str]]:
-    """Parameter, unit for display, and value with its standard error, which is missing if it is not determined."""
-    rows = []
-    for name, unit, value, error in zip(names, units, values, std, strict=True):
-        shown, scale = display_unit(unit, name)
-        x, sigma = (
-            bad if number is None else scale * float(number) for number, bad in ((value, np.nan), (error, np.inf))
-        )
-        rows.append([name, shown or "1", with_error(x, sigma)])
-    return rows
+    """The estimates; a value without a standard error is not determined."""
+    numbers = ((np.nan if v is None else v, np.inf if s is None else s) for v, s in zip(values, std, strict=True))
+    return [[name, *estimate_cells(name, unit, *pair)] for name, unit, pair in zip(names, units, numbers, strict=True)]
 
 
 def result_text(text: str) -> str:

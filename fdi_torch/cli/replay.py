@@ -12,7 +12,7 @@ from pathlib import Path
 from fdi_torch.cli import DONE
 from fdi_torch.cli import compare as comparing
 from fdi_torch.cli.screen import Screen
-from fdi_torch.logbook import Replay, compare, read_run, replay
+from fdi_torch.logbook import Replay, read_run, replay
 from fdi_torch.logbook.replay import RELATIVE
 
 DIFFERS = 3
@@ -43,6 +43,7 @@ def faithful(arguments: argparse.Namespace, screen: Screen) -> int:
 def what_if(arguments: argparse.Namespace, screen: Screen) -> int:
     """Repeat the run with another setting, and compare the new log with the old one."""
     from fdi_torch.jobs.replay import repeat_run
+    from fdi_torch.jobs.run_comparison import compare
 
     source = Path(arguments.log)
     target = Path(arguments.out or source.with_name(f"{source.name.removesuffix('.mcap')}.what_if.mcap"))
@@ -50,9 +51,9 @@ def what_if(arguments: argparse.Namespace, screen: Screen) -> int:
         repeat_run(read_run(source), target, arguments.set, arguments.trial, advance)
         advance(1.0)
     compared = compare([source, target])
-    comparing.show(compared, [source, target], screen)
+    comparing.show(compared, screen)
     screen.say(f"log: {target}")
-    screen.result({"format": "fdi_torch.replay/1", "log": str(target), "comparison": compared})
+    screen.result({"format": "fdi_torch.replay/1", "log": str(target), "comparison": compared.comparison})
     return DONE
 
 

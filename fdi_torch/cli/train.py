@@ -13,7 +13,7 @@ import math
 from collections.abc import Sequence
 from functools import partial
 
-from fdi_torch.amounts import parameter_words, rounded
+from fdi_torch.amounts import parameter_words
 from fdi_torch.cli import DONE, NOT_CONVERGED
 from fdi_torch.cli.explained import exit_code, say_first
 from fdi_torch.cli.options import live, overrides
@@ -27,6 +27,7 @@ from fdi_torch.parameters import ParameterName
 from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import data_warnings
+from fdi_torch.report.estimate_table import HEADER, estimate_cells
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -62,22 +63,18 @@ def show(done: TrainResult, screen: Screen) -> None:
         screen.say("- next: estimate fewer parameters, take a longer recording, or raise estimate.refine.iterations")
         screen.say()
     rows = []
-    for i, p in enumerate(done.fitting.space):
-        unit, scale = display_unit(p.unit, p.name)
-        truth = done.truth.get(p.name)
-        numbers = estimate_cells(float(final.value[i]), float(final.std[i]), p.nominal, scale)
-        simulated = [f"{scale * truth:.5g}" if truth is not None else ""] if done.truth else []
-        shown_unit = clock_unit(unit, ParameterName.parse(p.name).field, float(final.value[i]))
-        rows.append([p.name, shown_unit or "1", *numbers, *simulated])
-    header = ("parameter", "unit", "estimate", "std error", "95 % interval", "nominal", "simulated")
-    screen.table("", header if done.truth else header[:-1], rows, left=2)
+    for p, value, std in zip(space, final.value.tolist(), final.std.tolist(), strict=True):
+        unit, *cells = estimate_cells(p.name, p.unit, value, std)
+        exact = [p.nominal, *([done.truth.get(p.name, math.nan)] if done.truth else [])]
+        cells += [_plain(p.name, p.unit, number) for number in exact]
+        rows.append([p.name, clock_unit(unit, ParameterName.parse(p.name).field, value), *cells])
+    header = ("parameter", *HEADER, "nominal", *(["simulated"] if done.truth else []))
+    screen.table("", header, rows, left=2)
     if final.combinations:
-        rows = []
-        for c in final.combinations:
-            unit, scale = display_unit(c.unit)
-            rows.append([c.formula, unit or "1", *estimate_cells(c.value, c.std, c.nominal, scale)])
+        combined = [(c.formula, (c.parameters[0], c.unit), c) for c in final.combinations]
+        rows = [[name, *estimate_cells(*of, c.value, c.std), _plain(*of, c.nominal)] for name, of, c in combined]
         screen.say()
-        screen.table("determined combinations", ("combination", *header[1:-1]), rows, left=2)
+        screen.table("determined combinations", ("combination", *HEADER, "nominal"), rows, left=2)
     screen.say()
     for line in in_words(done):
         screen.say(line)
@@ -94,14 +91,9 @@ def show(done: TrainResult, screen: Screen) -> None:
         screen.say(f"picture: {picture}")
 
 
-def estimate_cells(value: float, std: float, nominal: float, scale: float) -> list[str]:
-    """Estimate, standard error, 95 % interval and nominal value as text; scale: one SI unit in the unit for display."""
-    value, std = scale * value, scale * std
-    if math.isfinite(std):
-        low, high = value - 1.96 * std, value + 1.96 * std
-        interval = f"{rounded(low, std)} .. {rounded(high, std)}"
-        return [rounded(value, std), rounded(std, std), interval, f"{scale * nominal:.5g}"]
-    return [rounded(value, std), "–", "not determined", f"{scale * nominal:.5g}"]
+def _plain(name: str, si_unit: str, value: float) -> str:
+    """An exact SI value in its unit for display; empty if there is none."""
+    return "" if math.isnan(value) else f"{display_unit(si_unit, name)[1] * value:.5g}"
 
 
 def show_uncertainty(done: TrainResult, screen: Screen) -> None:

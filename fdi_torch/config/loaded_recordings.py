@@ -173,7 +173,7 @@ def read_recording(
         masks = [(in_seconds(a, recording, config), in_seconds(b, recording, config)) for a, b in config.mask]
         selected = recording.window(start, stop).masked(masks).every(config.every)
         display_also_in(recording.written)
-        return replace(selected, trusted=config.trusted)
+        return replace(selected, trusted=config.trusted or selected.trusted)
     except (ValueError, LogError) as error:
         raise ConfigError([str(error)]) from error
 

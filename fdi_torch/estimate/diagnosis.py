@@ -112,7 +112,7 @@ def diagnose(
     std: Tensor,
     mean_levels: Tensor,
     mean_channels: Tensor,
-    unexplained_ratio: float,
+    misfit: Misfit,
     confidence: float = 0.95,
     combinations: Sequence[Combination] = (),
 ) -> Diagnosis:
@@ -141,7 +141,7 @@ def diagnose(
         for c in combinations
         if sizes.issuperset(c.parameters) and probability_of_deviation(c.value, c.std, c.nominal) > level
     )
-    return Diagnosis(tuple(faults), confidence, Misfit(unexplained_ratio), not_isolated)
+    return Diagnosis(tuple(faults), confidence, misfit, not_isolated)
 
 
 def probability_of_deviation(value: float, std: float, nominal: float) -> float:

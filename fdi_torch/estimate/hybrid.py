@@ -19,7 +19,7 @@ from fdi_torch.estimate.evolution import EvolutionResult, Search, evolve
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid_settings import HybridSettings, with_less_effort
 from fdi_torch.estimate.levenberg_marquardt import Progress
-from fdi_torch.estimate.misfit import unexplained_ratio
+from fdi_torch.estimate.misfit import channel_misfit, worst
 from fdi_torch.estimate.objectives import Problem
 from fdi_torch.estimate.refined import Refined
 from fdi_torch.estimate.refinement import (
@@ -162,11 +162,11 @@ def conclude(
     lanes = torch.zeros(1, dtype=torch.int64)
     problem = fitting.problem(steps[1], "likelihood", settings.adaptive)
     raw = fitting.problem(steps[1], "likelihood", settings.adaptive, averaged=False)
-    predicted, noise_ratios, inflated_noise = [], [], []
+    predicted, misfits, inflated_noise = [], [], []
     noise = raw.noise(theta, lanes)
     for term, noise_level in zip(raw.terms, noise, strict=True):
         predicted.append(term.engine.readings(term.theta(theta))[0])
-        noise_ratios.append(unexplained_ratio(noise_level[0], term.data.known, term.data.weight))
+        misfits.append(channel_misfit(noise_level[0], term.data.known, term.data.weight))
     for term, noise_level in zip(problem.terms, problem.noise(theta, lanes), strict=True):
         residuals = term.data.known - term.engine.readings(term.theta(theta))[0]
         inflation = correlation_inflation(residuals, (term.data.weight > 0).to(residuals))
@@ -192,7 +192,7 @@ def conclude(
         estimate.std,
         levels,
         means,
-        max(noise_ratios),
+        worst(misfits),
         settings.confidence,
         estimate.combinations,
     )

@@ -17,7 +17,6 @@ from operator import itemgetter
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
 from fdi_torch.estimate.kalman import SCATTER, KalmanFilter, Propagation, Score, SensorNoise, StateNoise
@@ -170,6 +169,8 @@ class _Problem:
             value, score = (start_value, first_score) if (x == x_start).all() else self.likelihood(noise_at(x / unit))
             likeliest = max(likeliest, (value, score), key=itemgetter(0))
             return (start_value - value) / samples, -score.slope.numpy() / samples / unit
+
+        from scipy.optimize import minimize  # it takes 0.3 s to load, and few jobs have random flows
 
         optimum = minimize(
             cost,

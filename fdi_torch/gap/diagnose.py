@@ -91,7 +91,8 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
         problem.known_effects,
         problem.outliers,
     )
-    return build_answer(diagnosis, problem.holdouts)
+    answer = build_answer(diagnosis, problem.holdouts)
+    return replace(answer, remarks=[*dict.fromkeys(problem.remarks), *answer.remarks])
 
 
 def verdict_of(credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: Sequence[CauseName]) -> Verdict:

@@ -118,15 +118,17 @@ def canonical(cause: CauseName, plant: PlantDescription) -> CauseName:
     return cause
 
 
-def is_above_floor(cause: CauseName, values: Mapping[str, float]) -> bool:
-    """Whether a cause is a leak above its tank's floor, by the values of a fit: no outlet's plugging is the same."""
+def has_no_other_name(cause: CauseName, values: Mapping[str, float]) -> bool:
+    """Whether a cause is a leak above its tank's floor or a narrowed outlet, by the values of a fit. Only a leak at the
+    floor and a wider outlet are the same."""
     name, place = cause
-    return name == "leak" and values.get(f"{place}.leak.height", 0.0) > 0.0
+    quantity = {"leak": "height", "plugging": "size"}.get(name)
+    return values.get(f"{place}.{name}.{quantity}", 0.0) > 0.0
 
 
 def equivalent_causes(cause: CauseName, plant: PlantDescription, values: Mapping[str, float]) -> tuple[CauseName, ...]:
     """Other names of the same cause. values: of the fit."""
-    if is_above_floor(cause, values):
+    if has_no_other_name(cause, values):
         return ()
     name, place = canonical(cause, plant)
     others = [("plugging", p.name) for p in plant.pipes if canonical(("plugging", p.name), plant) == (name, place)]

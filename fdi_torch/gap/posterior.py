@@ -11,7 +11,7 @@ from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.cause_hypothesis import CauseHypothesis
 from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.hypothesis_search import HypothesisSearch
-from fdi_torch.gap.library import canonical, is_above_floor
+from fdi_torch.gap.library import canonical, has_no_other_name
 from fdi_torch.gap.screening import Option
 from fdi_torch.gap.structure_search import SearchResult
 from fdi_torch.plant.description import PlantDescription
@@ -61,7 +61,8 @@ def posterior_of(
     hypotheses = named if named_only else search.search(result, named)
     by_causes: dict[tuple[frozenset[tuple[CauseName, bool]], str | None], CauseHypothesis] = {}
     for h in sorted(hypotheses, key=lambda h: -h.weight):
-        causes = frozenset((canonical(c, plant), is_above_floor(c, h.fit.values)) for c in h.causes)
+        own = {c: has_no_other_name(c, h.fit.values) for c in h.causes}
+        causes = frozenset((c if own[c] else canonical(c, plant), own[c]) for c in h.causes)
         by_causes.setdefault((causes, h.unknown_at), h)
     ranked = list(by_causes.values())
     unfitted = named[0].weight + math.log(max(result.unexamined, 1e-300))

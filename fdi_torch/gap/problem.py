@@ -21,6 +21,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.plant_limits import denied_rims, with_rims_unknown
 from fdi_torch.simulate.step_length import commensurate_step
 
 LEAST = 60
@@ -59,7 +60,7 @@ class DiagnosisProblem:
     """library: the effects to search. known_effects: limits of sensors, and stuck sensors, that the readings show
     without a model. data: the recordings, for the plant with these effects and without sensors that are stuck
     throughout. holdouts: the hold-outs, likewise. outliers: masked readings of the recordings, and of the hold-outs.
-    most, named_only: as in `Settings`."""
+    most, named_only: as in `Settings`. remarks: on what was changed in the plant."""
 
     library: tuple[Placement, ...]
     recordings: tuple[Recording, ...]
@@ -69,6 +70,7 @@ class DiagnosisProblem:
     most: int
     named_only: bool = False
     outliers: tuple[Sequence[SensorOutliers], Sequence[SensorOutliers]] = ((), ())
+    remarks: Sequence[str] = ()
 
 
 def problem_of(
@@ -87,6 +89,8 @@ def problem_of(
         raise ValueError(f"step: expected one within the {longest:g} s recorded, got {settings.step:g} s; shorten it")
     recordings, stuck = _examined(plant, recordings, settings.trusted)
     holdouts, _ = _examined(plant, holdouts, settings.trusted)
+    rims = [rim.text for r in (*recordings, *holdouts) if not r.trusted for rim in denied_rims(plant, r)]
+    plant = with_rims_unknown(plant, [*recordings, *holdouts])
     offered = {p.prefix for p in library}
     stuck_for_good = {s.sensor.name: s for s in stuck if s.for_good and f"{s.sensor.name}.sensor_stuck" in offered}
     plant = _without_stuck_sensors(plant, recordings, stuck)
@@ -104,9 +108,8 @@ def problem_of(
     data, *holdout_data = (
         checked_data_set(plant, nominal_effects, r, settings.step) for r in (recordings, *((h,) for h in holdouts))
     )
-    masked = (outliers, holdout_outliers)
-    options = settings.most, settings.named_only
-    return DiagnosisProblem(library, tuple(recordings), known_effects, data, tuple(holdout_data), *options, masked)
+    more = settings.most, settings.named_only, (outliers, holdout_outliers), rims
+    return DiagnosisProblem(library, tuple(recordings), known_effects, data, tuple(holdout_data), *more)
 
 
 def _without_outliers(

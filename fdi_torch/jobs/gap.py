@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fdi_torch.config.plant_writer import dump_plant
+from fdi_torch.config.plant_writer import dump_plant, plant_mapping
 from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.diagnose import ProgressCallback, solve_problem
 from fdi_torch.gap.problem import PLAIN, Settings, problem_of
@@ -38,7 +38,7 @@ def run_gap(
     with one_thread():
         case = problem_of(plant, recordings, holdouts, settings)
     sources = [r.origin for r in every]
-    config = {"settings": asdict(settings), "recordings": len(recordings)}
+    config = {"settings": asdict(settings), "recordings": len(recordings), "plant": plant_mapping(plant)}
     text = dump_plant(plant)
     with RunLog(
         path,

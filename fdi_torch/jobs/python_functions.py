@@ -11,7 +11,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.config.loaded_recordings import named_recordings, read_recording
+from fdi_torch.config.loaded_recordings import load_recordings, named_recordings, read_recording
 from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monitor
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.run_file import Run, build_run, load_run
@@ -41,6 +41,7 @@ from fdi_torch.recording import Recording
 Tell = Callable[[float, str], None]
 AnyPlant = PlantDescription | str | Path
 AnyRecording = Recording | Mapping[str, Any] | str | Path
+AnyRun = Run | Mapping[str, Any] | str | Path
 
 
 def silent(share: float | None, text: str) -> None:
@@ -57,31 +58,57 @@ def _keys(run: Any) -> Mapping[str, Any]:
     return run
 
 
+def _run_of(run: Any, job: str) -> Run:
+    """The run of a file, of its keys, or the built-in example for None. job: named in messages about a mapping."""
+    if run is None or isinstance(run, str | Path):
+        return load_run(run)
+    return run if isinstance(run, Run) else build_run(_keys(run), Path.cwd(), job)
+
+
+def _plant_and_recordings(plant: Any, recordings: Any, job: str) -> tuple[PlantDescription, list[Recording]]:
+    """A plant and segments of its recordings, given apart or, without recordings, as a run."""
+    if recordings is not None:
+        return (of := plant_of(plant)), recordings_of(recordings, of)
+    run = _run_of(plant, job)
+    if run.config.simulate is not None:
+        return run.plant, [simulate_recording(run)]
+    loaded = load_recordings(run.config.recordings, run.plant, run.base, run.given)
+    return run.plant, [part.recording for part in loaded]
+
+
 def simulate(
-    plant: AnyPlant = "three_tank",
+    plant: AnyPlant | AnyRun | None = None,
     *,
-    inputs: Mapping[str, Any],
-    duration: str = "1000 s",
-    sample_time: str = "1 s",
+    inputs: Mapping[str, Any] | None = None,
+    duration: str | None = None,
+    sample_time: str | None = None,
     faults: Mapping[str, float | str] | None = None,
     noise: Mapping[str, Any] | None = None,
-    start_levels: Any = "equilibrium",
-    hold: str = "zero_order",
-    seed: int = 0,
+    start_levels: Any = None,
+    hold: str | None = None,
+    seed: int | None = None,
 ) -> Recording:
-    """Simulate a recording, as `fdi simulate` does. The arguments are the keys of `simulate:` in a run file.
+    """Simulate a recording, as `fdi simulate` does.
 
+    plant: a plant, with the keys of `simulate:` in a run file as the other arguments (None: three_tank); or, without
+    any of these, a run with `simulate`: its file or its keys (None: the built-in example).
     inputs: a value or steps for every channel, {"Q1": "50 cm^3/s", "Q2": {"steps": [["0 s", "50 cm^3/s"], ...]}}.
     faults: {"T1.leak": 0.3}. noise: {"std": {"h1": "1 mm"}} or {"snr_db": 30}. The result is reproducible to the last
     bit for a given seed. Raises ConfigError, which names the wrong key and the expected value.
     """
-    keys = {"inputs": inputs, "duration": duration, "sample_time": sample_time, "hold": hold}
-    keys |= {"start_levels": start_levels, "faults": dict(faults or {}), "noise": noise or {}}
-    return simulate_recording(build_run({"plant": plant, "simulate": keys, "seed": seed}, Path.cwd(), "arguments"))
+    keys = {"inputs": inputs, "duration": duration, "sample_time": sample_time, "hold": hold, "seed": seed}
+    keys |= {"start_levels": start_levels, "faults": faults, "noise": noise}
+    given = {key: value for key, value in keys.items() if value is not None}
+    if not given and not isinstance(plant, PlantDescription):
+        return simulate_recording(_run_of(plant, "simulate"))
+    if isinstance(plant, Run | Mapping):
+        raise TypeError("simulate: expected either a run or a plant with the keys of simulate, got both; keep one")
+    named = {} if plant is None else {"plant": plant}
+    return simulate_recording(build_run({**named, "simulate": given}, Path.cwd(), "arguments"))
 
 
 def train(
-    run: Run | Mapping[str, Any] | str | Path | None = None,
+    run: AnyRun | None = None,
     tell: Tell | None = None,
     resume: bool = False,
     listener: Any = None,
@@ -92,16 +119,12 @@ def train(
     "estimate": {"parameters": ["T1.leak"]}}; None: the built-in example. tell(share, text): progress. resume: continue
     a killed run of the same file. listener: receives every log message.
     """
-    if run is None or isinstance(run, str | Path):
-        run = load_run(run)
-    elif not isinstance(run, Run):
-        run = build_run(_keys(run), Path.cwd(), "train")
-    return train_job.train(run, tell, resume, listener)
+    return train_job.train(_run_of(run, "train"), tell, resume, listener)
 
 
 def gap(
-    plant: AnyPlant,
-    recordings: AnyRecording | Sequence[AnyRecording],
+    plant: AnyPlant | AnyRun,
+    recordings: AnyRecording | Sequence[AnyRecording] | None = None,
     holdouts: AnyRecording | Sequence[AnyRecording] = (),
     *,
     out: str | Path = "logs",
@@ -110,10 +133,11 @@ def gap(
 ) -> GapResult:
     """Find where and by which effect the plant model deviates from recordings, as `fdi gap` does.
 
+    plant, recordings: without recordings, plant is a run: its file or its keys, as of `train`.
     holdouts: recordings on which the corrected model is validated. out: folder of the log. settings: library, leave_out
     (names of effects), step (s), most, named_only, as the options of `fdi gap`. Raises ValueError for other settings.
     """
-    plant = plant_of(plant)
+    plant, segments = _plant_and_recordings(plant, recordings, "gap")
     for name in ("library", "leave_out"):
         if isinstance(settings.get(name), str):
             settings[name] = (settings[name],)
@@ -122,9 +146,7 @@ def gap(
         if name not in valid_settings:
             raise ValueError(f"gap: {unknown('a setting', name, [*valid_settings, 'holdouts', 'out'])}")
     log = free_path(Path(out), "gap")
-    answer = run_gap(
-        log, plant, recordings_of(recordings, plant), recordings_of(holdouts, plant), Settings(**settings), tell
-    )
+    answer = run_gap(log, plant, segments, recordings_of(holdouts, plant), Settings(**settings), tell)
     return GapResult(answer, plant, log)
 
 
@@ -146,8 +168,8 @@ def monitor(
 
 
 def predict(
-    plant: AnyPlant,
-    recording: AnyRecording,
+    plant: AnyPlant | AnyRun,
+    recording: AnyRecording | None = None,
     *,
     start_samples: int = START_SAMPLES,
     step: float | None = None,
@@ -156,14 +178,14 @@ def predict(
 ) -> FreeRun:
     """Simulate a plant freely along a recording and compare it with the readings, as `fdi predict` does.
 
+    plant, recording: without a recording, plant is a run with one: its file or its keys, as of `train`.
     start_samples: number of samples for estimating the initial levels; settle: the same as a time, s. step: of the
     integration, s. vary: patterns of constants that are estimated from the start too. Raises ValueError if an input is
     unknown for a time.
     """
-    plant = plant_of(plant)
     if isinstance(recording, list | tuple):
         raise TypeError(f"predict: expected one recording, got a list of {len(recording)}; call it for each of them")
-    parts = recordings_of(recording, plant)
+    plant, parts = _plant_and_recordings(plant, recording, "predict")
     if len(parts) != 1:
         raise ValueError(
             f"{parts[0].source}: expected a recording whose inputs are known throughout, got {len(parts)} stretches; "
@@ -175,14 +197,18 @@ def predict(
 
 
 def refit(
-    plant: AnyPlant, recordings: AnyRecording | Sequence[AnyRecording], *, step: float | None = None, **choices: Any
+    plant: AnyPlant | AnyRun,
+    recordings: AnyRecording | Sequence[AnyRecording] | None = None,
+    *,
+    step: float | None = None,
+    **choices: Any,
 ) -> RefitResult:
     """Fit all constants with a tolerance and all effects of a plant to recordings, as `fdi refit` does: calibrate it.
 
+    plant, recordings: without recordings, plant is a run: its file or its keys, as of `train`.
     step: of the simulation, s. choices: leave_out, hold, vary (names or patterns), as the options of `fdi refit`.
     """
-    plant = plant_of(plant)
-    segments = recordings_of(recordings, plant)
+    plant, segments = _plant_and_recordings(plant, recordings, "refit")
     with one_thread():
         fit = refitted(plant, segments, step=step, **choices)
     return RefitResult(fit, misfit_of(fit.rmse, segments, plant))

@@ -75,12 +75,13 @@ def compare(paths: Sequence[str | Path]) -> Comparison:
     if len(paths) < 2:
         raise ValueError(f"expected at least two logs to compare, got {len(paths)}; name more")
     runs = [read_run(path) for path in paths]
+    first, *others = map(_hashes, runs)
     return Comparison(
         labels_of([run.path for run in runs]),
         {section: entries for section in SECTIONS if (entries := _differing(runs, section))},
         _results(runs),
         len({content_hash(run.messages()) for run in runs}) == 1,
-        len({tuple(sorted(_hashes(run).items())) for run in runs}) == 1 and bool(_hashes(runs[0])),
+        bool(first) and all(first.values()) and all(other == first for other in others),
     )
 
 
@@ -133,6 +134,7 @@ def _differing(runs: Sequence[Run], section: str) -> dict[str, tuple[str, ...]]:
 
 
 def _hashes(run: Run) -> dict[str, str]:
+    """Hashes of the recordings' files; "" for a recording that was in memory."""
     return {key: text for key, text in run.about("data").items() if key.endswith("sha256")}
 
 

@@ -45,11 +45,11 @@ class Clock:
 
     def share_after(self, instant: torch.Tensor) -> torch.Tensor:
         """Share of the step after `instant`: the exact mean over the step of a switch at that instant."""
-        return torch.clamp((self.end - instant) / self.step, 0.0, 1.0)
+        return torch.clamp(_since((self.end - instant) / self.step), max=1.0)
 
     def risen(self, onset: torch.Tensor, ramp: torch.Tensor) -> torch.Tensor:
         """Exact mean over the step of a linear rise from 0 to 1 that begins at `onset` (s) and takes `ramp` (s)."""
-        end, start = torch.clamp(self.end - onset, min=0.0), torch.clamp(self.start - onset, min=0.0)
+        end, start = _since(self.end - onset), _since(self.start - onset)
         return self.share_after(onset) - (_lag_integral(end, ramp) - _lag_integral(start, ramp)) / self.step
 
     def risen_by_end(self, onset: torch.Tensor, ramp: torch.Tensor) -> torch.Tensor:
@@ -68,6 +68,11 @@ class Clock:
         """Mean of sin(2 pi t / period + phase) over the step."""
         half = math.pi * self.step / period
         return torch.sin(2.0 * math.pi * self.middle / period + phase) * torch.sin(half) / half
+
+
+def _since(time: torch.Tensor) -> torch.Tensor:
+    """max(time, 0) with slope 0 at 0: the shift of an instant between two steps counts in the later one only."""
+    return torch.where(time <= 0.0, 0.0, time)
 
 
 def _lag_integral(since: torch.Tensor, ramp: torch.Tensor) -> torch.Tensor:

@@ -2,29 +2,106 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from statistics import NormalDist
 
 import torch
 from torch import Tensor
 
-from fdi_torch.plant.description import PlantDescription, Sensor
+from fdi_torch.plant.description import PlantDescription, Sensor, Tank, with_tolerances
 from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.channel_finding import ChannelFinding
+from fdi_torch.recordings.plant_units import refusal
+from fdi_torch.sample_noise import sample_noise
 
 RIM_MARGIN = 0.02
+"""A level within this share of the rim may be at it; overflowing water stands a few millimetres above it."""
+CHANCE = 0.05
+"""Probability with which noise alone may make a recording deny a rim."""
+FAR_ABOVE = 2.0
+"""Height of a tank whose rim is unknown, in highest levels that were read in it."""
 SMALL_SHARE = 0.01
 """The unit is suspect if all values are below this share of the limit, or any is above ten times the limit."""
 
 
+@dataclass(frozen=True)
+class DeniedRim:
+    """A rim that readings deny: by the plant file, their water would stand above it. count, highest (m): of those."""
+
+    sensor: Sensor
+    tank: Tank
+    count: int
+    highest: float
+
+    @property
+    def text(self) -> str:
+        name, rim = self.tank.name, _level(self.tank.height)
+        return (
+            f"{self.sensor.column}: {self.count} readings lie above the rim of {name}, up to {_level(self.highest)} of "
+            f"{rim}, which neither noise nor tolerances explain; correct tanks.{name}.height, or gain and offset of "
+            f"{self.sensor.name} if it reads too high: until then no cause that is found can be relied on"
+        )
+
+
+def denied_rims(plant: PlantDescription, recording: Recording) -> list[DeniedRim]:
+    """The rims that a recording denies.
+
+    A reading counts as above the rim if it exceeds RIM_MARGIN, the tolerances of height, gain and offset, and noise by
+    their quantiles of 1 - CHANCE. Noise alone lets r successive readings exceed with a probability of CHANCE^r, and in
+    one of N places with N CHANCE^r, so that a rim is denied by a run of r > 1 + ln N / ln(1 / CHANCE) readings: not by
+    a spike. A sensor that has effects in the plant file is left to these.
+    """
+    located = {effect.location for effect in plant.effects}
+    sensors = [s for s in plant.sensors if s.column in recording.output_names and s.name not in located]
+    return [denied for sensor in sensors if (denied := _denied(plant, sensor, recording))]
+
+
+def expect_no_denied_rim(plant: PlantDescription, recording: Recording) -> None:
+    """Raises ValueError if the recording denies a rim, unless it is trusted."""
+    if not recording.trusted and (denied := denied_rims(plant, recording)):
+        raise ValueError(refusal(recording, "; ".join(each.text for each in denied)))
+
+
+def _denied(plant: PlantDescription, sensor: Sensor, recording: Recording) -> DeniedRim | None:
+    column = recording.output_names.index(sensor.column)
+    values = recording.outputs[recording.mask[:, column], column]
+    tank, share = plant.tank(sensor.tank), plant.tolerances.get
+    levels = (values - sensor.offset) / sensor.gain
+    noise = float(sample_noise(values.unsqueeze(1))) / abs(sensor.gain)
+    relative = math.hypot(share(f"{tank.name}.height", 0.0), share(f"{sensor.name}.gain", 0.0)) * tank.height
+    inexact = math.hypot(relative, share(f"{sensor.name}.offset", 0.0) / sensor.gain)
+    margin = RIM_MARGIN * tank.height + NormalDist().inv_cdf(1.0 - CHANCE) * (noise + inexact)
+    above = levels > tank.height + margin
+    needed = 2 + int(math.log(max(len(levels), 1)) / math.log(1.0 / CHANCE))
+    if len(levels) < max(needed, 3) or not bool(above.unfold(0, needed, 1).all(dim=1).any()):
+        return None
+    return DeniedRim(sensor, tank, int(above.sum()), float(levels.max()))
+
+
+def with_rims_unknown(plant: PlantDescription, recordings: Sequence[Recording]) -> PlantDescription:
+    """The plant with tanks so high that they never overflow where the recordings, unless trusted, deny their rims."""
+    denied = [each for r in recordings if not r.trusted for each in denied_rims(plant, r)]
+    heights: dict[str, float] = {}
+    for each in denied:
+        heights[each.tank.name] = max(heights.get(each.tank.name, 0.0), FAR_ABOVE * each.highest)
+    tanks = tuple(replace(t, height=heights.get(t.name, t.height)) for t in plant.tanks)
+    unknown = {f"{name}.height" for name in heights}
+    return with_tolerances(replace(plant, tanks=tanks), lambda name: str(name) not in unknown)
+
+
 def plant_limit_findings(recording: Recording, plant: PlantDescription) -> Iterator[ChannelFinding]:
     """Findings of all sensors, pumps, transfers and valves that the recording has."""
+    denied = {each.sensor.column: each for each in denied_rims(plant, recording)}
     for sensor in plant.sensors:
         if sensor.column in recording.output_names:
             column = recording.output_names.index(sensor.column)
             valid = recording.mask[:, column]
-            yield from _level_findings(sensor, plant, recording.outputs[valid, column], recording.time[valid])
+            readings, time = recording.outputs[valid, column], recording.time[valid]
+            yield from _level_findings(sensor, plant, readings, time, denied.get(sensor.column))
     for pump in plant.metered_flows():
         if pump.channel in recording.input_names:
             yield from _pump_findings(pump, recording.inputs[:, recording.input_names.index(pump.channel)])
@@ -34,7 +111,7 @@ def plant_limit_findings(recording: Recording, plant: PlantDescription) -> Itera
 
 
 def _level_findings(
-    sensor: Sensor, plant: PlantDescription, readings: Tensor, time: Tensor
+    sensor: Sensor, plant: PlantDescription, readings: Tensor, time: Tensor, denied: DeniedRim | None
 ) -> Iterator[ChannelFinding]:
     """Findings about the valid readings (K,) of a sensor at the times (K,) s."""
     rim = plant.tank(sensor.tank).height
@@ -46,6 +123,9 @@ def _level_findings(
     if high > 10 * rim or high < SMALL_SHARE * rim:
         text = f"highest level {_level(high)}, rim {_level(rim)}: a wrong unit, or empty throughout?"
         yield ChannelFinding("unit", sensor.column, text, {"high": high, "rim": rim})
+    elif denied:
+        numbers = {"high": denied.highest, "rim": rim, "count": denied.count}
+        yield ChannelFinding("range", sensor.column, denied.text.partition(": ")[2], numbers)
     elif high > (1 + RIM_MARGIN) * rim:
         above = int((levels > (1 + RIM_MARGIN) * rim).sum())
         text = f"{above} readings lie above the rim of {sensor.tank} ({_level(high)} of {_level(rim)})"

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 from fdi_torch.amounts import parameter_words
 from fdi_torch.clock import clock_text
 from fdi_torch.estimate.combinations import Combination
-from fdi_torch.estimate.misfit import NONE_EXPLAINS, NOT_ESTABLISHED, UNRELIABLE, Misfit
+from fdi_torch.estimate.misfit import NONE_EXPLAINS, NOT_ESTABLISHED, unreliable
 from fdi_torch.estimate.uncertainty import convergence_warning
 from fdi_torch.gap.verdict_words import verdict_sentence
 from fdi_torch.names import counted, listed
@@ -64,7 +65,7 @@ def unreliable_words(material: Material) -> str:
     warnings = [convergence_warning(result.get("status", "")) if material.kind == "train" else ""]
     if material.unexplained:
         ratio = result.get("unexplained_ratio", "null")
-        warnings.append(UNRELIABLE if ratio == "null" else Misfit(float(ratio)).warning)
+        warnings.append(unreliable(math.inf if ratio == "null" else float(ratio)))
     return "".join(f"{warning}. " for warning in warnings if warning)
 
 

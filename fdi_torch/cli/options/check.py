@@ -1,6 +1,7 @@
 """Examine a plant, and recordings before any fit: clock, gaps, clipped, frozen or rounded channels, units, masks.
 
-Exit code 4 if the plant file still has placeholders of `fdi new plant`.
+Exit code 4 if the plant file still has placeholders of `fdi new plant`, or if recording and plant contradict each
+other.
 """
 
 from __future__ import annotations

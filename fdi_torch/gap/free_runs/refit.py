@@ -31,6 +31,7 @@ from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of_all
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.plant_limits import expect_no_denied_rim
 from fdi_torch.recordings.plant_units import expect_right_units
 from fdi_torch.simulate.experiment import Experiment
 
@@ -102,6 +103,7 @@ def refit(
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     for recording in recordings:
         expect_right_units(held_plant, recording)
+        expect_no_denied_rim(held_plant, recording)
     step = step or 0.5 * recordings[0].interval
     data = checked_data_set(held_plant, placements, recordings, step)
     start = {n: v for n, v in _initial_values(kept, plant, recordings).items() if n not in tolerances}

@@ -28,6 +28,7 @@ from fdi_torch.plant.description import PlantDescription, Sensor, with_tolerance
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.input_sampling import inputs_not_held
+from fdi_torch.recordings.plant_limits import denied_rims, with_rims_unknown
 from fdi_torch.recordings.plant_units import refusal, wrong_units
 from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs
 
@@ -76,6 +77,8 @@ def examined(plant: PlantDescription, recording: Recording) -> CheckedRecording:
         return CheckedRecording(recording, (), None)
     if not recording.trusted and (wrong := wrong_units(plant, recording)):
         return CheckedRecording(recording, (), RecordingFault(("units",), wrong))
+    rims = [] if recording.trusted else denied_rims(plant, recording)
+    plant = with_rims_unknown(plant, [recording])
     stuck = list(stuck_in(plant, recording))
     remaining, fault = without(recording, stuck), None
     constant = _constant_sensors(plant, remaining)
@@ -87,13 +90,17 @@ def examined(plant: PlantDescription, recording: Recording) -> CheckedRecording:
         remaining, constant = without(recording, stuck), [s for s in constant if s not in silent]
     if not recording.trusted and fault is None and (channels := inputs_not_held(remaining, plant)):
         fault = not_held(channels, recording.interval)
+    if fault is None and rims:
+        columns = tuple(rim.sensor.column for rim in rims)
+        fault = RecordingFault(columns, "; ".join(rim.text for rim in rims), physical=True)
     return CheckedRecording(_with_notes(remaining, stuck), tuple(stuck), fault)
 
 
 def usable(plant: PlantDescription, recording: Recording, effects: bool = False) -> CheckedRecording:
     """Check a recording. Raises ValueError if it has a recording fault.
 
-    effects: whether the caller considers effects of sensors; a delayed sensor is then accepted.
+    effects: whether the caller considers effects of sensors; a delayed sensor is then accepted, and so are readings
+    above a rim, which the caller must take as unknown (`with_rims_unknown`).
     """
     checked = examined(plant, recording)
     if checked.fault and not (effects and checked.fault.physical):

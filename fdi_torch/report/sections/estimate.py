@@ -11,9 +11,10 @@ import numpy as np
 from fdi_torch.estimate.combinations import Combination
 from fdi_torch.estimate.misfit import NOT_ESTABLISHED
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
+from fdi_torch.report.estimate_table import HEADER, correlation_table, estimate_cells, signed
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import amount, number, rounded_number, shown_unit, with_error
+from fdi_torch.report.numbers import amount, number, shown_unit
 from fdi_torch.report.panels import ellipse_panel
 from fdi_torch.report.section import Picture, Section
 
@@ -28,7 +29,7 @@ def estimate_section(material: Material) -> Section | None:
     rows = [_row(material, final, i) for i in range(len(final["names"]))]
     rows += [_combination_row(material, combination) for combination in combinations_of(material, "combinations")]
     header = ["parameter", "finding"] if material.of("/diagnosis/fault") else ["parameter"]
-    header += ["unit", "estimate", "95 % interval"]
+    header += HEADER
     header += ["simulated"] if material.truth else []
     notes = [str(note) for note in final.get("unidentifiable") or ()]
     notes += [f"{name} lies at the edge of its range" for name in final.get("at_bound") or ()]
@@ -54,15 +55,7 @@ def posterior_section(material: Material) -> Section | None:
     pictures = [_ellipse(material, final, covariance, pair, k) for k, pair in enumerate(ranked)]
     words = "Regions with 50 % and 95 % of the probability, most correlated pairs first."
     words += " The green cross marks the simulated values." if material.truth else ""
-    rows = [
-        [
-            f"{k + 1}  {names[i]}",
-            *(_signed(correlation[i, j]) for j in determined[: k + 1]),
-            *[""] * (len(determined) - k - 1),
-        ]
-        for k, i in enumerate(determined)
-    ]
-    grid = table(["correlation with", *(str(k + 1) for k in range(len(determined)))], rows)
+    grid = table(*correlation_table(names, covariance))
     return Section("Uncertainty", [words, pictures, grid]) if pictures else None
 
 
@@ -82,7 +75,7 @@ def _row(material: Material, final: Payload, i: int) -> list[Any]:
     name = str(final["names"][i])
     unit = str(final["units"][i]) if final.get("units") else ""
     cells: list[Any] = [name, _finding(material, name)] if material.of("/diagnosis/fault") else [name]
-    cells += _numbers(float(final["values"][i]), float(final["std"][i]), unit, name)
+    cells += estimate_cells(name, unit, float(final["values"][i]), float(final["std"][i]))
     return [*cells, *_simulated(material, unit, (name,), (1.0,))]
 
 
@@ -95,7 +88,7 @@ def _combination_row(material: Material, combination: Combination) -> list[Any]:
         cells.append(tag("span", "present", class_="bad") if deviates else "")
     return [
         *cells,
-        *_numbers(c.value, c.std, c.unit, c.parameters[0]),
+        *estimate_cells(c.parameters[0], c.unit, c.value, c.std),
         *_simulated(material, c.unit, c.parameters, c.coefficients),
     ]
 
@@ -106,17 +99,6 @@ def _simulated(material: Material, unit: str, names: Sequence[str], coefficients
         return []
     value = sum(c * material.truth.get(name, np.nan) for c, name in zip(coefficients, names, strict=True))
     return [number(shown_unit(unit, names[0])[1] * value) if np.isfinite(value) else ""]
-
-
-def _numbers(value: float, std: float, si_unit: str, name: str) -> list[str]:
-    """Unit, value with standard error, and 95 % interval, in the unit for display."""
-    unit, scale = shown_unit(si_unit, name)
-    value, std = scale * value, scale * std
-    reach = 1.96 * std
-    if not np.isfinite(reach):
-        return [unit or "1", with_error(value, std), "–"]
-    interval = " … ".join(rounded_number(end, std) for end in (value - reach, value + reach))
-    return [unit or "1", with_error(value, std), interval]
 
 
 def _finding(material: Material, name: str) -> Any:
@@ -156,8 +138,4 @@ def _ellipse(material: Material, final: Payload, covariance: np.ndarray, pair: t
     simulated = all(name in material.truth for name in names)
     truth = (scales[0] * material.truth[names[0]], scales[1] * material.truth[names[1]]) if simulated else None
     rho = part[0, 1] / np.sqrt(part[0, 0] * part[1, 1])
-    return Picture(f"ellipse_{k + 1}", ellipse_panel(names, units, centre, part, truth), f"correlation {_signed(rho)}")
-
-
-def _signed(correlation: float) -> str:
-    return f"{correlation:z.2f}".replace("-", "−")
+    return Picture(f"ellipse_{k + 1}", ellipse_panel(names, units, centre, part, truth), f"correlation {signed(rho)}")
