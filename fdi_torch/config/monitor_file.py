@@ -74,7 +74,7 @@ class MonitorConfig(Strict):
     mode: Literal["changes", "hybrid", "evolution", "least_squares", "multi_start"] = Field(
         "changes", description="isolate changes after alarms, or estimate all faults in each window by that method"
     )
-    detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="detector that raises alarms")
+    detector: Literal["fixed", "cusum"] = Field("cusum", description="detector that raises alarms")
     false_alarms_every: ScaledSeconds = Field(20000.0, description="mean time between false alarms, s")
     window: WindowConfig = Field(default_factory=WindowConfig)
     observer: ObserverConfig = Field(default_factory=ObserverConfig, description="gain; by default from the noise")
@@ -82,7 +82,7 @@ class MonitorConfig(Strict):
         None, description="longest integration step, s; by default about a hundredth of the tanks' emptying time"
     )
     output: OutputConfig = Field(default_factory=OutputConfig)
-    seed: int = Field(0, ge=0, description="seed of the simulation that sets the threshold of the GLR")
+    seed: int = Field(0, ge=0, description="seed of the draws of the noise that set the threshold")
 
     @model_validator(mode="before")
     @classmethod

@@ -84,7 +84,7 @@ class RehearsalConfig(Strict):
     reading_noise: str = Field("1 mm", description="standard deviation: 1 mm (of the level), or h1 = 1 mm, p2 = 2 mV")
     sampling: ScaledSeconds = Field(1.0, gt=0, description="sampling interval, s")
     false_alarms_every: ScaledSeconds = Field(20000.0, description="design mean time between false alarms, s")
-    detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="detector that raises alarms under naming")
+    detector: Literal["fixed", "cusum"] = Field("cusum", description="detector that raises alarms under naming")
     false_alarms: FalseAlarmConfig | None = Field(None, description="measure the false alarm rate")
     faults_found: FaultsFoundConfig | None = Field(None, description="measure detection delay, power and isolation")
     naming: NamingConfig | None = Field(None, description="measure isolation of component, sensor and actuator faults")
