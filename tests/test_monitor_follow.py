@@ -207,26 +207,6 @@ def test_ctrl_c_keeps_what_was_logged(tmp_path: Path, monkeypatch: pytest.Monkey
     assert "alarm" in [message.payload["event"] for message in read_run(path).messages(["/observer/alarm"])]
 
 
-def test_a_gain_by_hand_that_is_unstable_is_refused_in_a_sentence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    written(tmp_path / "rig.csv")
-    gain = [[-0.1, 0, 0], [0, -0.1, 0], [0, 0, -0.1]]
-    assert main(["monitor", "--config", config(tmp_path, observer={"gain": gain}), "--quiet"]) == 2
-    assert "expected an observer gain that lets errors decay" in capsys.readouterr().err
-    assert main(["monitor", "--config", config(tmp_path, observer={"gain": gain, "time_constant": "9 s"})]) == 2
-    assert "expected either a time constant or a gain by hand" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("observer", [{"gain": [[0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]}, {"time_constant": "15 s"}])
-def test_a_gain_by_hand_or_by_time_constant_finds_the_fault(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], observer: dict[str, object]
-) -> None:
-    written(tmp_path / "rig.csv", size=0.1)
-    events = monitored(["--config", config(tmp_path, observer=observer)], capsys)
-    assert next(event for event in events if event["kind"] == "isolated")["faults"] == [FAULT]
-
-
 def test_faults_may_be_named_by_a_pattern(tmp_path: Path) -> None:
     run = load_monitor(config(tmp_path, faults=["T1.leak", "*.leak"]))
     assert run.config.faults == ["T1.leak.size", "T2.leak.size", "T3.leak.size"]

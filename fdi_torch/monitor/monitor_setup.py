@@ -17,15 +17,13 @@ from fdi_torch.monitor.fault_free_checks import false_alarm_rate_text, fault_war
 from fdi_torch.monitor.hypothesis import SHAPE, faults_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
-from fdi_torch.monitor.noise_model import NoiseModel, learn_noise, noise_of_gain, operating_point
+from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.observer import Observer
-from fdi_torch.monitor.observer_gain import Gain, hand_gain, start_beside_noise, timed_gain
-from fdi_torch.monitor.samples import Samples, samples_of_recording, usual_interval
+from fdi_torch.monitor.samples import samples_of_recording, usual_interval
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.monitor.whitening import FEWEST_SAMPLES
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
-from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.step_length import commensurate_step
 
@@ -48,20 +46,6 @@ class PreparedMonitor:
     false_alarm_text: str = ""
 
 
-@dataclass(frozen=True)
-class GainSpecification:
-    """User-defined observer gain: a time constant in s, or a matrix (tanks x sensors, m per unit of the reading and
-    sample). Without it, the gain follows from the noise.
-    """
-
-    time_constant: float | None = None
-    by_hand: tuple[tuple[float, ...], ...] = ()
-
-    def __post_init__(self) -> None:
-        if (self.time_constant is None) == (not self.by_hand):
-            raise ValueError("expected either a time constant or a gain by hand, got both or none; give one")
-
-
 def prepare_monitor(
     plant: PlantDescription,
     fault_free: Recording,
@@ -74,7 +58,6 @@ def prepare_monitor(
     seed: int = 0,
     start: StartLevels = "free",
     ranges: Mapping[str, tuple[float, float]] | None = None,
-    gain: GainSpecification | None = None,
 ) -> PreparedMonitor:
     """A monitor for `faults` (parameters such as 'T1.leak.size'; the usual ones by default).
 
@@ -106,14 +89,8 @@ def prepare_monitor(
         space = space.with_changes(name, low=low, high=high)
     believed = space.vector(values)
     samples = samples_of_recording(fault_free, plant)
-    if gain is None:
-        noise, seen = learn_noise(learning, samples, space, believed, longest_step=step)
-        radius = Observer(learning, noise.gain, space, believed, step).check_stable(samples)
-    else:
-        given = _specified_gain(learning, samples, space, believed, step, gain)
-        observer = Observer(learning, given, space, believed, step)
-        radius = observer.check_stable(samples)
-        noise, seen = noise_of_gain(learning, given, samples, space, believed, step)
+    noise, seen = learn_noise(learning, samples, space, believed, longest_step=step)
+    radius = Observer(learning, noise.gain, space, believed, step).check_stable(samples)
     sampling = float(torch.diff(samples.time).median())
     generator = torch.Generator().manual_seed(seed)
     every = time_between_false_alarms
@@ -125,26 +102,6 @@ def prepare_monitor(
     )
     text = false_alarm_rate_text(noise, detector, every)
     return PreparedMonitor(monitor, believed, noise, values, radius, warnings, text)
-
-
-def _specified_gain(
-    network: TankNetwork,
-    samples: Samples,
-    space: ParameterSpace,
-    believed: Tensor,
-    step: float,
-    specification: GainSpecification,
-) -> Gain:
-    if specification.by_hand:
-        matrix = torch.tensor(specification.by_hand, dtype=network.nominal.dtype)
-        effects = matrix.new_zeros(network.order - len(network.description.tanks), matrix.shape[-1])
-        return hand_gain(torch.cat([matrix, effects]))  # states of effects follow the levels
-    linear = operating_point(network, samples, space, believed, step)
-    unit = torch.linalg.vector_norm(linear.output, dim=-1)
-    span = float(torch.diff(samples.time).median())
-    assert specification.time_constant is not None
-    start_std = start_beside_noise(network.description, unit)
-    return timed_gain(linear, span, specification.time_constant, unit, start_std)
 
 
 def with_shapes(faults: Sequence[str], plant: PlantDescription) -> list[str]:

@@ -195,7 +195,7 @@ class Observer:
         if not worst < 1.0:
             raise ValueError(
                 f"expected an observer gain that lets errors decay, got one that lets them grow by {worst:.6g} a "
-                "sample; lower the gain or let it be designed"
+                "sample; add a sensor, or correct the plant file"
             )
         return worst
 
