@@ -58,7 +58,7 @@ class MonitorConfig(Strict):
     ranges: dict[str, tuple[float, float]] = Field(
         default_factory=dict, description="ranges of faults that replace the default ones, SI"
     )
-    mode: Literal["changes", "hybrid", "evolution", "least_squares", "multi_start"] = Field(
+    mode: Literal["changes", "evolution", "least_squares"] = Field(
         "changes", description="isolate changes after alarms, or estimate all faults in each window by that method"
     )
     detector: Literal["fixed", "cusum"] = Field("cusum", description="detector that raises alarms")
