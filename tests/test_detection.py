@@ -136,21 +136,6 @@ def test_learning_for_as_long_as_needed_determines_the_rate() -> None:
         assert math.sqrt(factor) == pytest.approx(2.0, rel=0.05)
 
 
-@pytest.mark.parametrize("chart", CHARTS)
-def test_the_first_alarm_since_a_time_is_one_of_all_alarms(chart: Chart) -> None:
-    detector = detector_of(chart, 200.0)
-    white = noise(40, 1000, 3, seed=5)
-    white[:, 600:] += 0.5
-    white[3, 700] = torch.nan
-    since = torch.arange(40) * 15
-    first, early = detector.first_alarm_since(white, since)
-    for run, raised in enumerate(detector.alarms(white)):
-        moments = raised.nonzero().flatten().tolist()
-        assert early[run] == sum(m < since[run] for m in moments)
-        assert first[run] == next(m for m in moments if m >= since[run])
-    assert detector.first_alarm_since(torch.zeros(1, 50, 3), torch.tensor([0]))[0].tolist() == [NO_ALARM]
-
-
 def test_a_shift_is_found_sooner_by_cusum_than_by_a_fixed_threshold() -> None:
     shifted = noise(200, 3000, 3)
     shifted[:, 1000:, 1] += 0.7

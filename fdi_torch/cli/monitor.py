@@ -71,8 +71,7 @@ def _show_setup(prepared: PreparedMonitor, screen: Screen) -> None:
     screen.note(
         f"noise of the readings: {stds}, process noise per sample {noise.ratio:.2g} times that, "
         f"residual autocorrelated to order {noise.whitening.order}; "
-        f"{detector.chart} threshold {detector.threshold:.3g}; observer errors decay by a factor of "
-        f"{prepared.radius:.4f} per sample"
+        f"{detector.chart} threshold {detector.threshold:.3g}"
     )
     for name, value in prepared.calibrated.items():
         screen.note(f"calibrated {name} = {value:.5g}")

@@ -55,23 +55,6 @@ class Detector:
         first = above.to(torch.int8).argmax(dim=-1)
         return torch.where(above.any(dim=-1), first, torch.full_like(first, NO_ALARM))
 
-    def first_alarm_since(self, white: Tensor, since: Tensor) -> tuple[Tensor, Tensor]:
-        """Index of the first alarm at or after sample `since`, and the number of earlier alarms; all (*batch).
-
-        The index is NO_ALARM if there is none. The detector restarts after each alarm.
-        """
-        remaining = torch.nan_to_num(white, nan=0.0)
-        index = torch.arange(remaining.shape[-2], device=remaining.device)
-        early = torch.zeros_like(since)
-        while True:
-            first = self.first_alarm(remaining)
-            before = (first != NO_ALARM) & (first < since)
-            if not bool(before.any()):
-                return first, early
-            early = early + before
-            processed = before.unsqueeze(-1) & (index <= first.unsqueeze(-1))
-            remaining = torch.where(processed.unsqueeze(-1), 0.0, remaining)
-
     def alarms(self, white: Tensor) -> Tensor:
         """(*batch, S), True where an alarm is raised. After each, the detector restarts with the next sample."""
         remaining = torch.nan_to_num(white, nan=0.0)

@@ -18,18 +18,11 @@ GROWING_WINDOWS = 8.0  # longest windows over which one straight line describes 
 
 @dataclass(frozen=True)
 class Explainer:
-    """Fits the faults that may occur: the first `watched` parameters of the observer's space."""
+    """Fits the faults that may occur."""
 
     observer: ObserverBank
     faults: Sequence[Fault]
-    watched: int
     settings: MonitorSettings
-
-    def fault_free(self, believed: Tensor) -> Tensor:
-        """Parameter values (P,) with every fault at nominal and the calibrated constants as they are."""
-        healthy = believed.clone()
-        healthy[: self.watched] = self.observer.space.nominal()[: self.watched]
-        return healthy
 
     def search_start(self, state: MonitorState, alarm_time: float) -> float:
         """The earliest onset of a change that raised an alarm, s: not before the previous change."""
@@ -59,7 +52,7 @@ class Explainer:
         The window is doubled, up to `earliest` s, while the onset of a plausible one lies at its beginning: the change
         may have occurred before it, and a fault that had grown before would not be an explanation.
         """
-        s, healthy = self.settings, self.fault_free(believed)
+        s, healthy = self.settings, state.healthy
         while True:
             window = state.window(start)
             fits = isolate(

@@ -69,7 +69,7 @@ class Monitor:
         self.faults = faults_of(space.names[: self.watched])
         self.observer = ObserverBank(network, space, noise.gain, noise.whitening, longest_step)
         self.writer = EventWriter(self.observer, self.settings, self.watched)
-        explainer = Explainer(self.observer, self.faults, self.watched, self.settings)
+        explainer = Explainer(self.observer, self.faults, self.settings)
         self.alarms = AlarmHandler(explainer, detector, self.writer)
         self.fewest = self.alarms.reach + noise.whitening.order + 1
 
@@ -86,12 +86,14 @@ class Monitor:
         by default. learning_until: end of the segment from which the noise was learnt, s; before it the monitor raises
         no alarm, because it would use noise estimates from readings that are still to come.
         """
-        theta = self.space.nominal() if believed is None else believed
+        nominal = self.space.nominal()
+        theta = nominal if believed is None else believed
+        healthy = torch.cat([nominal[: self.watched], theta[self.watched :]])  # calibrated constants as they are
         state = initial_state(
             self.observer,
             samples,
             theta,
-            self.alarms.explainer.fault_free(theta),
+            healthy,
             levels=levels,
             correlation_time=self.settings.lookback,
         )

@@ -18,7 +18,6 @@ from fdi_torch.monitor.hypothesis import SHAPE, faults_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
-from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.samples import samples_of_recording, usual_interval
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.monitor.whitening import FEWEST_SAMPLES
@@ -33,7 +32,7 @@ class PreparedMonitor:
     """A monitor ready to start.
 
     believed: parameter values for the observer, including calibrated constants. calibrated: the constants' values by
-    name. radius: decay factor of the observer's error per sample. warnings: signs that the fault-free part is not fault
+    name. warnings: signs that the fault-free part is not fault
     free. false_alarm_text: accuracy of the time between false alarms.
     """
 
@@ -41,7 +40,6 @@ class PreparedMonitor:
     believed: Tensor
     noise: NoiseModel
     calibrated: dict[str, float]
-    radius: float
     warnings: tuple[str, ...] = ()
     false_alarm_text: str = ""
 
@@ -90,7 +88,6 @@ def prepare_monitor(
     believed = space.vector(values)
     samples = samples_of_recording(fault_free, plant)
     noise, seen = learn_noise(learning, samples, space, believed, longest_step=step)
-    radius = Observer(learning, noise.gain, space, believed, step).check_stable(samples)
     sampling = float(torch.diff(samples.time).median())
     generator = torch.Generator().manual_seed(seed)
     every = time_between_false_alarms
@@ -101,7 +98,7 @@ def prepare_monitor(
         *fault_warnings(learning, space, samples, believed, step, faults_of(watched)),
     )
     text = false_alarm_rate_text(noise, detector, every)
-    return PreparedMonitor(monitor, believed, noise, values, radius, warnings, text)
+    return PreparedMonitor(monitor, believed, noise, values, warnings, text)
 
 
 def with_shapes(faults: Sequence[str], plant: PlantDescription) -> list[str]:

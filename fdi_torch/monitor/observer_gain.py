@@ -31,9 +31,6 @@ class Gain:
     opening: Tensor
     inflation: Tensor
 
-    def at(self, k: int) -> Tensor:
-        return self.opening[k] if k < len(self.opening) else self.steady
-
     def table(self, first: int, count: int) -> Tensor:
         """The gains of `count` samples from the `first` of a run on, (count, *batch, tanks, sensors)."""
         opening = self.opening[first : first + count]

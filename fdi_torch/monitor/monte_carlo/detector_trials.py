@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.detection import CHARTS, NO_ALARM, Detector, make_detector
+from fdi_torch.monitor.detection import CHARTS, Detector, make_detector
 from fdi_torch.monitor.monte_carlo.simulated_runs import FaultSchedule, SimulatedRig
 from fdi_torch.monitor.noise_model import NoiseModel
 from fdi_torch.monitor.observer import Observer
@@ -45,8 +45,7 @@ def delays(
     white = white_residuals(rig, noise, samples)
     results = []
     for detector in charts:
-        since = (samples.time < schedule.onset.unsqueeze(1)).sum(1)
-        first, early = detector.first_alarm_since(white, since)
-        when = torch.where(first == NO_ALARM, torch.inf, samples.time[first.clamp(min=0)])
-        results.append(Delays(detector.chart, when - schedule.onset, early > 0))
+        alarms, before = detector.alarms(white), samples.time < schedule.onset.unsqueeze(1)
+        first = torch.where(alarms & ~before, samples.time, torch.inf).amin(dim=1)
+        results.append(Delays(detector.chart, first - schedule.onset, (alarms & before).any(dim=1)))
     return results
