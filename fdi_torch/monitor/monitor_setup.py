@@ -57,7 +57,8 @@ def prepare_monitor(
     start: StartLevels = "free",
     ranges: Mapping[str, tuple[float, float]] | None = None,
 ) -> PreparedMonitor:
-    """A monitor for `faults` (parameters such as 'T1.leak.size'; the usual ones by default).
+    """A monitor for `faults` (parameters such as 'T1.leak.size'; the usual ones by default). The usual ones that are
+    not among them are causes that are not on the list.
 
     calibrate: constants that are first fitted to the fault-free recording, with their tolerances as priors. start:
     knowledge of the initial levels. step: longest integration step, s; by default `usual_step`, or the fraction of the
@@ -69,11 +70,12 @@ def prepare_monitor(
     interval = usual_interval(fault_free.time)
     step = min(commensurate_step(usual_step(plant), interval) if step is None else step, 1.25 * interval)
     watched = with_shapes(list(faults) or usual_faults(plant), plant)
-    network = build_network(plant, placements_for(watched))
+    unlisted = [name for name in usual_faults(plant) if name not in watched]
+    network = build_network(plant, placements_for([*watched, *unlisted]))
     running = without_startup_effects(plant, fault_free.ran)  # the fault-free part need not be the start of the run
-    learning = build_network(running, placements_for([*watched, *calibrate]))
+    learning = build_network(running, placements_for([*watched, *calibrate, *unlisted]))
     values = calibration(running, fault_free, calibrate, step, start) if calibrate else {}
-    space = ParameterSpace([network.constants[name] for name in (*watched, *calibrate)])
+    space = ParameterSpace([network.constants[name] for name in (*watched, *calibrate, *unlisted)])
     for name in watched:
         if ParameterName.parse(name).field == "phase":  # a full turn either way, so that no fit stops at +-pi
             space = space.with_changes(name, low=-2.0 * math.pi, high=2.0 * math.pi)
@@ -92,7 +94,7 @@ def prepare_monitor(
     generator = torch.Generator().manual_seed(seed)
     every = time_between_false_alarms
     detector = make_detector(chart, every, sampling, len(plant.sensors), generator, learnt=noise.whitening)
-    monitor = Monitor(network, space, noise, detector, settings, step, watched=len(watched))
+    monitor = Monitor(network, space, noise, detector, settings, step, len(watched), len(unlisted))
     warnings = (
         *residual_warnings(plant, noise, detector, seen),
         *fault_warnings(learning, space, samples, believed, step, faults_of(watched)),
