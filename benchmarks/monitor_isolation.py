@@ -2,7 +2,7 @@
 
 With `--oracle`, each of its answers is compared with two posteriors on the same samples: over the same suspects if
 onset, course (sudden or growing) and the number of faults are known, and over the injected faults if their sizes are
-known too. What remains is what the readings do not decide. With `--from-prior N`, N sudden faults and their sizes are
+known too. What remains is what the readings do not decide. With `--from-prior N`, N faults and their sizes are
 drawn from the prior of the monitor, so that its probabilities must be the frequencies with which it is right. With
 `--listed K` beside it, each monitor has K suspects only, and each second fault is none of them.
 """
@@ -205,15 +205,17 @@ RANGES = {
 """Of the sizes that are drawn, 0.2 to 0.3 of the usual ranges, so that no tank overflows or runs dry."""
 
 
-def cases_from_prior(seed: int, learn: float, count: int) -> tuple[list[Case], dict[str, tuple[float, float]]]:
-    """Sudden faults with sizes from a monitor's prior, and the ranges that this monitor has."""
+def cases_from_prior(
+    seed: int, learn: float, count: int, ramp: float = 0.0
+) -> tuple[list[Case], dict[str, tuple[float, float]]]:
+    """Faults with sizes from a monitor's prior, and the ranges that this monitor has. ramp: duration of growth, s."""
     ranges = {f: RANGES[f.partition(".")[2]] for f in SIZES if " " not in f}
     rng, names, drawn = np.random.default_rng(seed), list(ranges), []
     for i in range(count):
         fault = names[rng.integers(len(names))]
         size = rng.uniform(*ranges[fault]) - fault.endswith(".factor")
         kind, share, onset = list(KINDS)[i % 3], size / SIZES[fault], learn + 300.0
-        drawn.append(Case(fault, 0.0, kind, learn, onset, onset + 1600.0, True, 1000 * seed + i, share))
+        drawn.append(Case(fault, ramp, kind, learn, onset, onset + 1600.0, True, 1000 * seed + i, share))
     return drawn, ranges
 
 
@@ -226,12 +228,13 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1, help="only each n-th case")
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--from-prior", type=int, default=0, help="draw that many cases from the monitor's prior")
+    parser.add_argument("--growing", action="store_true", help="these grow to their size in 1500 s")
     parser.add_argument("--listed", type=int, default=0, help="number of suspects, beside --from-prior")
     parser.add_argument("--oracle", action="store_true", help="compare with posteriors for known onsets and sizes")
     parser.add_argument("--show", action="store_true", help="print the events")
     a = parser.parse_args()
     if a.from_prior:
-        chosen, ranges = cases_from_prior(a.seed, a.learn, a.from_prior)
+        chosen, ranges = cases_from_prior(a.seed, a.learn, a.from_prior, GROWTH * a.growing)
     else:
         chosen, ranges = cases(a.seed, a.learn, a.faults, a.kinds)[a.first :: a.every], {}
     total: dict[str, float] = defaultdict(float)

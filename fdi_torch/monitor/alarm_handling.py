@@ -178,7 +178,7 @@ class AlarmHandler:
             return replace(state, change=replace(change, next_fit=float("inf"))), []
         fits = self.explainer.of_change(state, change)
         best = fits[0]
-        if best.hypothesis.unlisted:
+        if best.fits and not best.hypothesis.columns:
             return self._not_on_list(state, change, fits)
         present = [f for f in fits if f.hypothesis.columns == change.best.hypothesis.columns]
         resized = state.adjusted > change.best.onset  # sizes changed since, so no single change explains the window
@@ -195,15 +195,20 @@ class AlarmHandler:
     def _not_on_list(
         self, state: MonitorState, change: DetectedChange, fits: Sequence[HypothesisFit]
     ) -> tuple[MonitorState, list[Event]]:
-        """Report that a cause that is not on the list explains the latest change better. The observer keeps its
-        parameters as a substitute for that cause, but they are no known fault any more.
+        """Report that a cause that is not on the list, or chance, explains the latest change better.
+
+        The observer keeps its parameters as a substitute for such a cause, but they are no known fault any more. By
+        chance nothing changed, so that it goes on with those before the change.
         """
         reported = self.explainer.reported(fits)
         names, next_fit = self._names(reported), self.explainer.next_fit(change.best, state.now)
         tracks = tuple(t for t in state.tracks if t.number != change.number)
-        moved = replace(state, change=replace(change, next_fit=next_fit, reported=names), tracks=tracks)
+        told, change = change.reported, replace(change, next_fit=next_fit, reported=names)
+        moved = replace(state, change=change, tracks=tracks)
+        if not fits[0].hypothesis.unlisted:
+            moved = adopt_change(self.observer, moved, change, change.before)
         moved, event = self._cannot_tell(moved, change.number, reported)
-        return moved, [] if names == change.reported else [event]
+        return moved, [] if names == told else [event]
 
     def _cannot_tell(
         self, state: MonitorState, number: int, reported: Sequence[HypothesisFit]
