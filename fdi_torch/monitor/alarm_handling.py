@@ -214,9 +214,9 @@ class AlarmHandler:
         self, state: MonitorState, number: int, reported: Sequence[HypothesisFit]
     ) -> tuple[MonitorState, Event]:
         """Report explanations of which the likeliest is no fault of the list, and restart the detector beside it."""
-        state = beside_deviation(state).with_alarm(state.alarm(number).with_state(State.CANNOT_TELL))
-        event = self.writer.unexplained(state, number, reported)
-        return state.with_alarm(replace(state.alarm(number), explanations=event.explanations)), event
+        told = beside_deviation(state).with_alarm(state.alarm(number).with_state(State.CANNOT_TELL))
+        event = self.writer.unexplained(told, number, reported)
+        return told.with_alarm(replace(told.alarm(number), explanations=event.explanations)), event
 
     def _names(self, reported: Sequence[HypothesisFit]) -> tuple[tuple[str, ...], ...]:
         """Parameter names of each explanation."""
