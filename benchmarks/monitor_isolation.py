@@ -2,8 +2,9 @@
 
 With `--oracle`, each of its answers is compared with two posteriors on the same samples: over the same suspects if
 onset, course (sudden or growing) and the number of faults are known, and over the injected faults if their sizes are
-known too. What remains is what the readings do not decide. With `--from-prior N`, N sudden faults and their sizes are
-drawn from the prior of the monitor, so that its probabilities must be the frequencies with which it is right.
+known too. What remains is what the readings do not decide. With `--from-prior N`, N faults and their sizes are
+drawn from the prior of the monitor, so that its probabilities must be the frequencies with which it is right. With
+`--listed K` beside it, each monitor has K suspects only, and each second fault is none of them.
 """
 
 from __future__ import annotations
@@ -40,10 +41,17 @@ def events_of(recording: Recording, learn: float, every: float = 20000.0) -> lis
 
 
 def prepared_for(
-    recording: Recording, learn: float, every: float = 20000.0, ranges: Mapping[str, tuple[float, float]] | None = None
+    recording: Recording,
+    learn: float,
+    every: float = 20000.0,
+    ranges: Mapping[str, tuple[float, float]] | None = None,
+    listed: Sequence[str] = (),
 ) -> tuple[PreparedMonitor, Samples]:
-    """A monitor that has learnt for `learn` s, and all samples. ranges: of its suspects, the usual ones by default."""
-    plant, suspects = load_plant("three_tank"), list(ranges or {})
+    """A monitor that has learnt for `learn` s, and all samples.
+
+    ranges: of faults, the usual ones by default. listed: the monitor's suspects, by default those with ranges.
+    """
+    plant, suspects = load_plant("three_tank"), list(listed or ranges or {})
     known = fault_free_part(recording, 0.0, learn)
     prepared = prepare_monitor(plant, known, suspects, time_between_false_alarms=every, ranges=ranges)
     return prepared, samples_of_recording(recording, plant)
@@ -159,6 +167,31 @@ def scored(case: Case, events: Sequence[Event]) -> dict[str, float]:
     return count
 
 
+def suspects_of(case: Case, faults: Sequence[str], count: int, outside: bool) -> list[str]:
+    """A list of `count` suspects, with the fault of the case or, if `outside`, without it and its twins."""
+    others = [f for f in faults if f not in twins_of(case.name)]
+    drawn = np.random.default_rng(case.seed).permutation(others).tolist()
+    return drawn[:count] if outside else [case.name, *drawn[: count - 1]]
+
+
+def scored_list(case: Case, events: Sequence[Event], outside: bool) -> dict[str, float]:
+    """Counts of events with explanations: does the likeliest one name the fault, or a cause that is not on the list?"""
+    count: dict[str, float] = defaultdict(float)
+    kind = "outside" if outside else "listed"
+    answers = [e for e in events if e.kind in (*ANSWERS, "cannot tell") and e.time >= case.onset and e.explanations]
+    for e in answers:
+        right = [x.unlisted if outside else is_true(x.names, case.name) for x in e.explanations]
+        count[f"{kind}: events"] += 1
+        count[f"{kind}: in set"] += any(right)
+        count[f"{kind}: first right"] += right[0]
+        count[f"{kind}: first by its own probability"] += e.explanations[0].mass
+        count[f"{kind}: certain, wrong"] += str(e.state) == "isolated" and not right[0]
+        count[f"{kind}: probability of a cause not on the list"] += sum(x.mass for x in e.explanations if x.unlisted)
+    if answers:
+        count[f"{kind}: runs"], count[f"{kind}: last right"] = 1, right[0]
+    return count
+
+
 def cases(seed: int, learn: float, faults: Sequence[str], kinds: Sequence[str]) -> list[Case]:
     drawn = [(fault, ramp, kind) for fault in faults for ramp in (0.0, GROWTH) for kind in kinds]
     onset = learn + 300.0
@@ -172,15 +205,17 @@ RANGES = {
 """Of the sizes that are drawn, 0.2 to 0.3 of the usual ranges, so that no tank overflows or runs dry."""
 
 
-def cases_from_prior(seed: int, learn: float, count: int) -> tuple[list[Case], dict[str, tuple[float, float]]]:
-    """Sudden faults with sizes from a monitor's prior, and the ranges that this monitor has."""
+def cases_from_prior(
+    seed: int, learn: float, count: int, ramp: float = 0.0
+) -> tuple[list[Case], dict[str, tuple[float, float]]]:
+    """Faults with sizes from a monitor's prior, and the ranges that this monitor has. ramp: duration of growth, s."""
     ranges = {f: RANGES[f.partition(".")[2]] for f in SIZES if " " not in f}
     rng, names, drawn = np.random.default_rng(seed), list(ranges), []
     for i in range(count):
         fault = names[rng.integers(len(names))]
         size = rng.uniform(*ranges[fault]) - fault.endswith(".factor")
         kind, share, onset = list(KINDS)[i % 3], size / SIZES[fault], learn + 300.0
-        drawn.append(Case(fault, 0.0, kind, learn, onset, onset + 1600.0, True, 1000 * seed + i, share))
+        drawn.append(Case(fault, ramp, kind, learn, onset, onset + 1600.0, True, 1000 * seed + i, share))
     return drawn, ranges
 
 
@@ -193,19 +228,22 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1, help="only each n-th case")
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--from-prior", type=int, default=0, help="draw that many cases from the monitor's prior")
+    parser.add_argument("--growing", action="store_true", help="these grow to their size in 1500 s")
+    parser.add_argument("--listed", type=int, default=0, help="number of suspects, beside --from-prior")
     parser.add_argument("--oracle", action="store_true", help="compare with posteriors for known onsets and sizes")
     parser.add_argument("--show", action="store_true", help="print the events")
     a = parser.parse_args()
     if a.from_prior:
-        chosen, ranges = cases_from_prior(a.seed, a.learn, a.from_prior)
+        chosen, ranges = cases_from_prior(a.seed, a.learn, a.from_prior, GROWTH * a.growing)
     else:
         chosen, ranges = cases(a.seed, a.learn, a.faults, a.kinds)[a.first :: a.every], {}
     total: dict[str, float] = defaultdict(float)
     started = time.process_time()
-    for case, (recording, _) in zip(chosen, recordings(chosen), strict=True):
-        prepared, samples = prepared_for(recording, case.learn, ranges=ranges)
+    for k, (case, (recording, _)) in enumerate(zip(chosen, recordings(chosen), strict=True)):
+        listed = suspects_of(case, list(ranges), a.listed, k % 2 == 1) if a.listed else []
+        prepared, samples = prepared_for(recording, case.learn, ranges=ranges, listed=listed)
         events = followed(prepared, samples, case.learn)
-        count = scored(case, events)
+        count = scored_list(case, events, k % 2 == 1) if a.listed else scored(case, events)
         if a.oracle:
             times = [e.time for e in answers_of(case, events)]
             count |= scored_oracle(case, known_onset_posterior(prepared, samples, case, times), "onset")
@@ -214,7 +252,7 @@ def main() -> None:
         for name, number in count.items():
             total[name] += number
         print(f"{case.fault:26} {case.ramp:6.0f} {case.kind:6}", dict(count), flush=True)
-        if a.show or count["certain, wrong"]:
+        if a.show or count["certain, wrong"] or count["listed: certain, wrong"] + count["outside: certain, wrong"]:
             for e in events:
                 print("   ", e.line[:230])
     print(dict(total), f"{time.process_time() - started:.0f} s of CPU")

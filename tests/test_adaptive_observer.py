@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from benchmarks.paper.adaptive_observer import JointModel, adaptive_observer, joint_filter
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, place
-from fdi_torch.monitor.adaptive_observer import JointModel, adaptive_observer, joint_filter
 from fdi_torch.monitor.observer import bind_parameters
 from fdi_torch.monitor.observer_gain import hand_gain
 from fdi_torch.monitor.samples import Samples

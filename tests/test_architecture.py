@@ -61,6 +61,7 @@ DOORS = {
         "logbook/compare.py",
         "monitor/false_alarm_rate.py",
         "monitor/monte_carlo/false_alarm_plan.py",
+        "monitor/structural_analysis.py",
     ),
     "mcap": ("logbook/",),
     "yaml": ("config/",),

@@ -21,9 +21,9 @@ from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.fault_free_checks import false_alarm_rate_text
 from fdi_torch.monitor.flow_filter import forcing
 from fdi_torch.monitor.flow_noise_estimate import estimate_flow_filter
-from fdi_torch.monitor.noise_model import learn_noise, noise_of_gain, operating_point
+from fdi_torch.monitor.noise_model import learn_noise, operating_point
 from fdi_torch.monitor.observer import Observer
-from fdi_torch.monitor.observer_gain import hand_gain
+from fdi_torch.monitor.observer_gain import hand_gain, start_uncertainty
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.simulate.build import BuildError
 from fdi_torch.simulate.equilibrium import equilibrium
@@ -194,13 +194,14 @@ def test_without_a_compiler_the_start_tells_what_is_not_modelled(monkeypatch: py
 
 
 def test_innovations_do_not_depend_on_the_gain_of_the_observer() -> None:
-    samples = disturbed(15.0, 1000)
-    whites = []
+    samples, whites = disturbed(15.0, 1000), []
+    linear = operating_point(NETWORK, samples)
+    heights = start_uncertainty(NETWORK.description, samples.readings)
     for share in (0.2, 0.6):
         gain = hand_gain(share * torch.eye(3, dtype=torch.float64))
-        noise, seen = noise_of_gain(NETWORK, gain, samples)
-        assert noise.whitening.flows is not None
-        whites.append(noise.whitening.flows(seen.steady_residual)[0][100:])
+        residual = Observer(NETWORK, gain).run(samples).steady_residual
+        flows, _ = estimate_flow_filter(linear, gain, residual, residual.std(dim=0), heights, 1.0)
+        whites.append(flows(residual)[0][100:])
     assert float((whites[0] - whites[1]).square().mean().sqrt()) < 0.02 * float(whites[0].square().mean().sqrt())
 
 

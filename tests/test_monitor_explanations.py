@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.hypothesis import Hypothesis, HypothesisFit, credible_set, merged
+from fdi_torch.monitor.explanations import Explainer
+from fdi_torch.monitor.hypothesis import NO_CHANGE, Hypothesis, HypothesisFit, credible_set, merged
 from fdi_torch.monitor.hypothesis_fit import Prior, fit
 from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
 from fdi_torch.monitor.observer_bank import ChangeHypotheses
 from tests.test_monitor import FAULTS, SPACE, STD, followed, from_rest, monitor, recorded, step_to
 
@@ -81,6 +84,22 @@ def test_a_fault_after_an_alarm_by_chance_is_told_as_soon_as_without_that_alarm(
     assert ("retired", 1) in kinds and ("isolated", 2) in kinds
     told = next(e for e in events if e.faults)
     assert told.faults == ("T3.leak.size",) and told.time < 340.0
+
+
+def test_a_change_that_turns_out_to_be_chance_is_withdrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It raised an IndexError: no explanation with a parameter was left."""
+    watch, run = monitor(lookback=60.0, confirm=20.0), recorded(step_to("T3.leak.size", 0.05, 300.0), 420)
+    state, _ = followed(watch, run.segment(0, 340))
+    assert state.change is not None and bool(state.off_nominal.any())
+
+    def by_chance(self: Explainer, state: MonitorState, change: DetectedChange) -> list[HypothesisFit]:
+        return [replace(change.best, hypothesis=NO_CHANGE, misfit=0.0)]
+
+    monkeypatch.setattr(Explainer, "of_change", by_chance)
+    state, events = watch.advance(state, run.segment(340, 380))
+    told = next(e for e in events if e.kind == "cannot tell")
+    assert told.alarm == 1 and "chance" in told.text and not told.believed
+    assert not state.tracks and not bool(state.off_nominal.any())
 
 
 def test_no_onset_lies_in_the_part_that_is_declared_fault_free() -> None:

@@ -46,7 +46,7 @@ PLACES = {place for e in EQUATIONS for place in e.places} | {place for *_, place
 @pytest.mark.parametrize("place", sorted(PLACES))
 def test_the_code_of_every_equation_exists(place: str) -> None:
     module, name = place.split(":")
-    found = importlib.import_module(f"fdi_torch.{module}")
+    found = importlib.import_module(module if module.startswith("benchmarks.") else f"fdi_torch.{module}")
     first, *rest = name.split(".")
     attribute = getattr(found, first)
     fields = getattr(attribute, "__dataclass_fields__", {})

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Equation:
-    """numbers: of the paper's equations. says: their meaning. places: 'module:name' below fdi_torch;
+    """numbers: of the paper's equations. says: their meaning. places: 'module:name' below fdi_torch, or of benchmarks;
     empty: not built.
     """
 
@@ -38,7 +38,8 @@ EQUATIONS = (
     Equation((14,), "Luenberger-like observer with nominal parameters",
              ("monitor.observer:Observer", "monitor.noise_model:learn_noise")),
     Equation((15,), "conventional adaptive observer: parameters integrate the residual",
-             ("monitor.adaptive_observer:adaptive_observer", "monitor.adaptive_observer:adaptive_gain")),
+             ("benchmarks.paper.adaptive_observer:adaptive_observer",
+              "benchmarks.paper.adaptive_observer:adaptive_gain")),
     Equation((16,), "adaptive observer: the newest fitted parameters go back into it",
              ("monitor.window_monitor:WindowMonitor", "monitor.window_estimators:evolution",
               "monitor.monitor:Monitor")),

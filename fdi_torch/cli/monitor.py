@@ -68,11 +68,10 @@ def _show_setup(prepared: PreparedMonitor, screen: Screen) -> None:
         f"{sensor.name} {quantity_text(std, sensor.unit, 3, sensor.column)}"
         for sensor, std in zip(prepared.monitor.network.description.sensors, noise.reading_std.tolist(), strict=True)
     )
-    process = "" if noise.ratio != noise.ratio else f", process noise per sample {noise.ratio:.2g} times that"
     screen.note(
-        f"noise of the readings: {stds}{process}, residual autocorrelated to order {noise.whitening.order}; "
-        f"{detector.chart} threshold {detector.threshold:.3g}; observer errors decay by a factor of "
-        f"{prepared.radius:.4f} per sample"
+        f"noise of the readings: {stds}, process noise per sample {noise.ratio:.2g} times that, "
+        f"residual autocorrelated to order {noise.whitening.order}; "
+        f"{detector.chart} threshold {detector.threshold:.3g}"
     )
     for name, value in prepared.calibrated.items():
         screen.note(f"calibrated {name} = {value:.5g}")

@@ -17,7 +17,6 @@ from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.strict import ScaledSeconds, Seconds, Strict
 from fdi_torch.monitor.monitor_settings import CONFIRM, LONGEST, LOOKBACK, MonitorSettings
-from fdi_torch.monitor.monitor_setup import GainSpecification
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
@@ -44,18 +43,6 @@ class WindowConfig(Strict):
         )
 
 
-class ObserverConfig(Strict):
-    time_constant: Seconds | None = Field(None, description="time constant of its slowest error, s")
-    gain: list[list[float]] | None = Field(
-        None, description="explicit gain: rows of tanks, columns of sensors, m per unit of the reading and sample"
-    )
-
-    def wish(self) -> GainSpecification | None:
-        if self.time_constant is None and self.gain is None:
-            return None
-        return GainSpecification(self.time_constant, tuple(tuple(row) for row in self.gain or ()))
-
-
 class MonitorConfig(Strict):
     plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
     recording: RecordingConfig = Field(description="the recording to follow; none beside `source`")
@@ -71,18 +58,17 @@ class MonitorConfig(Strict):
     ranges: dict[str, tuple[float, float]] = Field(
         default_factory=dict, description="ranges of faults that replace the default ones, SI"
     )
-    mode: Literal["changes", "hybrid", "evolution", "least_squares", "multi_start"] = Field(
+    mode: Literal["changes", "evolution", "least_squares"] = Field(
         "changes", description="isolate changes after alarms, or estimate all faults in each window by that method"
     )
-    detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="detector that raises alarms")
+    detector: Literal["fixed", "cusum"] = Field("cusum", description="detector that raises alarms")
     false_alarms_every: ScaledSeconds = Field(20000.0, description="mean time between false alarms, s")
     window: WindowConfig = Field(default_factory=WindowConfig)
-    observer: ObserverConfig = Field(default_factory=ObserverConfig, description="gain; by default from the noise")
     step: Seconds | None = Field(
         None, description="longest integration step, s; by default about a hundredth of the tanks' emptying time"
     )
     output: OutputConfig = Field(default_factory=OutputConfig)
-    seed: int = Field(0, ge=0, description="seed of the simulation that sets the threshold of the GLR")
+    seed: int = Field(0, ge=0, description="seed of the draws of the noise that set the threshold")
 
     @model_validator(mode="before")
     @classmethod

@@ -14,12 +14,10 @@ from fdi_torch.capacity import expect_room
 from fdi_torch.config.monitor_file import WindowConfig
 from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
-from fdi_torch.config.strict import Decibel, ScaledSeconds, Share, Strict, quantity
+from fdi_torch.config.strict import ScaledSeconds, Share, Strict, quantity
 from fdi_torch.effects import build_network, full_name, placements_for
-from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.monitor.monitor_setup import with_shapes
 from fdi_torch.monitor.monte_carlo.detection_plan import DetectionPlan
-from fdi_torch.monitor.monte_carlo.estimator_comparison import ESTIMATOR_NAMES, EstimatorComparisonPlan
 from fdi_torch.monitor.monte_carlo.false_alarm_plan import FalseAlarmPlan
 from fdi_torch.monitor.monte_carlo.isolation_plan import IsolationPlan
 from fdi_torch.monitor.monte_carlo.level_control import moving_commands, moving_set_points
@@ -66,15 +64,6 @@ class NamingConfig(Strict):
     window: WindowConfig = Field(default_factory=WindowConfig)
 
 
-class RivalConfig(Strict):
-    faults: list[str] = Field(min_length=1, description="faults from which random sets are drawn")
-    sets: int = Field(200, ge=1, description="number of sets of faults")
-    part: int = Field(50, ge=1, description="number of sets computed at once")
-    snr_db: list[Decibel] = Field([30.0, 10.0], min_length=1, description="signal-to-noise ratios, dB")
-    rivals: list[Literal[ESTIMATOR_NAMES]] = Field(list(ESTIMATOR_NAMES), min_length=1, description="who is compared")  # type: ignore[valid-type]
-    looks: list[int] = Field([30, 60, 100, 150, 200, 300, 400, 600, 800, 1000], description="in samples")
-
-
 class RehearsalConfig(Strict):
     plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
     inputs: list[str | float] = Field(
@@ -83,16 +72,15 @@ class RehearsalConfig(Strict):
     reading_noise: str = Field("1 mm", description="standard deviation: 1 mm (of the level), or h1 = 1 mm, p2 = 2 mV")
     sampling: ScaledSeconds = Field(1.0, gt=0, description="sampling interval, s")
     false_alarms_every: ScaledSeconds = Field(20000.0, description="design mean time between false alarms, s")
-    detector: Literal["fixed", "cusum", "glr"] = Field("cusum", description="detector that raises alarms under naming")
+    detector: Literal["fixed", "cusum"] = Field("cusum", description="detector that raises alarms under naming")
     false_alarms: FalseAlarmConfig | None = Field(None, description="measure the false alarm rate")
     faults_found: FaultsFoundConfig | None = Field(None, description="measure detection delay, power and isolation")
     naming: NamingConfig | None = Field(None, description="measure isolation of component, sensor and actuator faults")
-    rivals: RivalConfig | None = Field(None, description="compare estimators")
     output: OutputConfig = Field(default_factory=OutputConfig)
     seed: int = Field(0, ge=0, description="seed of all random numbers")
 
 
-Plan = FalseAlarmPlan | DetectionPlan | IsolationPlan | EstimatorComparisonPlan
+Plan = FalseAlarmPlan | DetectionPlan | IsolationPlan
 
 
 @dataclass(frozen=True)
@@ -108,7 +96,7 @@ def load_rehearsal(path: str | Path, overrides: Iterable[str] = ()) -> Rehearsal
     config, plant, text = resolve(RehearsalConfig, data, file.parent, str(file))
     plans = tuple(_plans(config, plant))
     if not plans:
-        raise ValueError(f"{file}: expected false_alarms, faults_found, naming or rivals, got none of them; add one")
+        raise ValueError(f"{file}: expected false_alarms, faults_found or naming, got none of them; add one")
     return Rehearsal(config, plant, file.parent, str(file), text, plans)
 
 
@@ -135,10 +123,6 @@ def _plans(c: RehearsalConfig, plant: PlantDescription) -> Iterable[Plan]:
             yield IsolationPlan(
                 rig, loop, c.detector, settings, n.runs, count(n.lasts), n.onset, n.times, every, c.seed
             )  # fmt: skip
-    if (r := c.rivals) is not None:
-        expect_room(float(max(r.looks)) * (1 + len(plant.sensors)), f"{max(r.looks):.3g} samples", "look earlier")
-        fitting = _fitting(c, plant, r, max(r.looks) + 1)
-        yield EstimatorComparisonPlan(fitting, r.sets, r.part, tuple(r.snr_db), tuple(r.looks), c.seed, tuple(r.rivals))
 
 
 def _inputs(c: RehearsalConfig, plant: PlantDescription) -> torch.Tensor:
@@ -167,10 +151,3 @@ def _rig(
     elif loop == "closed":
         controller = moving_set_points(plant, inputs, levels, c.naming.swing if c.naming else 0.0)
     return SimulatedRig(network, space, inputs, levels, std, c.sampling, noise.wander, noise.colour, controller)
-
-
-def _fitting(c: RehearsalConfig, plant: PlantDescription, r: RivalConfig, samples: int) -> Fitting:
-    inputs, time = _inputs(c, plant), c.sampling * torch.arange(samples, dtype=torch.float64)
-    unread = torch.full((samples, len(plant.sensors)), torch.nan, dtype=torch.float64)
-    blank = plant.recording(time, inputs.expand(samples, -1), unread)
-    return set_up(plant, [blank], [full_name(name, plant) for name in r.faults], "equilibrium")

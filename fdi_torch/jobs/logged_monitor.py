@@ -282,7 +282,6 @@ def _prepare(run: MonitorRun, whole: Recording) -> PreparedMonitor:
         c.seed,
         c.recording.start_levels if at_start else "free",
         c.ranges,
-        c.observer.wish(),
     )
 
 

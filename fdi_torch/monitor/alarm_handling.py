@@ -107,10 +107,15 @@ class AlarmHandler:
         if change is not None and self.explainer.is_current(state, change):
             # The previous change may have been explained wrongly: one change that explains both alarms is preferred.
             fits = self.explainer.of_change(state, change)
+            if fits[0].fits and fits[0].hypothesis.unlisted:
+                counted, event = self._counted_with(state, change)
+                counted, events = self._not_on_list(counted, change, fits)
+                return counted, [event, *events]
             if fits[0].fits and fits[0].hypothesis.columns:
-                counted, events = self._same_change(state, change, fits)
+                counted, event = self._counted_with(state, change)
+                counted, events = self._revise(counted, change, "isolated", fits)
                 if self._is_quiet(counted):
-                    return counted, events
+                    return counted, [event, *events]
         return self._isolate(state)
 
     def retire(
@@ -157,16 +162,12 @@ class AlarmHandler:
         state, answer = self._adopt(state, change, "isolated")
         return state, [*events, *answer]
 
-    def _same_change(
-        self, state: MonitorState, change: DetectedChange, fits: Sequence[HypothesisFit]
-    ) -> tuple[MonitorState, list[Event]]:
+    def _counted_with(self, state: MonitorState, change: DetectedChange) -> tuple[MonitorState, Event]:
         """Count the pending alarm with the alarm of the latest change, which explains both."""
         assert state.pending is not None
         alarm = state.alarm(state.pending.number)
         state, event = self.retire(state, alarm.number, f"it belongs to alarm {change.number}", announced=False)
-        state = state.with_alarm(state.alarm(change.number).raised_again(alarm.last))
-        revised, events = self._revise(state, change, "isolated", fits)
-        return revised, [event, *events]
+        return state.with_alarm(state.alarm(change.number).raised_again(alarm.last)), event
 
     def _reconsider(self, state: MonitorState, change: DetectedChange) -> tuple[MonitorState, list[Event]]:
         """Fit all explanations of the latest change again.
@@ -177,6 +178,8 @@ class AlarmHandler:
             return replace(state, change=replace(change, next_fit=float("inf"))), []
         fits = self.explainer.of_change(state, change)
         best = fits[0]
+        if best.fits and not best.hypothesis.columns:
+            return self._not_on_list(state, change, fits)
         present = [f for f in fits if f.hypothesis.columns == change.best.hypothesis.columns]
         resized = state.adjusted > change.best.onset  # sizes changed since, so no single change explains the window
         not_better = (
@@ -189,14 +192,44 @@ class AlarmHandler:
             return replace(state, change=replace(change, next_fit=later)), []
         return self._revise(state, change, "revised", fits)
 
+    def _not_on_list(
+        self, state: MonitorState, change: DetectedChange, fits: Sequence[HypothesisFit]
+    ) -> tuple[MonitorState, list[Event]]:
+        """Report that a cause that is not on the list, or chance, explains the latest change better.
+
+        The observer keeps its parameters as a substitute for such a cause, but they are no known fault any more. By
+        chance nothing changed, so that it goes on with those before the change.
+        """
+        reported = self.explainer.reported(fits)
+        names, next_fit = self._names(reported), self.explainer.next_fit(change.best, state.now)
+        tracks = tuple(t for t in state.tracks if t.number != change.number)
+        told, change = change.reported, replace(change, next_fit=next_fit, reported=names)
+        moved = replace(state, change=change, tracks=tracks)
+        if not fits[0].hypothesis.unlisted:
+            moved = adopt_change(self.observer, moved, change, change.before)
+        moved, event = self._cannot_tell(moved, change.number, reported)
+        return moved, [] if names == told else [event]
+
+    def _cannot_tell(
+        self, state: MonitorState, number: int, reported: Sequence[HypothesisFit]
+    ) -> tuple[MonitorState, Event]:
+        """Report explanations of which the likeliest is no fault of the list, and restart the detector beside it."""
+        told = beside_deviation(state).with_alarm(state.alarm(number).with_state(State.CANNOT_TELL))
+        event = self.writer.unexplained(told, number, reported)
+        return told.with_alarm(replace(told.alarm(number), explanations=event.explanations)), event
+
+    def _names(self, reported: Sequence[HypothesisFit]) -> tuple[tuple[str, ...], ...]:
+        """Parameter names of each explanation."""
+        return tuple(tuple(self.space.names[c] for c in f.hypothesis.columns) for f in reported)
+
     def _unexplained(self, state: MonitorState, fits: Sequence[HypothesisFit]) -> tuple[MonitorState, list[Event]]:
         """Report once that no fault explains the alarm, and try again until the longest window is full."""
         assert state.pending is not None
         number, attempts = state.pending.number, state.pending.attempts + 1
         waiting, events = replace(state, pending=PendingAlarm(number, attempts)), []
         if attempts == 1:
-            waiting = beside_deviation(waiting).with_alarm(waiting.alarm(number).with_state(State.CANNOT_TELL))
-            events = [self.writer.unexplained(waiting, number, self.explainer.reported(fits))]
+            waiting, event = self._cannot_tell(waiting, number, self.explainer.reported(fits))
+            events = [event]
         if self.next_fit(waiting) - state.alarm(number).last <= self.settings.longest:
             return waiting, events
         waiting, event = self.retire(waiting, number, "no fault of the list explains it")
@@ -243,7 +276,7 @@ class AlarmHandler:
         change = replace(change, explanations=kept)
         back = recovered_columns(self.space, change)
         ended = tuple(t for t in (change.ended or state.tracks) if t.column in back)
-        names = tuple(tuple(self.space.names[c] for c in f.hypothesis.columns) for f in reported)
+        names = self._names(reported)
         announce = announce or names != change.reported
         change = replace(change, ended=ended, reported=names)
         state = adopt_change(self.observer, state, change, reset_to_nominal(self.space, change, back))

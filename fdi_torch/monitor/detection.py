@@ -1,8 +1,7 @@
-"""Detectors on white residuals: fixed threshold, CUSUM and GLR, designed for a mean time between false alarms."""
+"""Detectors on white residuals: fixed threshold and CUSUM, designed for a mean time between false alarms."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -14,20 +13,17 @@ from torch import Tensor
 from fdi_torch.monitor.false_alarm_rate import (
     ChartRate,
     FalseAlarmDesign,
-    block_maxima,
     cusum_rate,
     fixed_rate,
     latin_hypercube,
-    sum_of_squares_rate,
 )
 from fdi_torch.monitor.whitening import Whitening
 
-Chart = Literal["fixed", "cusum", "glr"]
-CHARTS: tuple[Chart, ...] = ("fixed", "cusum", "glr")
+Chart = Literal["fixed", "cusum"]
+CHARTS: tuple[Chart, ...] = ("fixed", "cusum")
 
 # CUSUM's drift: half the shift, in standard deviations of the white residual, for which the detection delay is least.
 DRIFT = 0.5
-LONGEST_WINDOW = 200  # samples, of the GLR
 NO_ALARM = -1
 
 
@@ -59,23 +55,6 @@ class Detector:
         first = above.to(torch.int8).argmax(dim=-1)
         return torch.where(above.any(dim=-1), first, torch.full_like(first, NO_ALARM))
 
-    def first_alarm_since(self, white: Tensor, since: Tensor) -> tuple[Tensor, Tensor]:
-        """Index of the first alarm at or after sample `since`, and the number of earlier alarms; all (*batch).
-
-        The index is NO_ALARM if there is none. The detector restarts after each alarm.
-        """
-        remaining = torch.nan_to_num(white, nan=0.0)
-        index = torch.arange(remaining.shape[-2], device=remaining.device)
-        early = torch.zeros_like(since)
-        while True:
-            first = self.first_alarm(remaining)
-            before = (first != NO_ALARM) & (first < since)
-            if not bool(before.any()):
-                return first, early
-            early = early + before
-            processed = before.unsqueeze(-1) & (index <= first.unsqueeze(-1))
-            remaining = torch.where(processed.unsqueeze(-1), 0.0, remaining)
-
     def alarms(self, white: Tensor) -> Tensor:
         """(*batch, S), True where an alarm is raised. After each, the detector restarts with the next sample."""
         remaining = torch.nan_to_num(white, nan=0.0)
@@ -96,13 +75,11 @@ def make_detector(
     channels: int,
     generator: torch.Generator,
     learnt: Whitening | None = None,
-    peaks: Tensor | None = None,
 ) -> Detector:
     """A detector with the given mean time between false alarms (s) over all channels together.
 
     sampling: s between samples. learnt: whitening estimated from a finite recording, whose uncertainty raises the
-    threshold; without it the noise is known. peaks: simulated block maxima of the GLR, to save repeating the
-    simulation. Raises ValueError.
+    threshold; without it the noise is known. Raises ValueError.
     """
     run_length = time_between_false_alarms / sampling
     if not run_length >= 20.0:
@@ -112,26 +89,20 @@ def make_detector(
         )
     rate: ChartRate
     update: Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]]
-    sums: Callable[[float], tuple[int, ...]]  # lengths of those that decide about an alarm
+    length: Callable[[float], int]  # of the sums that decide about an alarm
     if chart == "fixed":
-        rate, sums = fixed_rate, lambda threshold: (1,)
-        update = max_abs
+        rate, length, update = fixed_rate, lambda threshold: 1, max_abs
     elif chart == "cusum":
         # A sum that alarms by chance has most likely grown by the drift with each sample.
-        rate, sums = partial(cusum_rate, drift=DRIFT), lambda threshold: (max(round(threshold / DRIFT), 1),)
+        rate, length = partial(cusum_rate, drift=DRIFT), lambda threshold: max(round(threshold / DRIFT), 1)
         update = partial(cusum, DRIFT)
-    elif chart == "glr":
-        lengths = window_lengths(LONGEST_WINDOW)
-        update = partial(glr, lengths)
-        peaks = block_maxima(lambda e: update(e, None)[0], channels, generator) if peaks is None else peaks
-        rate, sums = sum_of_squares_rate(peaks, channels, generator), lambda threshold: lengths
     else:
         raise ValueError(f"expected a detector of {', '.join(CHARTS)}, got '{chart}'")
 
     def error(threshold: float) -> Tensor:
         if learnt is None:
             return torch.zeros(channels, dtype=torch.float64)
-        return torch.stack([learnt.error_of_sums(n) for n in sums(threshold)]).square().mean(0).sqrt()
+        return learnt.error_of_sums(length(threshold))
 
     median = torch.full((1, channels), 0.5, dtype=torch.float64)
     share = median if learnt is None else latin_hypercube(channels, generator)
@@ -154,29 +125,3 @@ def cusum(drift: float, white: Tensor, before: Tensor | None = None) -> tuple[Te
     sums = torch.cumsum(torch.cat([before[..., :1, :], moves], dim=-2), dim=-2)[..., 1:, :]
     lowest = torch.cummin(torch.cat([before[..., 1:, :], sums], dim=-2), dim=-2).values[..., 1:, :]
     return (sums - lowest).amax(dim=-1), torch.stack([sums[..., -1, :], lowest[..., -1, :]], dim=-2)
-
-
-def glr(lengths: tuple[int, ...], white: Tensor, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """The largest |sum e|^2 / n over windows of the last n samples, n from `lengths`.
-
-    It is twice the log-likelihood ratio of a change of the mean in any channels (Willsky & Jones 1976). white (*batch,
-    S, C); before (*batch, N, C): the last N cumulative sums, N at most the longest window.
-    """
-    fresh = torch.nan_to_num(white, nan=0.0)
-    before = torch.zeros_like(fresh[..., :1, :]) if before is None else before
-    further = torch.cumsum(torch.cat([before[..., -1:, :], fresh], dim=-2), dim=-2)
-    sums = torch.cat([before[..., :-1, :], further], dim=-2)
-    best, count, total = torch.zeros_like(fresh[..., 0]), fresh.shape[-2], sums.shape[-2]
-    for n in lengths:
-        reach = min(count, total - n)
-        if reach <= 0:
-            break
-        change = sums[..., total - reach :, :] - sums[..., total - reach - n : total - n, :]
-        best[..., count - reach :] = torch.maximum(best[..., count - reach :], change.square().sum(-1) / n)
-    return best, sums[..., -(lengths[-1] + 1) :, :]
-
-
-def window_lengths(longest: int) -> tuple[int, ...]:
-    """1, 2, 3, 4, 6, 8, 11, 16, ... up to `longest`: half an octave apart, which loses 1.5 % of a shift's evidence."""
-    lengths = {min(round(2.0 ** (i / 2)), longest) for i in range(2 * math.ceil(math.log2(max(longest, 2))) + 1)}
-    return tuple(sorted(lengths))

@@ -171,7 +171,7 @@ class EventWriter:
             rate = (size - float(change.before[c])) / (now - fit.onset) if grows and change else None
             sizes.append(self._size(state, c, size, std, rate))
         if not sizes:
-            return Explanation(fit.probability, (), unlisted=not fit.fits)
+            return Explanation(fit.probability, (), unlisted=h.unlisted or not fit.fits)
         ended = tuple(self.space.names[c] for c in h.recovered if c not in hidden)
         return Explanation(fit.probability, tuple(sizes), fit.onset, fit.onset_std, h.incipient, ended)
 

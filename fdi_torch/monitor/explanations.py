@@ -18,18 +18,12 @@ GROWING_WINDOWS = 8.0  # longest windows over which one straight line describes 
 
 @dataclass(frozen=True)
 class Explainer:
-    """Fits the faults that may occur: the first `watched` parameters of the observer's space."""
+    """Fits the faults that may occur. unlisted: those that are not on the list."""
 
     observer: ObserverBank
     faults: Sequence[Fault]
-    watched: int
     settings: MonitorSettings
-
-    def fault_free(self, believed: Tensor) -> Tensor:
-        """Parameter values (P,) with every fault at nominal and the calibrated constants as they are."""
-        healthy = believed.clone()
-        healthy[: self.watched] = self.observer.space.nominal()[: self.watched]
-        return healthy
+    unlisted: Sequence[Fault] = ()
 
     def search_start(self, state: MonitorState, alarm_time: float) -> float:
         """The earliest onset of a change that raised an alarm, s: not before the previous change."""
@@ -59,11 +53,20 @@ class Explainer:
         The window is doubled, up to `earliest` s, while the onset of a plausible one lies at its beginning: the change
         may have occurred before it, and a fault that had grown before would not be an explanation.
         """
-        s, healthy = self.settings, self.fault_free(believed)
+        s = self.settings
         while True:
             window = state.window(start)
             fits = isolate(
-                self.observer, window, believed, self.faults, s.incipient, s.together, healthy, earlier, flows=True
+                self.observer,
+                window,
+                believed,
+                self.faults,
+                s.incipient,
+                s.together,
+                state.healthy,
+                earlier,
+                flows=True,
+                unlisted=self.unlisted,
             )
             plausible = [f for f in fits if f.hypothesis.columns and f.probability > SMALLEST_PROBABILITY]
             if start <= earliest or all(f.onset - start > 2.0 * f.onset_std for f in plausible):

@@ -18,16 +18,10 @@ import torch
 from scipy.special import gammaincinv
 from torch import Tensor
 
-from fdi_torch.monitor.whitening import least_squares
-
 DRAWS = 1000  # from the posterior
-DIRECTIONS = 50  # of the sum that exceeds the GLR's threshold
 # Twice the mean overshoot of a sum of standard normal numbers, -2 zeta(1/2) / sqrt(2 pi), and its decrease with the
 # square of the drift, -zeta(-1/2) / (3 sqrt(2 pi)) (Chang & Peres 1997).
 OVERSHOOT, DECREASE = 1.16519, 0.02765
-# Simulated blocks. The probability of an alarm in a block is fitted as a function of the threshold, which needs fewer
-# draws than counting alarms.
-BLOCKS, BLOCK, BURN_IN = 4000, 1500, 500
 SMALLEST_ERROR = 1e-6  # of a standard deviation that is known
 SMALLEST_DRIFT = 1e-6  # over the standard deviation; below it the run length is that without a drift
 RAREST = 1e-300  # rate that counts as different from zero, 1/s
@@ -125,46 +119,3 @@ def cusum_rate(threshold: float, std: Tensor, drift: float) -> Tensor:
     k = (drift / std).clamp(min=SMALLEST_DRIFT)
     twice = 2.0 * k * (threshold / std + OVERSHOOT - DECREASE * k.square())
     return (4.0 * k.square() / (torch.expm1(twice) - twice)).sum(dim=-1)
-
-
-def sum_of_squares_rate(peaks: Tensor, channels: int, generator: torch.Generator) -> ChartRate:
-    """Rate of a statistic that is |sum e|^2 / n over some window, from its sorted maxima in blocks of unit variance.
-
-    The sum has a random direction u: with other variances the statistic is larger by sum u^2 std^2.
-    """
-    rate = rate_of_maxima(peaks)
-    direction = torch.randn(DIRECTIONS, channels, generator=generator, dtype=peaks.dtype).square()
-    direction = direction / direction.sum(dim=-1, keepdim=True)
-    return lambda threshold, std: rate(threshold / (std.square() @ direction.mT)).mean(dim=-1)
-
-
-def block_maxima(statistic: Callable[[Tensor], Tensor], channels: int, generator: torch.Generator) -> Tensor:
-    """Sorted maxima of a statistic (*batch, S, C) -> (*batch, S) in simulated blocks of white residuals."""
-    maxima = []
-    for _ in range(BLOCKS // 200):
-        noise = torch.randn(200, BURN_IN + BLOCK, channels, generator=generator, dtype=torch.float64)
-        maxima.append(statistic(noise)[:, BURN_IN:].amax(dim=1))
-    return torch.cat(maxima).sort().values
-
-
-def rate_of_maxima(peaks: Tensor) -> Callable[[Tensor], Tensor]:
-    """Alarms per sample as a function of the threshold h, from a statistic's sorted maxima in blocks of white noise.
-
-    In the steady state the probability of an alarm within a block of B samples is 1 - exp(-B / N). log(-log P(no
-    alarm)) is fitted by a parabola in h, so that all blocks contribute to the estimate of a rare alarm; beyond the
-    maxima the parabola is continued by its tangents.
-    """
-    share = (torch.arange(len(peaks), dtype=torch.float64) + 0.5) / len(peaks)
-    used = (share > 0.02) & (share < 0.995)
-    fitted, hazard = peaks[used], torch.log(-torch.log(share[used]))
-    centre = fitted.mean()
-    powers = torch.stack([(fitted - centre) ** i for i in range(3)], dim=1)
-    c0, c1, c2 = least_squares(powers, hazard.unsqueeze(1)).flatten()
-
-    def rate(threshold: Tensor) -> Tensor:
-        nearest = threshold.clamp(fitted[0], fitted[-1])
-        x = nearest - centre
-        log_hazard = c0 + (c1 + c2 * x) * x + (c1 + 2.0 * c2 * x) * (threshold - nearest)
-        return (torch.exp(log_hazard) / BLOCK).clamp(max=1.0)
-
-    return rate

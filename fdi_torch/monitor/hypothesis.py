@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 
 from torch import Tensor
@@ -41,13 +41,14 @@ class Hypothesis:
 
     columns: of the parameter space. incipient: whether they grow linearly from the onset instead of changing at once.
     shape: those of the columns that are period or phase. recovered: those that return to nominal, so that only the
-    onset is estimated.
+    onset is estimated. unlisted: any cause that is not on the list of faults; it changes none of the parameters.
     """
 
     columns: tuple[int, ...]
     incipient: bool = False
     shape: tuple[int, ...] = ()
     recovered: tuple[int, ...] = ()
+    unlisted: bool = False
 
     @property
     def free(self) -> list[int]:
@@ -104,7 +105,7 @@ class HypothesisFit:
         return 1.0 if self.fits else max(2.0 * self.misfit / self.noise_level, 1.0)
 
 
-NO_CHANGE = Hypothesis(())
+NO_CHANGE, UNLISTED = Hypothesis(()), Hypothesis((), unlisted=True)
 
 
 def with_posterior(fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
@@ -136,11 +137,30 @@ def merged(fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
 
     Sudden and incipient changes of the same parameters count as one explanation, with the sum of their probabilities.
     """
-    each: dict[tuple[tuple[int, ...], tuple[int, ...]], HypothesisFit] = {}
+    each: dict[Hypothesis, HypothesisFit] = {}
     for f in sorted(fits, key=lambda fit: -fit.probability):
-        key = f.hypothesis.columns, f.hypothesis.recovered
+        key = replace(f.hypothesis, incipient=False)
         each[key] = replace(each[key], probability=each[key].probability + f.probability) if key in each else f
     return sorted(each.values(), key=lambda fit: -fit.probability)
+
+
+def with_unlisted_as_one(fits: Sequence[HypothesisFit], unlisted: Container[int]) -> list[HypothesisFit]:
+    """The fits, with those of faults that are not on the list as one explanation; the likeliest explanation first.
+
+    unlisted: columns of these faults. One that no reading can distinguish from a fault of the list counts as that one.
+    """
+    outside = [f for f in fits if any(c in unlisted for c in f.hypothesis.columns)]
+    inside = [f for f in fits if not any(c in unlisted for c in f.hypothesis.columns)]
+    outside = [f for f in outside if not any(_indistinguishable(f, other) for other in inside)]
+    if not outside:
+        total = sum(f.probability for f in inside)
+        return [replace(f, probability=f.probability / total) for f in inside]
+    best, together = outside[0], sum(f.probability for f in outside)
+    cause = replace(best, hypothesis=UNLISTED, at_bound=(), probability=together)
+    total = together + sum(f.probability for f in inside)
+    listed = merged(inside)[0].probability
+    order = [cause, *inside] if together > listed else [inside[0], cause, *inside[1:]]
+    return [replace(f, probability=f.probability / total) for f in order]
 
 
 def credible_set(fits: Sequence[HypothesisFit], level: float = 0.95) -> list[HypothesisFit]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.evidence import log_prior, log_volume
+from fdi_torch.estimate.evidence import ODDS, log_prior, log_volume
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.linearisation import Linearisation
@@ -32,13 +32,21 @@ ITERATIONS = 12
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior odds of a hypothesis. names: of the parameter space. single_changes: number of possible single changes."""
+    """Prior odds of a hypothesis.
+
+    names: of the parameter space. single_changes: number of possible single changes. unlisted: columns of faults that
+    are not on the list; unlisted_changes: number of possible changes of these.
+    """
 
     names: tuple[str, ...]
     single_changes: int
+    unlisted: Container[int] = ()
+    unlisted_changes: int = 0
 
     def __call__(self, hypothesis: Hypothesis) -> float:
         """Log of the odds against no change."""
+        if any(c in self.unlisted for c in hypothesis.columns):
+            return math.log(ODDS.unknown / self.unlisted_changes)
         new = [c for c in hypothesis.sizes if c not in hypothesis.recovered]
         places = len({ParameterName.parse(self.names[c]).place for c in new}) + bool(hypothesis.recovered)
         return log_prior(hypothesis.count, places, max(self.single_changes, 1))

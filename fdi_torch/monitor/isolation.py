@@ -11,7 +11,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.hypothesis import Fault, Hypothesis, HypothesisFit, with_posterior
+from fdi_torch.monitor.hypothesis import Fault, Hypothesis, HypothesisFit, with_posterior, with_unlisted_as_one
 from fdi_torch.monitor.hypothesis_fit import Prior, changes_of, fit, misfit, no_change_fit, point_of
 from fdi_torch.monitor.initial_guess import oscillation_guess, recovery_guesses, recovery_hypotheses, signature_guesses
 from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow, no_change
@@ -30,17 +30,20 @@ def isolate(
     healthy: Tensor | None = None,
     earlier: Sequence[HypothesisFit] = (),
     flows: bool = False,
+    unlisted: Sequence[Fault] = (),
 ) -> list[HypothesisFit]:
     """Fits of all single changes, of the best ones combined with a further fault, and of no change, likeliest first.
 
     All faults of a hypothesis share one onset, and a window holds one change. believed (P,): parameters before the
     change. healthy (P,): the same without faults; if given, recovery of the faults in `believed` is a hypothesis too.
     earlier: previous fits of the same change, used as further initial guesses. flows: whether random flows are learnt
-    from the window too; the misfits of two calls are then not those of the same noise.
+    from the window too; the misfits of two calls are then not those of the same noise. unlisted: faults that are not on
+    the list; together they are one explanation.
     """
     manners = (False, True) if incipient else (False,)
-    prior = Prior(observer.space.names, len(faults) * len(manners))
-    plain = [Hypothesis((f.size,), late) for late in manners for f in faults if not f.shape]
+    outside = [f.size for f in unlisted]
+    prior = Prior(observer.space.names, len(faults) * len(manners), outside, len(outside) * len(manners))
+    plain = [Hypothesis((f.size,), late) for late in manners for f in (*faults, *unlisted) if not f.shape]
     oscillating = [Hypothesis(f.columns, shape=f.shape) for f in faults if f.shape]
     base = observer.white_innovations(window, believed, no_change(believed))
     starts = torch.cat(
@@ -57,8 +60,10 @@ def isolate(
         starts = torch.cat([starts, torch.stack([point_of(f) for f in earlier])])
     hypotheses = [*plain, *oscillating, *recoveries, *(f.hypothesis for f in earlier)]
     fits = _best_of_each(fit(observer, window, believed, hypotheses, starts, misfit(base), prior))
+    # Where nothing fits, the law of the plant or of a known fault is wrong: no evidence for a cause outside the list.
+    fits = [f for f in fits if f.fits or f.hypothesis.columns[0] not in outside]
     for _ in range(1, deepest):
-        best = [f for f in fits if f.hypothesis.count < deepest][:2]
+        best = [f for f in fits if f.hypothesis.count < deepest and f.hypothesis.columns[0] not in outside][:2]
         origin = {b.hypothesis.with_fault(f): b for b in best for f in faults if f.size not in b.hypothesis.columns}
         wider = [h for h in origin if h not in {f.hypothesis for f in fits}]
         if not wider:
@@ -72,6 +77,7 @@ def isolate(
     ranked = with_posterior([*fits, no_change_fit(observer, window, believed, base)])
     if flows and ranked[0].hypothesis.columns and ranked[0].fits:
         observer, ranked = _with_flows_of_window(observer, window, believed, ranked, prior)
+    ranked = with_unlisted_as_one(ranked, outside) if outside else ranked
     return [_beyond_range(observer, window, believed, f, prior) if f.at_bound else f for f in ranked]
 
 

@@ -47,8 +47,9 @@ class ResidualTrace:
 class Monitor:
     """Monitor of one plant. It holds no state of its own: `advance` takes a state and returns the next one.
 
-    The first `watched` parameters of `space` (all by default) are faults that may occur; the others are calibrated
-    constants, which stay fixed.
+    The first `watched` parameters of `space` (all by default) are faults that may occur, and the last `unlisted` ones
+    faults that are not on the list: none of them is told by its name, nor used by the observer. The others are
+    calibrated constants, which stay fixed.
     """
 
     def __init__(
@@ -60,16 +61,18 @@ class Monitor:
         settings: MonitorSettings | None = None,
         longest_step: float | None = None,
         watched: int | None = None,
+        unlisted: int = 0,
     ) -> None:
         if not len(space):
             raise ValueError("expected at least one fault to watch for, got none; name some")
         self.network, self.space, self.noise, self.detector = network, space, noise, detector
         self.settings = settings or usual_settings(network.description)
-        self.watched = len(space) if watched is None else watched
+        self.watched = len(space) - unlisted if watched is None else watched
         self.faults = faults_of(space.names[: self.watched])
         self.observer = ObserverBank(network, space, noise.gain, noise.whitening, longest_step)
         self.writer = EventWriter(self.observer, self.settings, self.watched)
-        explainer = Explainer(self.observer, self.faults, self.watched, self.settings)
+        outside = [f for f in faults_of(space.names) if f.size >= len(space) - unlisted]
+        explainer = Explainer(self.observer, self.faults, self.settings, outside)
         self.alarms = AlarmHandler(explainer, detector, self.writer)
         self.fewest = self.alarms.reach + noise.whitening.order + 1
 
@@ -86,12 +89,14 @@ class Monitor:
         by default. learning_until: end of the segment from which the noise was learnt, s; before it the monitor raises
         no alarm, because it would use noise estimates from readings that are still to come.
         """
-        theta = self.space.nominal() if believed is None else believed
+        nominal = self.space.nominal()
+        theta = nominal if believed is None else believed
+        healthy = torch.cat([nominal[: self.watched], theta[self.watched :]])  # calibrated constants as they are
         state = initial_state(
             self.observer,
             samples,
             theta,
-            self.alarms.explainer.fault_free(theta),
+            healthy,
             levels=levels,
             correlation_time=self.settings.lookback,
         )

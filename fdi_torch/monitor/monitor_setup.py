@@ -17,15 +17,12 @@ from fdi_torch.monitor.fault_free_checks import false_alarm_rate_text, fault_war
 from fdi_torch.monitor.hypothesis import SHAPE, faults_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
-from fdi_torch.monitor.noise_model import NoiseModel, learn_noise, noise_of_gain, operating_point
-from fdi_torch.monitor.observer import Observer
-from fdi_torch.monitor.observer_gain import Gain, hand_gain, start_beside_noise, timed_gain
-from fdi_torch.monitor.samples import Samples, samples_of_recording, usual_interval
+from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
+from fdi_torch.monitor.samples import samples_of_recording, usual_interval
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.monitor.whitening import FEWEST_SAMPLES
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
-from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.step_length import commensurate_step
 
@@ -35,7 +32,7 @@ class PreparedMonitor:
     """A monitor ready to start.
 
     believed: parameter values for the observer, including calibrated constants. calibrated: the constants' values by
-    name. radius: decay factor of the observer's error per sample. warnings: signs that the fault-free part is not fault
+    name. warnings: signs that the fault-free part is not fault
     free. false_alarm_text: accuracy of the time between false alarms.
     """
 
@@ -43,23 +40,8 @@ class PreparedMonitor:
     believed: Tensor
     noise: NoiseModel
     calibrated: dict[str, float]
-    radius: float
     warnings: tuple[str, ...] = ()
     false_alarm_text: str = ""
-
-
-@dataclass(frozen=True)
-class GainSpecification:
-    """User-defined observer gain: a time constant in s, or a matrix (tanks x sensors, m per unit of the reading and
-    sample). Without it, the gain follows from the noise.
-    """
-
-    time_constant: float | None = None
-    by_hand: tuple[tuple[float, ...], ...] = ()
-
-    def __post_init__(self) -> None:
-        if (self.time_constant is None) == (not self.by_hand):
-            raise ValueError("expected either a time constant or a gain by hand, got both or none; give one")
 
 
 def prepare_monitor(
@@ -74,9 +56,9 @@ def prepare_monitor(
     seed: int = 0,
     start: StartLevels = "free",
     ranges: Mapping[str, tuple[float, float]] | None = None,
-    gain: GainSpecification | None = None,
 ) -> PreparedMonitor:
-    """A monitor for `faults` (parameters such as 'T1.leak.size'; the usual ones by default).
+    """A monitor for `faults` (parameters such as 'T1.leak.size'; the usual ones by default). The usual ones that are
+    not among them are causes that are not on the list.
 
     calibrate: constants that are first fitted to the fault-free recording, with their tolerances as priors. start:
     knowledge of the initial levels. step: longest integration step, s; by default `usual_step`, or the fraction of the
@@ -88,11 +70,12 @@ def prepare_monitor(
     interval = usual_interval(fault_free.time)
     step = min(commensurate_step(usual_step(plant), interval) if step is None else step, 1.25 * interval)
     watched = with_shapes(list(faults) or usual_faults(plant), plant)
-    network = build_network(plant, placements_for(watched))
+    unlisted = [name for name in usual_faults(plant) if name not in watched]
+    network = build_network(plant, placements_for([*watched, *unlisted]))
     running = without_startup_effects(plant, fault_free.ran)  # the fault-free part need not be the start of the run
-    learning = build_network(running, placements_for([*watched, *calibrate]))
+    learning = build_network(running, placements_for([*watched, *calibrate, *unlisted]))
     values = calibration(running, fault_free, calibrate, step, start) if calibrate else {}
-    space = ParameterSpace([network.constants[name] for name in (*watched, *calibrate)])
+    space = ParameterSpace([network.constants[name] for name in (*watched, *calibrate, *unlisted)])
     for name in watched:
         if ParameterName.parse(name).field == "phase":  # a full turn either way, so that no fit stops at +-pi
             space = space.with_changes(name, low=-2.0 * math.pi, high=2.0 * math.pi)
@@ -106,45 +89,18 @@ def prepare_monitor(
         space = space.with_changes(name, low=low, high=high)
     believed = space.vector(values)
     samples = samples_of_recording(fault_free, plant)
-    if gain is None:
-        noise, seen = learn_noise(learning, samples, space, believed, longest_step=step)
-        radius = Observer(learning, noise.gain, space, believed, step).check_stable(samples)
-    else:
-        given = _specified_gain(learning, samples, space, believed, step, gain)
-        observer = Observer(learning, given, space, believed, step)
-        radius = observer.check_stable(samples)
-        noise, seen = noise_of_gain(learning, given, samples, space, believed, step)
+    noise, seen = learn_noise(learning, samples, space, believed, longest_step=step)
     sampling = float(torch.diff(samples.time).median())
     generator = torch.Generator().manual_seed(seed)
     every = time_between_false_alarms
     detector = make_detector(chart, every, sampling, len(plant.sensors), generator, learnt=noise.whitening)
-    monitor = Monitor(network, space, noise, detector, settings, step, watched=len(watched))
+    monitor = Monitor(network, space, noise, detector, settings, step, len(watched), len(unlisted))
     warnings = (
         *residual_warnings(plant, noise, detector, seen),
         *fault_warnings(learning, space, samples, believed, step, faults_of(watched)),
     )
     text = false_alarm_rate_text(noise, detector, every)
-    return PreparedMonitor(monitor, believed, noise, values, radius, warnings, text)
-
-
-def _specified_gain(
-    network: TankNetwork,
-    samples: Samples,
-    space: ParameterSpace,
-    believed: Tensor,
-    step: float,
-    specification: GainSpecification,
-) -> Gain:
-    if specification.by_hand:
-        matrix = torch.tensor(specification.by_hand, dtype=network.nominal.dtype)
-        effects = matrix.new_zeros(network.order - len(network.description.tanks), matrix.shape[-1])
-        return hand_gain(torch.cat([matrix, effects]))  # states of effects follow the levels
-    linear = operating_point(network, samples, space, believed, step)
-    unit = torch.linalg.vector_norm(linear.output, dim=-1)
-    span = float(torch.diff(samples.time).median())
-    assert specification.time_constant is not None
-    start_std = start_beside_noise(network.description, unit)
-    return timed_gain(linear, span, specification.time_constant, unit, start_std)
+    return PreparedMonitor(monitor, believed, noise, values, warnings, text)
 
 
 def with_shapes(faults: Sequence[str], plant: PlantDescription) -> list[str]:

@@ -40,7 +40,7 @@ class NoiseModel:
     """Noise model identified from a fault-free recording.
 
     reading_std (sensors,): measurement noise in the readings' units. ratio: process over measurement noise, both as
-    levels; NaN if unknown. whitening: of the observer's residual. gain: of the observer. interval: usual time between
+    levels. whitening: of the observer's residual. gain: of the observer. interval: usual time between
     samples, s.
     """
 
@@ -77,23 +77,6 @@ def learn_noise(
     fine = candidates([coarse.exponent + offset for offset in FINE])
     best = candidates([_minimizing_exponent(fine)])[0]
     return replace(_noise(network, linear, best), interval=usual_interval(fault_free.time)), best.seen
-
-
-def noise_of_gain(
-    network: TankNetwork,
-    gain: Gain,
-    fault_free: Samples,
-    space: ParameterSpace | None = None,
-    theta: Tensor | None = None,
-    longest_step: float | None = None,
-) -> tuple[NoiseModel, Observation]:
-    """Noise model for a given observer gain: only the residual's autocorrelation, and its standard deviation."""
-    seen = Observer(network, gain, space, theta, longest_step).run(fault_free)
-    settled = seen.last(max(len(fault_free) - len(gain.opening), len(fault_free) // 2))
-    linear = operating_point(network, fault_free, space, theta, longest_step)
-    whitening = _whitening(network, linear, gain, seen)
-    std = settled.steady_residual.square().nanmean(dim=0).sqrt()
-    return NoiseModel(std, math.nan, whitening, gain, usual_interval(fault_free.time)), seen
 
 
 @dataclass(frozen=True)

@@ -14,15 +14,11 @@ from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.inverted_sensor import levels_from_readings
 from fdi_torch.plant.network import PlaceValues, TankNetwork
-from fdi_torch.plant.scales import length_scale
 from fdi_torch.simulate.build import BuildError
 from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.engine import Readings
 from fdi_torch.simulate.injection import Injection, lay_out_samples
 from fdi_torch.simulate.traced_engine import TracedEngine
-
-LEVEL_OFFSET = 1e-5  # small change of the levels, in units of the plant's length scale
-DECAYED, DIVERGED = 1e-4, 1e3  # shares of that change at which the stability check stops
 
 
 @dataclass(frozen=True)
@@ -174,30 +170,6 @@ class Observer:
         return (
             table.movedim(0, -3).expand(*lanes, -1, -1, -1).reshape(lanes.numel(), *table.shape[:1], *table.shape[-2:])
         )
-
-    def check_stable(self, samples: Samples) -> float:
-        """Decay factor of an initial error per sample, geometric mean.
-
-        It compares two runs along the same readings with different initial levels. Raises ValueError if the error does
-        not decay.
-        """
-        start = initial_levels(self.stepper.network, samples, self.values)
-        moved = start + LEVEL_OFFSET * length_scale(self.stepper.network.description)
-        steady, self.gain = self.gain, Gain(self.gain.steady, self.gain.opening[:0], self.gain.inflation[:0])
-        one, other = (self.run(samples, levels).levels for levels in (start, moved))
-        self.gain = steady
-        rates = []
-        for error in torch.linalg.vector_norm(other - one, dim=-1).reshape(-1, len(samples)):
-            decided = (~((error > DECAYED * error[0]) & (error < DIVERGED * error[0]))).nonzero().flatten()
-            last = int(decided[0]) if len(decided) else len(error) - 1
-            rates.append(float(error[last] / error[0]) ** (1.0 / max(last, 1)))
-        worst = max(rates, key=lambda rate: rate if rate == rate else float("inf"))
-        if not worst < 1.0:
-            raise ValueError(
-                f"expected an observer gain that lets errors decay, got one that lets them grow by {worst:.6g} a "
-                "sample; lower the gain or let it be designed"
-            )
-        return worst
 
     def _lanes(self, samples: Samples) -> torch.Size:
         """Batch shape of recordings, parameters and gains together."""

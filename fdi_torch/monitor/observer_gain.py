@@ -1,8 +1,7 @@
-"""Gains of a Luenberger-like observer: the Kalman gain, a gain for a given time constant, or a gain given by hand."""
+"""Gain of a Luenberger-like observer: the Kalman gain of the linearised plant."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -31,9 +30,6 @@ class Gain:
     steady: Tensor
     opening: Tensor
     inflation: Tensor
-
-    def at(self, k: int) -> Tensor:
-        return self.opening[k] if k < len(self.opening) else self.steady
 
     def table(self, first: int, count: int) -> Tensor:
         """The gains of `count` samples from the `first` of a run on, (count, *batch, tanks, sensors)."""
@@ -127,47 +123,13 @@ def riccati(linear: Linear, process: Tensor, reading: Tensor) -> Tensor:
             return 0.5 * (h + h.mT)
     raise ValueError(
         "expected a plant whose levels can all be observed from its sensors, got one with an unobserved level that is "
-        "not stable by itself; add a sensor or give the gain by hand"
+        "not stable by itself; add a sensor"
     )
 
 
 def hand_gain(matrix: Tensor) -> Gain:
     """A constant gain (order, sensors): K_obv of eq. 14 times the sampling interval."""
     return Gain(matrix, matrix.new_zeros(0, *matrix.shape), matrix.new_zeros(0, matrix.shape[-1]))
-
-
-def timed_gain(linear: Linear, span: float, time_constant: float, reading_std: Tensor, start_std: Tensor) -> Gain:
-    """The Kalman gain whose slowest error mode decays with `time_constant` s, by bisection over the process noise.
-
-    span: s between samples. reading_std (sensors,) and start_std (tanks,) as in `kalman_gain`. Raises ValueError if no
-    gain is that slow, or that fast because a level is not measured.
-    """
-    if not time_constant > 0:
-        raise ValueError(f"expected a positive time constant of the observer, got {time_constant} s")
-    target = math.exp(-span / time_constant)
-    scale = float(reading_std.max())
-    process = torch.ones_like(start_std)
-
-    def at(exponent: float) -> Gain:
-        return kalman_gain(linear, process * scale * 10.0**exponent, reading_std, start_std)
-
-    low, high = -6.0, 4.0
-    slowest, fastest = _radius(linear, at(low).steady), _radius(linear, at(high).steady)
-    if not fastest <= target <= slowest:
-        raise ValueError(
-            f"expected a time constant between {-span / math.log(max(fastest, 1e-300)):.3g} s and "
-            f"{-span / math.log(slowest):.3g} s, which this plant and its sensors allow, got {time_constant:g} s"
-        )
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if _radius(linear, at(middle).steady) > target else (low, middle)
-    return at(0.5 * (low + high))
-
-
-def spectral_radius(linear: Linear, gain: Tensor) -> Tensor:
-    """Spectral radius (*batch) of the error's transition F (I - L H). Below 1 the error decays."""
-    eye = torch.eye(linear.transition.shape[-1], dtype=gain.dtype, device=gain.device)
-    return torch.linalg.eigvals(linear.transition @ (eye - gain @ linear.output)).abs().amax(-1)
 
 
 def start_uncertainty(plant: PlantDescription, like: Tensor) -> Tensor:
@@ -182,10 +144,6 @@ def start_beside_noise(plant: PlantDescription, like: Tensor) -> Tensor:
     length scale.
     """
     return start_uncertainty(plant, like) / length_scale(plant)
-
-
-def _radius(linear: Linear, gain: Tensor) -> float:
-    return float(spectral_radius(linear, gain).max())
 
 
 def _filter_gain(linear: Linear, predicted: Tensor, reading: Tensor) -> tuple[Tensor, Tensor]:

@@ -49,13 +49,6 @@ class Samples:
         inputs = self.inputs[i] if self.inputs.dim() > 2 else self.inputs
         return replace(self, inputs=inputs, readings=self.readings[i])
 
-    def input_at(self, k: int, share: float = 0.0) -> Tensor:
-        """The inputs at `share` (0..1) of the interval from sample k to the next, (*batch, channels)."""
-        left = self.inputs[..., k, :]
-        if self.hold == "zero_order" or share == 0.0 or k + 1 == len(self):
-            return left
-        return left + share * (self.inputs[..., k + 1, :] - left)
-
 
 def samples_of_recording(recording: Recording, plant: PlantDescription) -> Samples:
     """One recording as samples without a batch dimension. Raises ValueError if a channel is missing."""

@@ -7,8 +7,11 @@ after the other's equation is removed (Krysander & Frisk 2008; Definitions 1 and
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
+
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement, Stage, place_kind
@@ -68,23 +71,8 @@ def overdetermined(equations: dict[str, frozenset[str]]) -> set[str]:
 
 
 def matching(equations: dict[str, frozenset[str]]) -> dict[str, str]:
-    """A maximum matching, unknown -> equation, by augmenting paths."""
-    matched: dict[str, str] = {}
-
-    def augment(equation: str, tried: set[str]) -> bool:
-        for unknown in _ordered(equations[equation]):
-            if unknown in tried:
-                continue
-            tried.add(unknown)
-            if unknown not in matched or augment(matched[unknown], tried):
-                matched[unknown] = equation
-                return True
-        return False
-
-    for equation in equations:
-        augment(equation, set())
-    return matched
-
-
-def _ordered(names: Iterable[str]) -> Sequence[str]:
-    return sorted(names)
+    """A maximum matching, unknown -> equation."""
+    names, unknowns = list(equations), sorted(frozenset().union(*equations.values()))
+    table = csr_array([[float(unknown in equations[name]) for unknown in unknowns] for name in names])
+    partner = maximum_bipartite_matching(table, perm_type="row")
+    return {unknown: names[row] for unknown, row in zip(unknowns, partner.tolist(), strict=True) if row >= 0}

@@ -1,6 +1,6 @@
-"""Parameter estimators for one window of readings: the search of the 2020 paper (eq. 16) and alternatives.
+"""Parameter estimators for one window of readings: the search of the 2020 paper (eq. 16), and least squares.
 
-All take the same window and the previous estimate, and process a batch of runs.
+Both take a window and the previous estimate, and process a batch of runs.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.draws import problem_seeds
-from fdi_torch.estimate.evolution import distant_members, evolve
+from fdi_torch.estimate.evolution import evolve
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.information import certainty
@@ -27,8 +27,6 @@ from fdi_torch.simulate.engine import Readings
 SEARCH_STEP, REFINE_STEP = 5.0, 0.5
 SEARCH = EvolutionSettings(population=40, evaluations=2000)
 REFINE = RefineSettings(iterations=60, decrease_tolerance=1e-6)
-STARTS = 8  # random starts of the multi-start refinement, in addition to the previous estimate
-REFINED = 3  # clearly different members of the search that are refined
 # A channel is constant if its standard deviation is less than this multiple of its sample-to-sample noise.
 CONSTANT_RATIO = 1.2
 
@@ -83,40 +81,6 @@ Estimator = Callable[[WindowData, Tensor, int], WindowEstimate]
 
 def evolution(window: WindowData, before: Tensor, seed: int) -> WindowEstimate:
     """Differential evolution on the sum of correlations, started at the previous estimate (2020 paper, eq. 16)."""
-    members, _ = _searched(window, before, seed)
-    return WindowEstimate(members[:, 0], torch.full_like(before, torch.nan))
-
-
-def hybrid(window: WindowData, before: Tensor, seed: int) -> WindowEstimate:
-    """Differential evolution, then likelihood refinement of its best distant members and of the previous estimate."""
-    members, _ = _searched(window, before, seed)
-    return _refined(window, torch.cat([members, before.unsqueeze(1)], dim=1))
-
-
-def least_squares(window: WindowData, before: Tensor, seed: int) -> WindowEstimate:
-    """Levenberg-Marquardt on the likelihood, from the previous estimate."""
-    return _refined(window, before.unsqueeze(1))
-
-
-def multi_start(window: WindowData, before: Tensor, seed: int) -> WindowEstimate:
-    """Levenberg-Marquardt from the previous estimate and from random points of the box."""
-    low, high = window.box
-    generator = torch.Generator().manual_seed(seed)
-    drawn = torch.rand(window.runs, STARTS, before.shape[1], generator=generator, dtype=before.dtype)
-    starts = low.unsqueeze(1) + drawn * (high - low).unsqueeze(1)
-    return _refined(window, torch.cat([starts, before.unsqueeze(1)], dim=1))
-
-
-ESTIMATORS: dict[str, Estimator] = {
-    "hybrid": hybrid,
-    "evolution": evolution,
-    "least_squares": least_squares,
-    "multi_start": multi_start,
-}
-
-
-def _searched(window: WindowData, before: Tensor, seed: int) -> tuple[Tensor, Tensor]:
-    """The best clearly different members of the search (R, K, P), best first, and the best cost (R,)."""
     low, high = window.box
     objective: Objective = "correlation" if window.moves() else "likelihood"
     span = float(window.fitting.recordings[0].time[-1] - window.fitting.recordings[0].time[0])
@@ -124,22 +88,15 @@ def _searched(window: WindowData, before: Tensor, seed: int) -> tuple[Tensor, Te
     problem = window.problem(min(longest, span / 20.0), objective)
     seeds = problem_seeds(seed, (window.runs,), low.device)
     result = evolve(problem.cost, low, high, SEARCH, seeds, first_guess=before.clamp(low, high).unsqueeze(1))
-    return distant_members(result.population, result.cost, (high - low)[0], REFINED), result.best_cost
+    return WindowEstimate(result.population[:, 0], torch.full_like(before, torch.nan))
 
 
-def _refined(window: WindowData, starts: Tensor) -> WindowEstimate:
-    """The best refinement over the starts (R, K, P)."""
-    starts_per_run, (low, high) = starts.shape[1], window.box
+def least_squares(window: WindowData, before: Tensor, seed: int) -> WindowEstimate:
+    """Levenberg-Marquardt on the likelihood, from the previous estimate."""
     problem = window.problem(REFINE_STEP * time_scale(window.fitting.plant), "likelihood")
-    refined = levenberg_marquardt(
-        lambda theta, members: problem.linearise(theta, members // starts_per_run),
-        starts,
-        low.unsqueeze(1),
-        high.unsqueeze(1),
-        REFINE,
-    )
-    cost = torch.where(torch.isfinite(refined.cost), refined.cost, torch.inf)
-    rows, best = torch.arange(window.runs), cost.argmin(-1)
+    refined = levenberg_marquardt(problem.linearise, before, *window.box, REFINE)
     assert refined.curvature is not None
-    held = None if refined.held is None else refined.held[rows, best]
-    return WindowEstimate(refined.theta[rows, best], certainty(refined.curvature[rows, best], held=held).std)
+    return WindowEstimate(refined.theta, certainty(refined.curvature, held=refined.held).std)
+
+
+ESTIMATORS: dict[str, Estimator] = {"evolution": evolution, "least_squares": least_squares}

@@ -153,7 +153,8 @@ class WindowMonitor:
         fitting = set_up(plant, [recording], self.space.parameters[: self.watched], "free")
         network = fitting.networks[0]
         for name, value in zip(self.space.names[self.watched :], believed[self.watched :].tolist(), strict=True):
-            network.nominal[network.constants.index(name)] = value
+            if name in network.constants:
+                network.nominal[network.constants.index(name)] = value
         return fitting
 
     def _estimate_event(self, estimate: WindowEstimate, now: float, start: float, believed: Tensor) -> Event:

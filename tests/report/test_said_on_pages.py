@@ -49,7 +49,7 @@ def test_runs_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> Non
 
 
 def test_words_of_a_table_are_left_aligned() -> None:
-    assert _texts([["5 %", "fixed", "20"], ["20 %", "glr", "7"]]) == 2
+    assert _texts([["5 %", "fixed", "20"], ["20 %", "cusum", "7"]]) == 2
     assert _texts([["white", "24 (18 .. 40)"]]) == 1 and _texts([]) == 1
 
 

@@ -1,4 +1,4 @@
-"""Validate a monitor on simulated runs: false alarms, detection delays, isolation, comparison of estimators.
+"""Validate a monitor on simulated runs: false alarms, detection delays, isolation.
 
 The work consists of tasks of seconds to minutes; Ctrl-C keeps those that are done, and --resume continues.
 """

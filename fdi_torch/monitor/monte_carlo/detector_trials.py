@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.detection import CHARTS, LONGEST_WINDOW, NO_ALARM, Detector, glr, make_detector, window_lengths
-from fdi_torch.monitor.false_alarm_rate import block_maxima
+from fdi_torch.monitor.detection import CHARTS, Detector, make_detector
 from fdi_torch.monitor.monte_carlo.simulated_runs import FaultSchedule, SimulatedRig
 from fdi_torch.monitor.noise_model import NoiseModel
 from fdi_torch.monitor.observer import Observer
@@ -20,18 +18,7 @@ from fdi_torch.monitor.whitening import Whitening
 
 def detectors(every: float, sampling: float, channels: int, learnt: Whitening | None = None) -> list[Detector]:
     """One detector of each kind, all with the mean time `every` s between false alarms."""
-    peaks = _peaks(channels)
-    return [
-        make_detector(chart, every, sampling, channels, torch.Generator(), learnt=learnt, peaks=peaks)
-        for chart in CHARTS
-    ]
-
-
-@lru_cache(maxsize=8)
-def _peaks(channels: int) -> Tensor:
-    """Simulated block maxima for the GLR's threshold, kept for further detectors."""
-    lengths = window_lengths(LONGEST_WINDOW)
-    return block_maxima(lambda white: glr(lengths, white)[0], channels, torch.Generator().manual_seed(0))
+    return [make_detector(chart, every, sampling, channels, torch.Generator(), learnt=learnt) for chart in CHARTS]
 
 
 def white_residuals(rig: SimulatedRig, noise: NoiseModel, samples: Samples) -> Tensor:
@@ -58,8 +45,7 @@ def delays(
     white = white_residuals(rig, noise, samples)
     results = []
     for detector in charts:
-        since = (samples.time < schedule.onset.unsqueeze(1)).sum(1)
-        first, early = detector.first_alarm_since(white, since)
-        when = torch.where(first == NO_ALARM, torch.inf, samples.time[first.clamp(min=0)])
-        results.append(Delays(detector.chart, when - schedule.onset, early > 0))
+        alarms, before = detector.alarms(white), samples.time < schedule.onset.unsqueeze(1)
+        first = torch.where(alarms & ~before, samples.time, torch.inf).amin(dim=1)
+        results.append(Delays(detector.chart, first - schedule.onset, (alarms & before).any(dim=1)))
     return results

@@ -10,7 +10,6 @@ from statistics import NormalDist
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.hypothesis import SHAPE, Fault
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
@@ -93,14 +92,12 @@ def _inward(observer: ObserverBank, believed: Tensor, scenario: FaultScenario) -
 class IsolationResult:
     """Result of the monitor on one run.
 
-    alarm: time of the first alarm after the onset, s, or None. first, last: parameters named by the first and the last
-    event after the onset; grows: whether the last event describes an incipient fault. early: number of earlier alarms.
+    alarm: time of the first alarm after the onset, s, or None. last: the faults named by the last event after the
+    onset, without period and phase of an oscillation. early: number of earlier alarms.
     """
 
     alarm: float | None
-    first: tuple[str, ...]
     last: tuple[str, ...]
-    grows: bool
     early: int
 
 
@@ -110,22 +107,11 @@ def isolate_run(monitor: Monitor, samples: Samples, believed: Tensor, levels: Te
     """
     state = monitor.start(samples, believed, levels)
     _, events = monitor.advance(state, samples.segment(1, len(samples)))
-    return _result(events, onset)
-
-
-def _result(events: Sequence[Event], onset: float) -> IsolationResult:
     alarms = [e.time for e in events if e.kind == "alarm"]
     after = [t for t in alarms if t >= onset]
-    naming = [e for e in events if e.faults and e.time >= onset]
-    first, last = (_sizes(naming[0]), _sizes(naming[-1])) if naming else ((), ())
-    return IsolationResult(
-        after[0] if after else None, first, last, bool(naming) and naming[-1].growing, len(alarms) - len(after)
-    )
-
-
-def _sizes(event: Event) -> tuple[str, ...]:
-    """The faults that an event names, without period and phase of an oscillation."""
-    return tuple(name for name in event.faults if ParameterName.parse(name).field not in SHAPE)
+    named = next((e.faults for e in reversed(events) if e.faults and e.time >= onset), ())
+    last = tuple(name for name in named if ParameterName.parse(name).field not in SHAPE)
+    return IsolationResult(after[0] if after else None, last, len(alarms) - len(after))
 
 
 def confusions(truth: Sequence[str], named: Sequence[tuple[str, ...]], most: int = 8) -> list[tuple[str, str, int]]:

@@ -45,11 +45,11 @@ class JointModel:
         self.tanks = len(network.description.tanks)
 
     def moved(self, z: Tensor, samples: Samples, k: int) -> Tensor:
-        """The state at sample k + 1 from that at sample k."""
+        """The state at sample k + 1 from that at sample k, with held inputs."""
         begin, end = float(samples.time[k]), float(samples.time[k + 1])
         values = bind_parameters(self.network, self.space, z[..., self.tanks :])
         state = PlantState(z[..., : self.tanks])
-        after = self.stepper.advance(state, lambda share: samples.input_at(k, share), begin, end - begin, values)
+        after = self.stepper.advance(state, lambda share: samples.inputs[..., k, :], begin, end - begin, values)
         return torch.cat([after.levels, z[..., self.tanks :]], dim=-1)
 
     def read(self, z: Tensor, end: float) -> Tensor:
@@ -80,7 +80,7 @@ def adaptive_observer(
         span = end - float(samples.time[k - 1]) if k else 0.0
         z = model.moved(z, samples, k - 1) if k else z
         residual = samples.readings[..., k, :] - model.read(z, end)
-        both = torch.cat([gain.at(k), span * rate])
+        both = torch.cat([gain.table(k, 1)[0], span * rate])
         z = model.kept(z + _times(both, torch.nan_to_num(residual, nan=0.0)))
         states.append(z)
         residuals.append(residual)

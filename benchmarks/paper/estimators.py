@@ -1,27 +1,34 @@
-"""Comparison of on-line estimators on random multiple faults: error over its bound, failures, speed and cost."""
+"""On-line estimators side by side, on random sets of one to five of the paper's faults.
+
+`python -m benchmarks.paper.estimators` prints error over the Cramer-Rao bound, failures, speed and cost of each.
+"""
 
 from __future__ import annotations
 
+import argparse
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.fitting import Fitting
+from benchmarks.paper.adaptive_observer import LEVEL_NOISE, JointModel, adaptive_gain, adaptive_observer, joint_filter
+from benchmarks.paper.published import PARAMETERS
+from fdi_torch.config.plant_file import load_plant
+from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.estimate.information import certainty, fisher_information
-from fdi_torch.monitor.adaptive_observer import LEVEL_NOISE, JointModel, adaptive_gain, adaptive_observer, joint_filter
-from fdi_torch.monitor.monte_carlo.tasks import Numbers, ResultTable, Task, quantiles, seeded_generator
+from fdi_torch.monitor.monte_carlo.tasks import quantiles
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.window_estimators import ESTIMATORS, WindowData
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import length_scale
+from fdi_torch.recording import Recording
 from fdi_torch.simulate.simulated_recording import noise_level
 
-NAME = "rivals"
+INPUTS = (50e-6, 50e-6)  # m^3/s
+LOOKS = (30, 60, 100, 150, 200, 300, 400, 600, 800, 1000)  # numbers of samples after which all estimate
 # Integration step (s) of the data and of the bounds: fine, so that no estimator has the same discretization error.
 DATA_STEP = 0.05
 FILTERS = ("kalman", "adaptive")
@@ -68,20 +75,26 @@ class ComparisonRow:
     """Performance of one estimator.
 
     over_bound: root mean square of error / bound over the faulty parameters of successful runs, and its 95 % interval.
-    failures: number of the `runs` whose final errors exceed both 5 % of the range and five bounds. never: number of
+    failures: number of runs whose final errors exceed both 5 % of the range and five bounds. never: number of
     runs that did not stay within 5 %.
     to_close: quartiles of the time after which all parameters stay within 5 % of their range, s; infinite: never.
     """
 
     name: str
-    snr_db: float
-    runs: int
     over_bound: float
     interval: tuple[float, float]
     failures: int
     never: int
     to_close: tuple[float, float, float]
     cost: float
+
+    @property
+    def line(self) -> str:
+        """A row of a table."""
+        low, middle, high = (f"{t:.0f}" if t < 1e9 else "never" for t in self.to_close)
+        error = f"{self.over_bound:.2g} ({self.interval[0]:.2g} to {self.interval[1]:.2g})"
+        close = f"{middle} ({low} to {high})"
+        return f"| {self.name} | {error} | {self.failures} | {self.never} | {close} | {1e3 * self.cost:.2g} ms |"
 
 
 def draw_runs(fitting: Fitting, count: int, snr_db: float, generator: torch.Generator) -> RandomFaultRuns:
@@ -116,7 +129,7 @@ def track_estimates(name: str, runs: RandomFaultRuns, sample_counts: Sequence[in
     return EstimateTracks(torch.tensor(sample_counts), theta, seconds / (len(runs.truth) * runs.readings.shape[1]))
 
 
-def comparison_row(name: str, snr_db: float, runs: RandomFaultRuns, tracks: EstimateTracks) -> ComparisonRow:
+def comparison_row(name: str, runs: RandomFaultRuns, tracks: EstimateTracks) -> ComparisonRow:
     """Summarise the tracks of one estimator."""
     space = runs.fitting.space
     deviation = (tracks.theta - runs.truth.unsqueeze(1)).abs()
@@ -134,7 +147,7 @@ def comparison_row(name: str, snr_db: float, runs: RandomFaultRuns, tracks: Esti
     times = torch.where(first >= 0, step * tracks.sample_counts[first].to(torch.float64), torch.inf)
     low_quarter, middle, high_quarter = quantiles(times.tolist(), (0.25, 0.5, 0.75))
     return ComparisonRow(
-        name, snr_db, len(failed), mean**0.5, (low, high), int(failed.sum()), int((first < 0).sum()),
+        name, mean**0.5, (low, high), int(failed.sum()), int((first < 0).sum()),
         (low_quarter, middle, high_quarter), tracks.cost,
     )  # fmt: skip
 
@@ -181,61 +194,31 @@ def _initial_std(space: ParameterSpace) -> Tensor:
     return (space.high() - space.low()) / 3.0
 
 
-@dataclass(frozen=True)
-class EstimatorComparisonPlan:
-    """Monte Carlo plan: `sets` random fault sets, `subset` of them per task. looks: numbers of samples after which all
-    estimate.
-    """
+def blank_recording(plant: PlantDescription, seconds: int) -> Recording:
+    """A recording of the three tanks with constant inputs, one sample a second, without readings."""
+    time = torch.arange(seconds + 1, dtype=torch.float64)
+    unread = torch.full((seconds + 1, len(plant.sensors)), torch.nan, dtype=torch.float64)
+    columns, units = tuple(s.column for s in plant.sensors), tuple(s.unit for s in plant.sensors)
+    inputs = torch.tensor(INPUTS, dtype=torch.float64).expand(seconds + 1, -1)
+    return Recording(time, inputs, unread, plant.channels(), columns, tuple(plant.channel_units().values()), units)
 
-    fitting: Fitting
-    sets: int
-    subset: int
-    snr_db: tuple[float, ...]
-    looks: tuple[int, ...]
-    seed: int
-    rivals: tuple[str, ...] = ESTIMATOR_NAMES
 
-    def tasks(self) -> list[Task]:
-        return [
-            Task(f"{NAME}/{snr:g}/{rival}", lambda s=snr, r=rival, f=first: self._track(s, r, f))  # type: ignore[misc]
-            for snr in self.snr_db
-            for rival in self.rivals
-            for first in range(0, self.sets, self.subset)
-        ]
-
-    def _track(self, snr: float, rival: str, first: int) -> Numbers:
-        tracks = track_estimates(rival, self._runs(snr, first), self.looks)
-        return {"theta": tracks.theta.flatten().tolist(), "cost": tracks.cost, "first": float(first)}
-
-    @lru_cache(maxsize=4)  # noqa: B019 - a plan lives as long as the program
-    def _runs(self, snr: float, first: int) -> RandomFaultRuns:
-        count = min(self.subset, self.sets - first)
-        return draw_runs(self.fitting, count, snr, seeded_generator(self.seed, 9, int(snr), first))
-
-    def result_table(self, numbers: Mapping[str, Sequence[Mapping[str, Any]]]) -> ResultTable:
-        rows = []
-        for snr in self.snr_db:
-            for rival in self.rivals:
-                results = numbers.get(f"{NAME}/{snr:g}/{rival}", ())
-                if results:
-                    rows.append(self._row(snr, rival, results))
-        what = ("SNR, dB", "rival", "sets", "error / bound", "95 %", "failures", "never within 5 %")
-        times = ("to within 5 %, s (quartiles)", "CPU ms a sample")
-        nearest = min(rows, key=lambda row: float(row[3]), default=None)
-        summary = f"{nearest[1]} comes nearest to the bound ({nearest[3]} times it)" if nearest else ""
-        return ResultTable("rivals on random sets of faults", (*what, *times), tuple(rows), summary)
-
-    def _row(self, snr: float, rival: str, results: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-        width = len(self.fitting.space)
-        parts = [self._runs(snr, int(n["first"])) for n in results]
-        theta = torch.cat(
-            [torch.tensor(n["theta"], dtype=torch.float64).reshape(-1, len(self.looks), width) for n in results]
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--sets", type=int, default=200)
+    a = parser.parse_args()
+    plant = load_plant("three_tank")
+    fitting = set_up(plant, [blank_recording(plant, LOOKS[-1])], list(PARAMETERS), "equilibrium")
+    for snr_db in (30.0, 10.0):
+        runs = draw_runs(fitting, a.sets, snr_db, torch.Generator().manual_seed(a.seed))
+        print(
+            f"| SNR {snr_db:g} dB | error / bound | failures | never within 5 % | to within 5 %, s (quartiles) | CPU |"
         )
-        fields = ("truth", "faulty", "readings", "std", "bound")
-        runs = RandomFaultRuns(self.fitting, *(torch.cat([getattr(p, field) for p in parts]) for field in fields))
-        cost = sum(n["cost"] for n in results) / len(results)
-        row = comparison_row(rival, snr, runs, EstimateTracks(torch.tensor(self.looks), theta, cost))
-        quarter = [f"{t:.0f}" if t < 1e9 else "never" for t in row.to_close]
-        ratio = (f"{row.over_bound:.2f}", f"{row.interval[0]:.2f} .. {row.interval[1]:.2f}")
-        ends = (str(row.failures), str(row.never), f"{quarter[1]} ({quarter[0]} .. {quarter[2]})")
-        return (f"{snr:g}", rival, str(row.runs), *ratio, *ends, f"{1e3 * row.cost:.3g}")
+        print("|---|---|---|---|---|---|")
+        for name in ESTIMATOR_NAMES:
+            print(comparison_row(name, runs, track_estimates(name, runs, LOOKS)).line, flush=True)
+
+
+if __name__ == "__main__":
+    main()
