@@ -31,7 +31,7 @@ class UnmeteredFlow(Effect):
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         flow = 0.1 * flow_scale(plant, place)
-        shares = [(k / 4, 1 / 4) for k in range(4)] + [(k / 8, 1 / 2) for k in range(5)] + [(0.0, 1.0)]
+        shares = [(k / 4, 1 / 4) for k in range(4)] + [(k / 8, 1 / 2) for k in range(5)]
         return [
             {
                 "flow": sign * flow,

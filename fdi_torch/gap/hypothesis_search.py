@@ -114,7 +114,8 @@ class HypothesisSearch:
             best = likeliest(trials)
 
     def _with_fewer_effects(self, best: CauseHypothesis) -> list[CauseHypothesis]:
-        """Variants of a hypothesis without one of its effects, with its discrepancy or one at an effect's place."""
+        """Variants of a hypothesis without one of its effects, with its discrepancy or, if it has none, one at any place:
+        the effect may only have compensated it."""
         if (at := best.discrepancy) is not None:
             beside = _without_discrepancy(best, at)
             reduced = [
