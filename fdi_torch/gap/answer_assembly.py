@@ -70,7 +70,7 @@ def _names(result: DiagnosisResult, hypothesis: CauseHypothesis) -> tuple[CauseN
 
 
 def _where(result: DiagnosisResult) -> list[tuple[str, float]]:
-    """Places by the probability of a cause there; it is one at a sensor with outliers."""
+    """Places with the probability of a cause there, the likeliest first; 1 for a sensor with outliers."""
     shown = {place for effect, place in result.from_readings if effect == UNKNOWN}
     places = [(place, 1.0 if place in shown else share) for place, share in result.posterior.places]
     return sorted(places, key=lambda item: -item[1])

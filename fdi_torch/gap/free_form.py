@@ -90,7 +90,7 @@ class FreeFlow(_Free):
 
 
 class FreeInflow(_Free):
-    """A tank or a pair of tanks: scale (f(level or difference) + k(t))."""
+    """Any flow into a tank, scale (f(level) + k(t)), or between two tanks, scale (f(difference of levels) + k(t))."""
 
     name = "free_inflow"
     stage = Stage.BALANCE

@@ -66,7 +66,7 @@ def coefficients_of(
 
 
 def without_time_course(free: Sequence[Placement]) -> tuple[Placement, ...]:
-    """Free forms without their functions of time, which belong to the clock of one recording."""
+    """The free forms without their functions of time, which would not repeat in another recording."""
     placements = []
     for p in free:
         effect: Any = p.effect
@@ -94,7 +94,7 @@ def _without_initial_levels(fitter: Fitter, fit: Fit, columns: Tensor, residual:
 
 
 def fitted_coefficients(fitter: Fitter, fit: Fit, free: Sequence[Placement]) -> Coefficients:
-    """Coefficients of a fit that contains the free form itself."""
+    """Coefficients of a free form, with their covariance, from a fit that contains it."""
     indices = [fit.space.index(n) for n in fit.values_of(free)]
     selected = covariance(fitter, fit)[indices][:, indices]
     return Coefficients(tuple(fit.space.names[i] for i in indices), fit.theta[indices], selected)

@@ -114,8 +114,8 @@ class HypothesisSearch:
             best = likeliest(trials)
 
     def _with_fewer_effects(self, best: CauseHypothesis) -> list[CauseHypothesis]:
-        """Variants of a hypothesis without one of its effects, with its discrepancy or, if it has none, one at any place:
-        the effect may only have compensated it."""
+        """Variants of a hypothesis without one of its effects, with its discrepancy or, if it has none, one at any
+        place: the effect may only have compensated it."""
         if (at := best.discrepancy) is not None:
             beside = _without_discrepancy(best, at)
             reduced = [
@@ -140,7 +140,8 @@ class HypothesisSearch:
     def _with_the_same(
         self, at: LocalizedDiscrepancy, fits: Iterable[Fit], best: CauseHypothesis
     ) -> list[CauseHypothesis]:
-        """Other effects with the same discrepancy. fits: beside it. best: likeliest hypothesis so far."""
+        """Hypotheses with other effects beside the same discrepancy. fits: of these effects, to the readings without
+        what it explains. best: likeliest hypothesis so far."""
         noise, hypotheses = best.explanation.noise, list[CauseHypothesis]()
         for fit in fits:
             fitter = with_disturbances(self.pool.fitter, fit, noise)

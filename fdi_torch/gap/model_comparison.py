@@ -155,8 +155,8 @@ def prediction_arrays(result: DiagnosisResult, holdouts: Sequence[HeldOut]) -> d
 
 
 def _as_recorded(data: DataSet, values: Tensor) -> Tensor:
-    """Map (S, C) in the plant's order of sensors to the recording's order and samples; NaN for columns without a
-    sensor."""
+    """Readings (S, C) of the plant's sensors, in their order, as columns and samples of the recording; NaN in columns
+    without a sensor."""
     names, values = data.recording.output_names, at_recorded_times(data, values)
     arranged = values.new_full((len(values), len(names)), torch.nan)
     for i, sensor in enumerate(data.plant.sensors):

@@ -1,4 +1,4 @@
-"""Choice among the starts of a candidate, by separable least squares about a fit of fewer effects.
+"""Choice among the initial values of further effects, by separable least squares about a fit without them.
 
 Only the parameters z of the effects that the fit lacks vary; all others follow linearly, with the sensitivities J and
 the parameters x of the fit:

@@ -132,7 +132,7 @@ class TrajectoryProblem:
         return (here.jacobian.flatten(1, 2).mT @ bend.flatten(1).unsqueeze(-1)).squeeze(-1)
 
     def model(self, theta: Tensor, trial: TrialTrajectory) -> Linearisation:
-        """The model at a trial."""
+        """Readings and Jacobian at the parameters of a trial step."""
         return self._model(theta, self.engine.linearise(theta, trial.levels))
 
     def _model(self, theta: Tensor, linearised: Linearised) -> Linearisation:

@@ -53,7 +53,7 @@ class Prior:
 
 
 def no_change_fit(observer: ObserverBank, window: ObserverWindow, believed: Tensor, base: Tensor) -> HypothesisFit:
-    """The hypothesis of a false alarm. base (1, S, sensors): white innovations without a change."""
+    """The fit of the hypothesis that the alarm is false. base (1, S, sensors): white innovations without a change."""
     limit, first = _noise_limit(observer, window), float(window.samples.time[0])
     level = float(window.readings)
     return HypothesisFit(NO_CHANGE, believed, torch.zeros_like(believed), first, 0.0, 0.0, misfit(base), level, limit)

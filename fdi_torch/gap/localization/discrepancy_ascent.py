@@ -132,7 +132,8 @@ class Ascent:
     def about(
         self, fit: Fit, explained: Tensor, noise: StateNoise, place: str, selection: Selection
     ) -> EvaluatedDiscrepancy:
-        """The discrepancy about a fit beside it, with the levels that are predicted from the readings of right sensors.
+        """The discrepancy evaluated about another fit, whose levels are predicted from readings without the error that
+        a discrepancy at a sensor would be.
 
         explained: part of the readings (S, C) that the discrepancy explains. selection: the regressors from which the
         regression starts. Without any, it would select a hundred where little noise is left.

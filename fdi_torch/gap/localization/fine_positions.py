@@ -118,7 +118,7 @@ class Positions:
         return gains_of((white.T @ self._residual).squeeze(1), white.square().sum(dim=0))
 
     def _products(self, white: Tensor, basis: Tensor) -> list[Tensor]:
-        """Products of all regressors with whitened columns (S C + P, W), what the basis explains projected out, by the
+        """Products of all regressors with whitened columns (S C + P, W), less what the basis explains of these; by the
         families of `position_products`."""
         adjoints = adjoints_of(self.regression, self.under, white, basis)
         if (channel := self.regression.sensor(self.place)) is None:

@@ -37,8 +37,8 @@ EVENTS, SAMPLES = 3, 6  # so many outliers, or samples in all, mean that somethi
 
 @dataclass(frozen=True)
 class Outlier:
-    """rows: its samples, in a row. times: of the first and the last, s. jumps: its height in usual differences of
-    neighbours; infinite for stuck readings."""
+    """Outliers of one sensor in succession. rows: their samples. times: of the first and the last, s. jumps: their
+    height over the usual difference of neighbouring readings; infinite for stuck readings."""
 
     rows: slice
     times: tuple[float, float]
