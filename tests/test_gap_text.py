@@ -103,6 +103,20 @@ def test_an_ambiguous_verdict_states_which_causes_are_certain() -> None:
     )
 
 
+def test_several_places_of_one_unknown_are_told_as_such() -> None:
+    leak, posterior = (
+        ("leak", "T1"),
+        [ProbableExplanation((("leak", "T1"),), p, at) for p, at in ((0.6, "Q1"), (0.38, "h1"))],
+    )
+    answer = replace(BOTH, ambiguity_set=[(leak, ODD), (leak, ("unknown", "h1"))], posterior=posterior)
+    assert answer.verdict == "unknown"
+    assert verdict_sentence(answer.to_dict()) == (
+        "The gap comes from something that no effect of the library describes; 2 explanations are plausible at 95 %, "
+        "the likeliest is leak at T1 and something unknown at Q1, probability 60.0 %. Present with at least 95 %: "
+        "leak at T1."
+    )
+
+
 def test_a_single_explanation_that_does_not_suffice_states_the_unfitted_probability() -> None:
     posterior = [ProbableExplanation((("leak", "T1"),), 0.8)]
     answer = replace(BOTH, verdict="ambiguous", ambiguity_set=[(("leak", "T1"),)], posterior=posterior, unexamined=0.2)

@@ -121,16 +121,18 @@ def _verdict(answer: Named, best: str) -> str:
         return f"No gap: the plant file explains the recording within rounding, noise and tolerances{chance}."
     if verdict == "named":
         return f"The gap comes from {best}{chance}."
+    explanations, certain = answer.get("ambiguity_set") or [], apart_from_rounding(answer.get("certain") or [])
+    count, surely = len(explanations), f" Present with at least 95 %: {explanation_words(certain)}." if certain else ""
     if verdict == "ambiguous":
-        explanations = answer.get("ambiguity_set") or []
-        count, whether = len(explanations), "is" if all(map(apart_from_rounding, explanations)) else "may be"
+        whether = "is" if all(map(apart_from_rounding, explanations)) else "may be"
         plausible = f"{count} explanations are plausible at 95 %, " if count > 1 else ""
         rest = "" if count > 1 else _unfitted(answer)
-        certain = apart_from_rounding(answer.get("certain") or [])
-        surely = f" Present with at least 95 %: {explanation_words(certain)}." if certain else ""
         return f"There {whether} a gap; {plausible}the likeliest is {best}{chance}.{rest}{surely}"
     if verdict != "unknown":
         return ""
+    if causes_of(first) and count > 1:
+        plausible = f"{count} explanations are plausible at 95 %, the likeliest is {best}{chance}."
+        return f"The gap comes from something that no effect of the library describes; {plausible}{surely}"
     if causes_of(first):
         return f"The gap comes from {best}{chance}; no effect of the library describes the unknown part."
     place = next((str(w["location"]) for w in answer.get("where") or []), "a sensor")  # logs of earlier versions

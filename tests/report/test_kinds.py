@@ -101,7 +101,12 @@ def test_a_gap_page_says_where_which_how_far_and_what_next(gap_report: RunReport
             ", or equivalently pump delay at Q1, probability 90.0 %",
         ),
         (
-            {"verdict": "unknown", "causes": [], "posterior": [{"causes": [], "probability": 0.9, "unknown_at": "Q1"}]},
+            {
+                "verdict": "unknown",
+                "causes": [],
+                "ambiguity_set": [[{"effect": "unknown", "location": "Q1"}]],
+                "posterior": [{"causes": [], "probability": 0.9, "unknown_at": "Q1"}],
+            },
             "The gap comes from something unknown at Q1, probability 90.0 %; no effect of the library describes the "
             "unknown part",
         ),
