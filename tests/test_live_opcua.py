@@ -133,7 +133,9 @@ def test_a_recording_through_a_server_gives_the_events_of_the_file(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("restored", [True, False])
 def test_a_server_that_is_stopped_and_started_again_loses_no_event(
+    restored: bool,
     tmp_path: Path,
     plc: Plc,
     once_subscribed: Callable[[Callable[[], None]], threading.Thread],
@@ -141,7 +143,7 @@ def test_a_server_that_is_stopped_and_started_again_loses_no_event(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A restarted server knows neither session nor subscription. The plant waits until the monitor is back, because
-    nothing keeps samples meanwhile.
+    nothing keeps samples meanwhile. restored: whether the library succeeds in restoring the subscription.
     """
     connected_again, put = threading.Event(), Inbox.put
 
@@ -150,7 +152,12 @@ def test_a_server_that_is_stopped_and_started_again_loses_no_event(
         if any(isinstance(item, str) and "again after" in item for item in kept):
             connected_again.set()
 
+    async def failing(subscription: asyncua.common.subscription.Subscription) -> None:
+        raise TimeoutError
+
     monkeypatch.setattr(Inbox, "put", noticing)
+    if not restored:
+        monkeypatch.setattr(asyncua.common.subscription.Subscription, "restore", failing)
     expected = monitored(["--config", config(tmp_path, recording={"file": str(written(tmp_path / "all.csv"))})], capsys)
 
     def replay() -> None:

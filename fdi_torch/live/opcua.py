@@ -21,6 +21,8 @@ WAIT = 15.0
 """Time within which a server must accept the first connection, s."""
 ALIVE = 1.0
 """Interval at which the server's state is read, and time within which it must answer, s."""
+SILENT = 5.0
+"""Time without a value after a loss and between new subscriptions, s."""
 LONGEST_RETRY = 30.0
 """Longest waiting time between attempts to connect, s; the first is 1 s, doubled after each."""
 QUEUE = 1000
@@ -43,6 +45,8 @@ class OpcUaSource:
         self._url = f"opc.tcp://{address.place}/{address.path}".rstrip("/")
         self._place, self._tags, self._period, self._publish = address.place, tags, period, publish
         self._lost_at: float | None = None
+        self._subscribed_at: float | None = None  # the last time since a loss
+        self._subscription: Any = None
         self._waiting: list[Value] | None = []  # values before each node has sent its first; None from then on
         self._inbox, self._stop, self._connected = Inbox(), threading.Event(), threading.Event()
         self._refusal: Exception | None = None
@@ -93,7 +97,6 @@ class OpcUaSource:
         try:
             client = self._asyncua.Client(
                 self._url,
-                timeout=ALIVE,
                 watchdog_intervall=ALIVE,
                 auto_reconnect=True,
                 reconnect_max_delay=LONGEST_RETRY,
@@ -111,12 +114,26 @@ class OpcUaSource:
             self._connected.set()
             while not self._stop.is_set():  # a waiting thread of the pool would outlive Ctrl-C
                 await asyncio.sleep(0.1)
+                await self._ensure_subscribed(client)
         except Exception as error:
             self._refuse(error)
         finally:
             # A server that is gone cannot answer; the process ends all the same.
             with suppress(Exception):
                 await asyncio.wait_for(client.disconnect(), 2.0 * ALIVE)
+
+    async def _ensure_subscribed(self, client: Any) -> None:
+        """Subscribe anew if no value has come for a while since a loss. The library restores a subscription once: if
+        the restarted server answers too late, it would remain without nodes."""
+        since = self._lost_at if self._subscribed_at is None else self._subscribed_at
+        if self._lost_at is None or since is None or client.uaclient.state.name != "CONNECTED":
+            return
+        if time.monotonic() - since > SILENT:
+            self._subscribed_at = time.monotonic()
+            with suppress(Exception):  # before the new one, which may get the same number from a restarted server
+                await asyncio.wait_for(self._subscription.delete(), SILENT)
+            with suppress(Exception):
+                await asyncio.wait_for(self._subscribe(client), SILENT)
 
     async def _subscribe(self, client: Any) -> None:
         """Raises a status code of the server for a node that does not exist."""
@@ -128,7 +145,7 @@ class OpcUaSource:
                 await node.read_data_value()
             except ua.UaError as error:
                 raise ValueError(f"{tag}: {_text(error)}") from error
-        subscription = await client.create_subscription(1000.0 * self._publish, self)
+        self._subscription = await client.create_subscription(1000.0 * self._publish, self)
         every_time = ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp)
         monitored = []
         for k, node in enumerate(nodes):
@@ -136,7 +153,7 @@ class OpcUaSource:
             item.MonitoringMode = ua.MonitoringMode.Reporting
             item.RequestedParameters = ua.MonitoringParameters(k + 1, 1000.0 * self._period, every_time, QUEUE, True)
             monitored.append(item)
-        for result in await subscription.create_monitored_items(monitored):
+        for result in await self._subscription.create_monitored_items(monitored):
             if isinstance(result, ua.StatusCode):
                 result.check()
 
@@ -145,7 +162,7 @@ class OpcUaSource:
         self._connected.set()
 
     async def _lost(self, error: Exception) -> None:
-        self._lost_at = time.monotonic()
+        self._lost_at, self._subscribed_at = time.monotonic(), None
         self._inbox.put([f"connection to {self._place} lost ({_text(error)}); trying again"])
 
 
