@@ -11,10 +11,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from fdi_torch.monitor.alarm_state import Alarm, State
-from fdi_torch.monitor.detection import Detector
 from fdi_torch.monitor.event_text import EventWriter
 from fdi_torch.monitor.events import Event, Kind
-from fdi_torch.monitor.explanations import Explainer
+from fdi_torch.monitor.explanations import Explainer, answer_of
 from fdi_torch.monitor.hypothesis import HypothesisFit, merged
 from fdi_torch.monitor.hypothesis_fit import changes_of
 from fdi_torch.monitor.isolation import SMALLEST_PROBABILITY
@@ -32,17 +31,17 @@ from fdi_torch.monitor.known_faults import (
     with_new_sizes,
 )
 from fdi_torch.monitor.monitor_state import DetectedChange, HiddenFault, MonitorState, PendingAlarm
-from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, beside_deviation, residuals_to_test
+from fdi_torch.monitor.residual_test import ResidualTest
+from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, beside_deviation
 
 
 class AlarmHandler:
     """Alarm logic of one monitor; each method takes a state and returns the next one with the events it causes."""
 
-    def __init__(self, explainer: Explainer, detector: Detector, writer: EventWriter) -> None:
+    def __init__(self, explainer: Explainer, test: ResidualTest, writer: EventWriter) -> None:
         self.explainer, self.observer, self.faults = explainer, explainer.observer, explainer.faults
         self.space, self.settings = self.observer.space, explainer.settings
-        self.detector, self.writer = detector, writer
-        self.reach = max(round(self.settings.lookback / detector.design.interval), 1)
+        self.test, self.writer = test, writer
 
     # Schedule
 
@@ -84,7 +83,7 @@ class AlarmHandler:
             if fits[0].fits and fits[0].hypothesis.columns:
                 again = state.with_alarm(state.alarm(change.number).raised_again(state.now))
                 revised, events = self._revise(again, change, "revised", fits, announce=False)
-                if self._is_quiet(revised):
+                if self.test.is_quiet(revised):
                     return revised, events
         resized = size_change(self.observer, state, self.explainer.search_start(state, state.now), self.faults)
         if resized is not None:
@@ -92,7 +91,9 @@ class AlarmHandler:
             moved, announced = with_new_sizes(moved, resized, self.settings.revise)
             changed = [t for t in moved.tracks if t.column in resized.hypothesis.columns]
             return moved, self.writer.followed(moved, changed, announced)
-        alarm = Alarm(len(state.alarms) + 1, state.now, state.now, self._sensor_shares(state))
+        sensors = [sensor.name for sensor in self.observer.network.description.sensors]
+        shares = self.test.shares(state, self.explainer.search_start(state, state.now))
+        alarm = Alarm(len(state.alarms) + 1, state.now, state.now, tuple(zip(sensors, shares, strict=True)))
         raised = replace(state, alarms=(*state.alarms, alarm), pending=PendingAlarm(alarm.number))
         return raised, [self.writer.raised(raised, alarm)]
 
@@ -114,7 +115,7 @@ class AlarmHandler:
             if fits[0].fits and fits[0].hypothesis.columns:
                 counted, event = self._counted_with(state, change)
                 counted, events = self._revise(counted, change, "isolated", fits)
-                if self._is_quiet(counted):
+                if self.test.is_quiet(counted):
                     return counted, [event, *events]
         return self._isolate(state)
 
@@ -125,22 +126,6 @@ class AlarmHandler:
         retired = state.alarm(number).with_state(State.RETIRED)
         state = replace(state, pending=None, detector_memory=None).with_alarm(retired)
         return state, self.writer.retired(state, retired, reason, announced)
-
-    def _is_quiet(self, state: MonitorState) -> bool:
-        """Whether the detector, run again from the latest change on, stays within its threshold now.
-
-        The misfit of a long window is no such test: its noise hides a deviation of a few seconds.
-        """
-        count = max(int((state.samples.time > state.valid_since).sum()), 1)
-        statistic, _ = self.detector.update(residuals_to_test(state, count, self.reach), None)
-        return float(statistic[-1]) <= self.detector.threshold
-
-    def _sensor_shares(self, state: MonitorState) -> tuple[tuple[str, float], ...]:
-        """The share of each sensor in the detector's statistic."""
-        since = self.explainer.search_start(state, state.now)
-        white = residuals_to_test(state, max(int((state.samples.time > since).sum()), 1), self.reach)
-        names = [sensor.name for sensor in self.observer.network.description.sensors]
-        return tuple(zip(names, self.detector.shares(white).tolist(), strict=True))
 
     # Isolation
 
@@ -304,7 +289,7 @@ class AlarmHandler:
                 events.append(event)
             return state, events
         alarm = state.alarm(change.number)
-        answer = self._answer_of(reported)
+        answer = answer_of(reported)
         state = state.with_alarm(alarm.with_state(answer))
         kind = kind if kind == "revised" and alarm.state is answer else str(answer)  # type: ignore[assignment]
         event = self.writer.answered(state, change, reported, kind, announce or kind != "revised")
@@ -312,10 +297,3 @@ class AlarmHandler:
         named = likeliest.restricted_to([self.space.names[c] for c in present])
         state = state.with_alarm(replace(state.alarm(change.number), explanations=(named, *rivals)))
         return state, [*events, event]
-
-    @staticmethod
-    def _answer_of(reported: Sequence[HypothesisFit]) -> State:
-        best = reported[0]
-        if best.at_bound:
-            return State.CANNOT_TELL
-        return State.ISOLATED if len(reported) == 1 and best.fits else State.EXPLAINED

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from fdi_torch.monitor.alarm_state import State
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit, credible_set, merged
 from fdi_torch.monitor.isolation import SMALLEST_PROBABILITY, isolate
 from fdi_torch.monitor.monitor_settings import MonitorSettings
@@ -85,3 +86,11 @@ class Explainer:
     def reported(self, fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
         """The fewest explanations that together have the reported probability."""
         return credible_set(merged(fits), self.settings.level)
+
+
+def answer_of(reported: Sequence[HypothesisFit]) -> State:
+    """The state of an alarm with these explanations, the likeliest first."""
+    best = reported[0]
+    if best.at_bound:
+        return State.CANNOT_TELL
+    return State.ISOLATED if len(reported) == 1 and best.fits else State.EXPLAINED

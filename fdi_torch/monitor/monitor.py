@@ -23,8 +23,9 @@ from fdi_torch.monitor.monitor_settings import MonitorSettings, usual_settings
 from fdi_torch.monitor.monitor_state import MonitorState
 from fdi_torch.monitor.noise_model import NoiseModel
 from fdi_torch.monitor.observer_bank import LONG_AGO, ObserverBank
+from fdi_torch.monitor.residual_test import ResidualTest
 from fdi_torch.monitor.samples import Samples, split_at_gaps
-from fdi_torch.monitor.state_update import advance_observer, drop_old_samples, initial_state, residuals_to_test
+from fdi_torch.monitor.state_update import advance_observer, drop_old_samples, initial_state
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 
@@ -73,8 +74,9 @@ class Monitor:
         self.writer = EventWriter(self.observer, self.settings, self.watched)
         outside = [f for f in faults_of(space.names) if f.size >= len(space) - unlisted]
         explainer = Explainer(self.observer, self.faults, self.settings, outside)
-        self.alarms = AlarmHandler(explainer, detector, self.writer)
-        self.fewest = self.alarms.reach + noise.whitening.order + 1
+        self.test = ResidualTest(detector, self.settings.lookback)
+        self.alarms = AlarmHandler(explainer, self.test, self.writer)
+        self.fewest = self.test.reach + noise.whitening.order + 1
 
     def start(
         self,
@@ -184,6 +186,5 @@ class Monitor:
     def _observed(self, state: MonitorState, samples: Samples) -> tuple[MonitorState, Tensor]:
         """The state after the samples, and the detector's statistic (S,) at each of them."""
         moved = advance_observer(self.observer, state, samples)
-        residuals = residuals_to_test(moved, len(samples), self.alarms.reach)
-        statistic, memory = self.detector.update(residuals, state.detector_memory)
+        statistic, memory = self.test.statistic(moved, len(samples), state.detector_memory)
         return replace(moved, detector_memory=memory), statistic

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fdi_torch.estimate.evidence import ODDS
 from fdi_torch.monitor.hypothesis import HypothesisFit, faults_of
-from fdi_torch.monitor.law_errors import SIZE_ERROR, STEP, LawErrors, normalized
+from fdi_torch.monitor.law_errors import SIZE_ERROR, STEP, LawErrors
 from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
 from fdi_torch.monitor.observer_bank import LONG_AGO, ChangeHypotheses, ObserverBank, ObserverWindow
 from fdi_torch.monitor.samples import ClockState, Samples, concatenated
@@ -129,13 +129,6 @@ def drop_old_samples(state: MonitorState, fewest: int) -> MonitorState:
         tested=state.tested[first:],
         memory=state.memory[first:],
     )
-
-
-def residuals_to_test(state: MonitorState, count: int, reach: int) -> Tensor:
-    """The last white residuals (count, sensors) for the detector. reach: samples over which those beside known faults
-    are normalized.
-    """
-    return normalized(state.tested, count, reach) if bool(state.off_nominal.any()) else state.tested[-count:]
 
 
 def _run(
