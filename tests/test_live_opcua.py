@@ -143,8 +143,10 @@ def test_a_server_that_is_stopped_and_started_again_loses_no_event(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A restarted server knows neither session nor subscription. The plant waits until the monitor is back, because
-    nothing keeps samples meanwhile. restored: whether the library succeeds in restoring the subscription.
+    nothing keeps samples meanwhile. restored: whether the library succeeds in restoring the subscription. The network
+    is cut until the server is back, because a server that is being stopped may still take up a session.
     """
+    proxy = Proxy(plc.port)
     connected_again, put = threading.Event(), Inbox.put
 
     def noticing(self: Inbox, items: Iterable[Item]) -> None:
@@ -157,6 +159,7 @@ def test_a_server_that_is_stopped_and_started_again_loses_no_event(
 
     monkeypatch.setattr(Inbox, "put", noticing)
     if not restored:
+        monkeypatch.setattr("fdi_torch.live.opcua.SILENT", 2.0)
         monkeypatch.setattr(asyncua.common.subscription.Subscription, "restore", failing)
     expected = monitored(["--config", config(tmp_path, recording={"file": str(written(tmp_path / "all.csv"))})], capsys)
 
@@ -164,17 +167,19 @@ def test_a_server_that_is_stopped_and_started_again_loses_no_event(
         for k, sample in enumerate(MESSAGES):
             if k == 210:
                 time.sleep(0.5)  # for what the server has not sent yet
+                proxy.cut()
                 plc.close()
-                time.sleep(1.0)
                 plc.start()
+                proxy.mend()
                 assert connected_again.wait(60.0)
             plc.write(sample)
             time.sleep(0.005)
 
     thread = once_subscribed(replay)
-    path = config(tmp_path, recording=None, source=source(plc.port))
+    path = config(tmp_path, recording=None, source=source(proxy.port))
     events = monitored(["--config", path, "--idle", "14"], capsys)
     thread.join()
+    proxy.cut()
     assert told(events) == told(expected)
     assert texts(events).count("trying again") == texts(events).count("again after") == 1
 
