@@ -22,7 +22,7 @@ from fdi_torch.gap.channel_noise import (
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
 from fdi_torch.gap.identifiability import planned_identifiability
-from fdi_torch.gap.library import STANDARD, canonical, equivalent_causes, library_of
+from fdi_torch.gap.library import STANDARD, equivalence_class, library_of
 from fdi_torch.gap.screening import Pairs
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
@@ -217,14 +217,19 @@ def test_the_library_offers_65_effects_at_places_of_the_three_tanks() -> None:
 
 def test_a_leak_at_the_floor_and_a_plugged_outlet_without_a_valve_are_one_cause() -> None:
     plant, plugged, leak = nominal_plant(), ("plugging", "OUT2"), ("leak", "T2")
-    assert canonical(plugged, plant) == leak
-    assert equivalent_causes(leak, plant, {}) == (plugged,) and equivalent_causes(plugged, plant, {}) == (leak,)
-    assert equivalent_causes(leak, plant, {"T2.leak.height": 0.3}) == ()
-    assert equivalent_causes(plugged, plant, {"OUT2.plugging.size": -0.4}) == (leak,)
-    assert equivalent_causes(plugged, plant, {"OUT2.plugging.size": 0.4}) == ()
-    assert equivalent_causes(("plugging", "P13"), plant, {"P13.plugging.size": -0.4}) == ()
-    with_valve = replace(plant, pipes=tuple(replace(p, valve="v") if p.name == "OUT2" else p for p in plant.pipes))
-    assert canonical(plugged, with_valve) == plugged and equivalent_causes(leak, with_valve, {}) == ()
+    both = {plugged, leak}
+    assert equivalence_class(leak, plant, {}) == both == equivalence_class(plugged, plant, {})
+    assert equivalence_class(plugged, plant, {"OUT2.plugging.size": -0.4}) == both
+    assert equivalence_class(leak, plant, {"T2.leak.height": 0.3}) == {leak}
+    assert equivalence_class(plugged, plant, {"OUT2.plugging.size": 0.4}) == {plugged}
+    pipe = ("plugging", "P13")
+    assert equivalence_class(pipe, plant, {"P13.plugging.size": -0.4}) == {pipe}
+    (outlet,) = (p for p in plant.pipes if p.name == "OUT2")
+    with_valve = replace(plant, pipes=tuple(replace(p, valve="v") if p is outlet else p for p in plant.pipes))
+    assert equivalence_class(plugged, with_valve, {}) == {plugged} and equivalence_class(leak, with_valve, {}) == {leak}
+    two_outlets = replace(plant, pipes=(*plant.pipes, replace(outlet, name="OUT4")))
+    all_three = both | {("plugging", "OUT4")}
+    assert all(equivalence_class(c, two_outlets, {}) == all_three for c in all_three)
 
 
 def test_a_pair_of_tanks_is_accepted_in_either_order() -> None:

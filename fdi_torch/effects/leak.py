@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
@@ -36,6 +38,12 @@ class Leak(Effect):
         growing = {"size": 0.1, "onset": 0.3 * operating_range.duration, "ramp": 0.7 * operating_range.duration}
         opened = [{"size": 0.1, "onset": instant} for instant in onset_grid(operating_range)]
         return [{"size": 0.1}, *at_height, *opened, growing]
+
+    def equivalents(
+        self, place: str, plant: PlantDescription, values: Mapping[str, float]
+    ) -> tuple[tuple[str, str], ...]:
+        is_raised = values.get("height", 0.0) > 0.0
+        return () if is_raised else tuple(("plugging", outlet) for outlet in plant.floor_outlets(place))
 
     def inflow(self, local: Local, p: Values) -> torch.Tensor:
         head = torch.clamp(local.level - p["height"], min=0.0)

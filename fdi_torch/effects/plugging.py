@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
@@ -30,6 +32,15 @@ class Plugging(Effect):
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         times = [{}, *({"onset": instant} for instant in onset_grid(operating_range))]
         return [{"size": size} | onset for onset in times for size in (0.1, -0.1)]
+
+    def equivalents(
+        self, place: str, plant: PlantDescription, values: Mapping[str, float]
+    ) -> tuple[tuple[str, str], ...]:
+        source = next(p.source for p in plant.pipes if p.name == place)
+        outlets = plant.floor_outlets(source)
+        if place not in outlets or values.get("size", 0.0) > 0.0:
+            return ()
+        return (("leak", source), *((self.name, other) for other in outlets if other != place))
 
     def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * (1.0 - p["size"] * local.clock.risen(p["onset"], p["ramp"]))

@@ -18,7 +18,7 @@ from fdi_torch.gap.experiment_design import discriminating_input
 from fdi_torch.gap.free_form import discrepancy_tables
 from fdi_torch.gap.holdout import HeldOut, run_reference_models
 from fdi_torch.gap.identifiability import identifiability, simulated_confusions
-from fdi_torch.gap.library import equivalent_causes
+from fdi_torch.gap.library import equivalence_class
 from fdi_torch.gap.model_comparison import (
     causal_places,
     closure_to_dict,
@@ -149,8 +149,9 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
             ParameterName.parse(name).field: Amount(value, stds[name], fit.space[name].unit)
             for name, value in fit.values_of([p]).items()
         }
-        others = equivalent_causes((p.effect.name, p.location), plant, fit.values)
-        causes.append(Cause(p.effect.name, p.location, amounts, others))
+        cause = (p.effect.name, p.location)
+        others = equivalence_class(cause, plant, fit.values) - {cause}
+        causes.append(Cause(*cause, amounts, tuple(sorted(others))))
     if result.posterior.best.unknown_at:
         causes.append(Cause(UNKNOWN, result.posterior.best.unknown_at))
     steps = {s.name: ("step", step) for s, step in zip(plant.sensors, result.quantization_steps, strict=True)}

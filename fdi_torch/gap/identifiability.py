@@ -27,7 +27,7 @@ from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
-from fdi_torch.gap.library import canonical, library_of
+from fdi_torch.gap.library import equivalence_class, library_of
 from fdi_torch.gap.screening import Option, Pairs, options_of, pairs_of, screen
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
@@ -80,7 +80,7 @@ def _inseparable_pairs(
             i, j = best[a], best[b]
             weaker = min(float(gram[i, i]), float(gram[j, j]))
             separation = weaker * (1.0 - float(gram[i, j]) ** 2 / (float(gram[i, i]) * float(gram[j, j])))
-            if separation < PARTED and canonical(a, plant) != canonical(b, plant):
+            if separation < PARTED and b not in equivalence_class(a, plant, {}):
                 pairs.append((a, b, max(separation, 0.0)))
     return tuple(sorted(pairs, key=lambda pair: pair[2]))
 
@@ -130,8 +130,8 @@ def simulated_confusions(pairs: Pairs, named: CauseName, gap: float, plant: Plan
     'confused': with the true cause in the library. 'passed': without it; 'passed_for' lists the causes for which this
     happens most often. None if no other effect can cause such a gap within its range.
     """
-    kinds = [canonical(o.cause, plant) for o in pairs.options]
-    named_kind = canonical(named, plant)
+    kinds = [min(equivalence_class(o.cause, plant, {})) for o in pairs.options]
+    named_kind = min(equivalence_class(named, plant, {}))
     rivals = [i for i, o in enumerate(pairs.options) if kinds[i] != named_kind and _possible(o, pairs.gram[i, i], gap)]
     if not rivals:
         return None

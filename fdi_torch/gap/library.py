@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from fdi_torch.effects import EFFECTS, effect
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.names import unknown
-from fdi_torch.plant.description import OUTSIDE, PlantDescription
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement, fits, place_kinds_of
 
 # Effects searched by default. All others are searched if they are named.
@@ -107,29 +107,9 @@ def tanks_of(place: str, plant: PlantDescription) -> tuple[str, ...]:
     return plant.tanks_at(place)
 
 
-def canonical(cause: CauseName, plant: PlantDescription) -> CauseName:
-    """One name for equivalent causes: plugging of an outlet at its tank's floor, without a valve, is a leak of the tank
-    there."""
+def equivalence_class(cause: CauseName, plant: PlantDescription, values: Mapping[str, float]) -> frozenset[CauseName]:
+    """The cause and all others with the same equations. values: of a fit, by full name."""
     name, place = cause
-    for pipe in plant.pipes:
-        is_hole = pipe.target == OUTSIDE and pipe.elevation == 0.0 and pipe.valve is None
-        if is_hole and name == "plugging" and place == pipe.name:
-            return "leak", pipe.source
-    return cause
-
-
-def has_no_other_name(cause: CauseName, values: Mapping[str, float]) -> bool:
-    """Whether a cause is a leak above its tank's floor or a narrowed outlet, by the values of a fit. Only a leak at the
-    floor and a wider outlet are the same."""
-    name, place = cause
-    quantity = {"leak": "height", "plugging": "size"}.get(name)
-    return values.get(f"{place}.{name}.{quantity}", 0.0) > 0.0
-
-
-def equivalent_causes(cause: CauseName, plant: PlantDescription, values: Mapping[str, float]) -> tuple[CauseName, ...]:
-    """Other names of the same cause. values: of the fit."""
-    if has_no_other_name(cause, values):
-        return ()
-    name, place = canonical(cause, plant)
-    others = [("plugging", p.name) for p in plant.pipes if canonical(("plugging", p.name), plant) == (name, place)]
-    return tuple(c for c in dict.fromkeys([(name, place), *others]) if c != cause) if others else ()
+    prefix = f"{place}.{name}."
+    own = {full.removeprefix(prefix): value for full, value in values.items() if full.startswith(prefix)}
+    return frozenset((cause, *effect(name).equivalents(place, plant, own)))

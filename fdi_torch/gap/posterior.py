@@ -11,7 +11,7 @@ from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.cause_hypothesis import CauseHypothesis
 from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.hypothesis_search import HypothesisSearch
-from fdi_torch.gap.library import canonical, has_no_other_name
+from fdi_torch.gap.library import equivalence_class
 from fdi_torch.gap.screening import Option
 from fdi_torch.gap.structure_search import SearchResult
 from fdi_torch.plant.description import PlantDescription
@@ -59,10 +59,9 @@ def posterior_of(
     best = max(e.log_weight for e in result.explanations)
     named = [search.alone(e, best) for e in result.explanations]
     hypotheses = named if named_only else search.search(result, named)
-    by_causes: dict[tuple[frozenset[tuple[CauseName, bool]], str | None], CauseHypothesis] = {}
+    by_causes: dict[tuple[frozenset[frozenset[CauseName]], str | None], CauseHypothesis] = {}
     for h in sorted(hypotheses, key=lambda h: -h.weight):
-        own = {c: has_no_other_name(c, h.fit.values) for c in h.causes}
-        causes = frozenset((c if own[c] else canonical(c, plant), own[c]) for c in h.causes)
+        causes = frozenset(equivalence_class(c, plant, h.fit.values) for c in h.causes)
         by_causes.setdefault((causes, h.unknown_at), h)
     ranked = list(by_causes.values())
     unfitted = named[0].weight + math.log(max(result.unexamined, 1e-300))

@@ -168,6 +168,11 @@ class PlantDescription:
         pairs = {f"{a}-{b}": (a, b) for a, b in self.tank_pairs()}
         return pairs.get(location, tuple(t.name for t in self.tanks if t.name == location))
 
+    def floor_outlets(self, tank: str) -> tuple[str, ...]:
+        """Names of the outlets from a tank's floor without a valve; each, wider, is the same as a leak there."""
+        outlets = (p for p in self.pipes if p.source == tank and p.target == OUTSIDE)
+        return tuple(p.name for p in outlets if p.elevation == 0.0 and p.valve is None)
+
     def locations(self) -> tuple[str, ...]:
         return tuple(c.name for c in self.components()) + tuple(f"{a}-{b}" for a, b in self.tank_pairs())
 

@@ -80,6 +80,14 @@ class Effect:
         bounds = [bound for bound in (size.low, size.high) if bound != size.nominal]
         return [{size.name: size.nominal + 0.1 * (bound - size.nominal)} | typical for bound in bounds]
 
+    def equivalents(
+        self, place: str, plant: PlantDescription, values: Mapping[str, float]
+    ) -> tuple[tuple[str, str], ...]:
+        """Other effects, each with its place, that have the same equations. values: its parameters (SI, short names);
+        a parameter without a value may have any.
+        """
+        return ()
+
     def delay(self, p: Values) -> torch.Tensor:
         """COMMAND, READING: dead time that the effect adds to its signal, s (only where `delays`)."""
         raise NotImplementedError
