@@ -61,7 +61,11 @@ def test_regressors_with_memory_follow_their_equations() -> None:
         [0.0, 0.25, 1.75, 1.75, 0.25],
     ]
     assert delayed(torch.tensor([1.0, 3.0, 5.0, 9.0]), step.float(), 3.0).tolist() == [1.0, 1.0, 2.0, 4.0]
-    assert rate_limited(torch.tensor([0.0, 5.0, 5.0, 1.0]), step, 1.0).tolist() == [0.0, 2.0, 4.0, 2.0]
+    rates = torch.tensor([[1.0], [2.0]], dtype=torch.float64)
+    assert rate_limited(torch.tensor([0.0, 5.0, 5.0, 1.0]), step, rates).tolist() == [
+        [0.0, 2.0, 4.0, 2.0],
+        [0.0, 4.0, 5.0, 1.0],
+    ]
 
 
 def test_a_relay_keeps_its_state_between_its_thresholds() -> None:

@@ -13,7 +13,7 @@ from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_columns import Discrepancy, Selection
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
-from fdi_torch.gap.localization.fine_positions import CONVERGED, Positions, with_best_frequency
+from fdi_torch.gap.localization.fine_positions import CONVERGED, Positions
 from fdi_torch.gap.localization.localized_discrepancy import (
     Estimate,
     LocalizedDiscrepancy,
@@ -120,8 +120,8 @@ class Ascent:
         under = with_disturbances(self.fitter, fit, noise, discrepancy.linearised)
         if start is None:
             nothing = torch.zeros(len(discrepancy.columns), dtype=torch.bool)
-            discrepancy = with_best_frequency(regression, place, under, fit, discrepancy, nothing) or discrepancy
             positions = Positions(regression, place, under, discrepancy, nothing, self.generator)
+            discrepancy = positions.with_best_frequency(discrepancy, nothing)
             discrepancy = positions.best(discrepancy, nothing) or discrepancy
         whitened = WhitenedDiscrepancy(under, fit, discrepancy)
         costs = column_costs(discrepancy.choices, self.largest)
@@ -199,9 +199,11 @@ class Ascent:
         return current
 
     def _with_finer_frequency(self, current: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
-        used, regression, at = current.regressed.used, current.regression, current.discrepancy
-        finer = with_best_frequency(regression, current.location, current.under, regression.fit, at, used)
-        return self._changed(current, finer) if finer else current
+        at, others = current.discrepancy, current.regressed.used & ~current.discrepancy.sinusoids
+        if at.frequency is None:
+            return current
+        positions = Positions(current.regression, current.location, current.under, at, others, self.generator)
+        return self._changed(current, positions.with_best_frequency(at, others))
 
     def _changed(self, current: EvaluatedDiscrepancy, discrepancy: Discrepancy) -> EvaluatedDiscrepancy:
         """The same with a discrepancy that differs in some columns."""

@@ -14,18 +14,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 
 import torch
+from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from fdi_torch.estimate.linear_parameters import without
-from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.breakpoints import Relays
 from fdi_torch.gap.localization.discrepancy_columns import Discrepancy, Position
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.regressors import HARMONICS
 from fdi_torch.gap.localization.single_regressor_gain import (
+    SIGNS,
     adjoints_of,
     gains_of,
     inflow_weights,
@@ -39,15 +41,16 @@ from fdi_torch.gap.localization.single_regressor_gain import (
 from fdi_torch.gap.localization.sparse_regression import COLLINEAR, VISIBLE, column_costs
 from fdi_torch.simulate.joint_collocation import with_blanks
 
-TRIED = 8  # positions with the largest estimated gains, whose gains are computed exactly
+TRIED = 8  # positions, or frequencies, with the largest estimated gains, whose gains are computed exactly
 HALVINGS = 4  # of the spacing between a relay's thresholds; then it is 1/16 of that of the fine grid
 CONVERGED = 0.1  # nats; a search for a discrepancy ends at a smaller gain
-FREQUENCIES = 17  # of one round, over twice the spacing of the round before
-FREQUENCY_ROUNDS = 3  # the last spacing is then 1/600 of 1/T
+FREQUENCIES = 17  # from 1/T below a frequency to 1/T above it
+FREQUENCY_ERROR = 1.0 / 600.0  # of the best frequency, in units of 1/T
 
 
 class Positions:
-    """All positions of a kink, a jump, a relay or a step in time at a place, under one noise.
+    """All positions of a kink, a jump, a relay or a step in time at a place, and all frequencies of its sinusoids,
+    under one noise.
 
     under: fitter with the disturbance noise. used (M,): the regressors of the discrepancy that are selected already.
     The strength of each position is computed with these present; regressors that are added later only reduce it.
@@ -64,22 +67,27 @@ class Positions:
     ) -> None:
         self.regression, self.place, self.under, self.fit = regression, place, under, regression.fit
         self._residual = whitened_residual(under, self.fit, discrepancy.linearised)
-        signs = random_signs(self._residual, generator)
         basis = parameter_basis(under, self.fit, discrepancy.linearised, discrepancy.columns[used])
-        self._strengths = [strengths_of(p) for p in self._products(signs, basis)]
-        choices = sum(map(len, self._strengths))
-        (self._cost,) = column_costs(torch.tensor([float(choices)]), largest_influence(under)).tolist()
-        self._choices = choices
+        self._signs = self._weights(random_signs(self._residual, generator), basis)
+
+    @cached_property
+    def _strengths(self) -> list[Tensor]:
+        return [strengths_of(p) for p in position_products(self.regression, self.place, self._signs)]
+
+    @cached_property
+    def _choices(self) -> int:
+        return sum(map(len, self._strengths))
 
     def best(self, discrepancy: Discrepancy, used: Tensor) -> Discrepancy | None:
         """The discrepancy with the regressor that explains most in addition to those used, or None if none is worth
         its selection."""
         basis = parameter_basis(self.under, self.fit, discrepancy.linearised, discrepancy.columns[used])
-        products = self._products(self._residual, basis)
+        products = position_products(self.regression, self.place, self._weights(self._residual, basis))
         gains = [gains_of(p[:, 0], strength) for p, strength in zip(products, self._strengths, strict=True)]
         highest = [(float(g[i]), family, i) for family, g in enumerate(gains) for i in _local_maxima(g)]
         tried = sorted(highest, reverse=True)[:TRIED]
-        if not tried or tried[0][0] < self._cost:
+        (cost,) = column_costs(torch.tensor([float(self._choices)]), largest_influence(self.under)).tolist()
+        if not tried or tried[0][0] < cost:
             return None
         positions = [Position(family, index, self._choices) for _, family, index in tried]
         columns = torch.stack([self.regression.column(self.place, p) for p in positions], dim=-1)
@@ -117,15 +125,57 @@ class Positions:
         white = without(basis, self.under.whiten(columns).flatten(0, 1))
         return gains_of((white.T @ self._residual).squeeze(1), white.square().sum(dim=0))
 
-    def _products(self, white: Tensor, basis: Tensor) -> list[Tensor]:
-        """Products of all regressors with whitened columns (S C + P, W), less what the basis explains of these; by the
-        families of `position_products`."""
+    def _weights(self, white: Tensor, basis: Tensor) -> list[Tensor]:
+        """Whitened columns (S C + P, W), less what the basis explains of these, as weights (W, K) of a regressor along
+        each recording."""
         adjoints = adjoints_of(self.regression, self.under, white, basis)
         if (channel := self.regression.sensor(self.place)) is None:
-            weights = inflow_weights(self.regression, self.place, adjoints)
-        else:
-            weights = [adjoints.readings[piece.rows, channel].T for piece in self.regression.pieces]
-        return position_products(self.regression, self.place, weights)
+            return inflow_weights(self.regression, self.place, adjoints)
+        return [adjoints.readings[piece.rows, channel].T for piece in self.regression.pieces]
+
+    def with_best_frequency(self, discrepancy: Discrepancy, used: Tensor) -> Discrepancy:
+        """The discrepancy with the frequency at which its sinusoids explain most beside the other regressors that it
+        uses. used (M,): as at the beginning, and no sinusoids; the same discrepancy if it has none.
+        """
+        if discrepancy.frequency is None:
+            return discrepancy
+        basis = parameter_basis(self.under, self.fit, discrepancy.linearised, discrepancy.columns[used])
+        weights = self._weights(self._residual, basis)
+
+        def estimated(frequencies: Tensor, harmonics: slice) -> Tensor:
+            each = zip(self.regression.at(self.place)[0], weights, self._signs, strict=True)
+            products = [r.sinusoids(frequencies)[:, harmonics] @ torch.cat([w, signs]).T for r, w, signs in each]
+            score, signs = torch.cat(products, dim=1).split([1, SIGNS], dim=2)
+            return _reductions(score, signs @ signs.mT / SIGNS)
+
+        def exact(frequencies: Tensor, harmonics: slice) -> Tensor:
+            columns = self.regression.sinusoids(self.place, frequencies)[..., harmonics]
+            white = without(basis, self.under.whiten(columns.flatten(2)).flatten(0, 1))
+            white = white.unflatten(1, columns.shape[2:]).transpose(0, 1)  # (F, S C + P, W)
+            return _reductions(white.mT @ self._residual, white.mT @ white)
+
+        # Without harmonics: a third of a frequency would explain as much by its third harmonic.
+        fundamental, whole = slice(None, None, HARMONICS), slice(None)
+        candidates = torch.cat([self.regression.frequencies, self._residual.new_tensor([discrepancy.frequency])])
+        tried = candidates[estimated(candidates, fundamental).argsort(descending=True)[:TRIED]]
+        first = tried[exact(tried, fundamental).argmax()]
+        unit, steps = 1.0 / self.under.data.longest_duration, torch.linspace(-1.0, 1.0, FREQUENCIES, dtype=first.dtype)
+        near = float(first + unit * steps[estimated(first + unit * steps, whole).argmax()])
+        spacing = 2.0 * unit / (FREQUENCIES - 1)
+        best = minimize_scalar(
+            lambda frequency: -float(exact(first.new_tensor([frequency]), whole)),
+            bounds=(max(near - spacing, 0.0), near + spacing),
+            options={"xatol": FREQUENCY_ERROR * unit},
+        )
+        columns = self.regression.sinusoids(self.place, first.new_tensor([best.x]))
+        return discrepancy.with_sinusoids(float(best.x), columns[:, :, 0])
+
+
+def _reductions(score: Tensor, gram: Tensor) -> Tensor:
+    """Reduction of chi-square (F,) by the columns of each frequency. score (F, W, 1): their products with the residual.
+    gram (F, W, W): with each other."""
+    gram = gram + torch.diag_embed(COLLINEAR * torch.diagonal(gram, dim1=1, dim2=2) + VISIBLE)
+    return (score * torch.linalg.solve(gram, score)).sum(dim=(1, 2))
 
 
 def best_thresholds(gains: Callable[[Tensor], Tensor], start: Tensor, spacing: float) -> Tensor:
@@ -150,48 +200,6 @@ def pairs_around(thresholds: Tensor, spacing: float) -> Tensor:
     moves = torch.tensor([-spacing, 0.0, spacing], dtype=thresholds.dtype)
     pairs = thresholds + torch.cartesian_prod(moves, moves)
     return pairs[pairs[:, 0] < pairs[:, 1]]
-
-
-def with_best_frequency(
-    regression: DiscrepancyRegression,
-    place: str,
-    under: Fitter,
-    fit: Fit,
-    discrepancy: Discrepancy,
-    used: Tensor,
-) -> Discrepancy | None:
-    """The discrepancy with the frequency at which its sinusoids explain most beside the other regressors that it uses.
-
-    under, used: as for `Positions`. None if there are no sinusoids.
-    """
-    sinusoids = discrepancy.sinusoids
-    if discrepancy.frequency is None:
-        return None
-    basis = parameter_basis(under, fit, discrepancy.linearised, discrepancy.columns[used & ~sinusoids])
-    residual = whitened_residual(under, fit, discrepancy.linearised)
-    residual = without(basis, residual)
-
-    def strongest(frequencies: Tensor, harmonics: slice) -> Tensor:
-        columns = regression.sinusoids(place, frequencies)[..., harmonics]
-        white = without(basis, under.whiten(columns.flatten(2)).flatten(0, 1))
-        white = white.unflatten(1, columns.shape[2:]).transpose(0, 1)  # (F, S C + P, W)
-        score, gram = white.mT @ residual, white.mT @ white
-        gram = gram + torch.diag_embed(COLLINEAR * torch.diagonal(gram, dim1=1, dim2=2) + VISIBLE)
-        return frequencies[(score * torch.linalg.solve(gram, score)).sum(dim=(1, 2)).argmax()]
-
-    # Without harmonics: a third of a frequency would explain as much by its third harmonic. In parts, for memory.
-    candidates = torch.cat([regression.frequencies, residual.new_tensor([discrepancy.frequency])])
-    while len(candidates) > 1:
-        candidates = torch.stack(
-            [strongest(part, slice(None, None, HARMONICS)) for part in candidates.split(FREQUENCIES)]
-        )
-    frequency, spacing = candidates[0], 1.0 / under.data.longest_duration
-    steps = torch.arange(FREQUENCIES, dtype=residual.dtype) - FREQUENCIES // 2
-    for _ in range(FREQUENCY_ROUNDS):
-        spacing *= 2.0 / FREQUENCIES
-        frequency = strongest(frequency + spacing * steps, slice(None))
-    columns = regression.sinusoids(place, frequency.reshape(1))
-    return discrepancy.with_sinusoids(float(frequency), columns[:, :, 0])
 
 
 def _local_maxima(gains: Tensor) -> list[int]:

@@ -15,6 +15,7 @@ import itertools
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -73,7 +74,8 @@ def rate_limits(
     x: Tensor, step: Tensor, ends: tuple[float, float], scale: float, times: Sequence[float] = TRAVEL_TIMES
 ) -> list[Tensor]:
     """Difference between x after a rate limit and x, for each travel time."""
-    return [rate_limited(x, step, (ends[1] - ends[0]) / (scale * time)) - x for time in times]
+    rate = (ends[1] - ends[0]) / (scale * x.new_tensor(times).unsqueeze(1))
+    return list((rate_limited(x, step, rate) - x).unbind())
 
 
 def stictions(x: Tensor, ends: tuple[float, float], bands: Sequence[float] = STICTION_BANDS) -> list[Tensor]:
@@ -152,11 +154,13 @@ def backlash(x: Tensor, band: Tensor) -> Tensor:
 def stiction(x: Tensor, band: Tensor) -> Tensor:
     """Stiction: the output (B, K) holds its value until x (K,) is more than the band (B, 1) away, then jumps to x."""
     values, index = torch.unique_consecutive(x, return_inverse=True)
-    held, output = values[0].expand_as(band), []
-    for value in values:
-        held = torch.where((value - held).abs() > band, value, held)
-        output.append(held)
-    return torch.cat(output, dim=1)[:, index]
+    bands = band.squeeze(1).numpy()
+    output = np.empty((len(values), len(bands)))
+    held = np.full(len(bands), float(x[0]))
+    for k, value in enumerate(values.tolist()):
+        held[np.abs(value - held) > bands] = value
+        output[k] = held
+    return torch.from_numpy(output).T[:, index]
 
 
 def relay(x: Tensor, thresholds: Tensor) -> Tensor:
@@ -169,13 +173,23 @@ def relay(x: Tensor, thresholds: Tensor) -> Tensor:
     return x[last_switch] > 0.5 * (low + high)
 
 
-def rate_limited(x: Tensor, step: Tensor, rate: float) -> Tensor:
-    """The output follows x with at most `rate` per second."""
-    held, output = float(x[0]), []
-    for value, most in zip(x.tolist(), (rate * step).tolist(), strict=True):
-        held += min(max(value - held, -most), most)
-        output.append(held)
-    return x.new_tensor(output)
+def rate_limited(x: Tensor, step: Tensor, rate: Tensor) -> Tensor:
+    """The output (B, K) follows x (K,) with at most `rate` (B, 1) per second, initially at rest.
+
+    While x is constant, the output approaches it in a straight line, so that the loop is over the changes of x.
+    """
+    values, index, counts = torch.unique_consecutive(x, return_inverse=True, return_counts=True)
+    time, last = torch.cumsum(step, dim=0), torch.cumsum(counts, dim=0) - 1
+    durations = torch.diff(time[last], prepend=time.new_zeros(1))
+    before = np.empty((len(values), len(rate)))  # output before each change
+    held, rates = np.full(len(rate), float(x[0])), rate.squeeze(1).numpy()
+    for k, (value, duration) in enumerate(zip(values.tolist(), durations.tolist(), strict=True)):
+        before[k] = held
+        most = rates * duration
+        held = held + np.clip(value - held, -most, most)
+    start = torch.from_numpy(before).T[:, index]
+    most = rate * (time - (time[last] - durations)[index])
+    return start + torch.minimum(torch.maximum(x - start, -most), most)
 
 
 def _scanned(keep: Tensor, added: Tensor, first: Tensor) -> Tensor:
