@@ -142,6 +142,13 @@ def test_a_quantized_channel_has_a_step_and_a_printed_one_has_none() -> None:
     assert quantization_step(x, 0.001) == 0.0
 
 
+def test_rounding_that_costs_no_information_is_not_told() -> None:
+    """As in a recording that is printed to a tenth of a millimetre, with noise of half a millimetre."""
+    x = (1e4 * (0.3 + noise(20000, 0.0, 0.0005, 1)[:, 0])).round() / 1e4
+    assert quantization_step(x, 0.0005) == 0.0
+    assert quantization_step(x, 0.0002) == pytest.approx(1e-4, rel=1e-6)
+
+
 def test_rounding_adds_a_uniform_error_to_the_noise_of_the_other_channels() -> None:
     """A step q has the standard deviation q / sqrt(12)."""
     both = Noise(torch.full((2,), 1e-3, dtype=torch.float64), torch.zeros(2, dtype=torch.float64))

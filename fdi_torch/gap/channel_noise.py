@@ -25,6 +25,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+RELEVANT = 0.01  # share of the variance of the noise that rounding must add to be told
 DECAY_SHARE = 0.3  # share of a quantization step over which its error decorrelates
 MOST_BINS = 512  # bins of a spectrum
 CACHED = 2  # layouts whose spectra are cached, 40 MB each: of a recording and of its hold-out
@@ -261,7 +262,8 @@ def with_rounding(noise: Noise, steps: Sequence[float], readings: Tensor) -> Noi
 
 
 def quantization_step(values: Tensor, noise: float) -> float:
-    """Distance between the values of a quantized channel, or 0 if it is below a tenth of the noise.
+    """Distance between the values of a quantized channel, or 0 if rounding adds less than a hundredth to the variance of
+    the noise: it then costs less than a hundredth of the information.
 
     values (S,) are quantized if all differences between distinct values are multiples of the smallest one.
     """
@@ -276,4 +278,5 @@ def quantization_step(values: Tensor, noise: float) -> float:
     step = float(clear[clear < 1.5 * step].mean())
     multiples = clear / step
     on_lattice = bool(((multiples - multiples.round()).abs() < 0.02 * multiples.round()).all())
-    return step if on_lattice and step > 0.1 * noise and len(distinct) < 0.5 * len(values) else 0.0
+    is_relevant = step**2 / 12.0 > RELEVANT * noise**2
+    return step if on_lattice and is_relevant and len(distinct) < 0.5 * len(values) else 0.0

@@ -159,12 +159,12 @@ class Positions:
         candidates = torch.cat([self.regression.frequencies, self._residual.new_tensor([discrepancy.frequency])])
         tried = candidates[estimated(candidates, fundamental).argsort(descending=True)[:TRIED]]
         first = tried[exact(tried, fundamental).argmax()]
-        unit, steps = 1.0 / self.under.data.longest_duration, torch.linspace(-1.0, 1.0, FREQUENCIES, dtype=first.dtype)
-        near = float(first + unit * steps[estimated(first + unit * steps, whole).argmax()])
-        spacing = 2.0 * unit / (FREQUENCIES - 1)
+        unit = 1.0 / self.under.data.longest_duration
+        around = (first + unit * torch.linspace(-1.0, 1.0, FREQUENCIES, dtype=first.dtype)).clamp(min=unit)
+        near, spacing = float(around[estimated(around, whole).argmax()]), 2.0 * unit / (FREQUENCIES - 1)
         best = minimize_scalar(
             lambda frequency: -float(exact(first.new_tensor([frequency]), whole)),
-            bounds=(max(near - spacing, 0.0), near + spacing),
+            bounds=(max(near - spacing, unit), near + spacing),
             options={"xatol": FREQUENCY_ERROR * unit},
         )
         columns = self.regression.sinusoids(self.place, first.new_tensor([best.x]))
