@@ -12,9 +12,10 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
+from fdi_torch.effects import effect
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.estimate.linear_parameters import without
-from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
 from fdi_torch.gap.localization.breakpoints import Relays
@@ -39,6 +40,7 @@ from fdi_torch.gap.localization.sparse_regression import column_costs, sparse_fi
 from fdi_torch.gap.localization.whitened_discrepancy import WhitenedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, with_disturbances, with_estimated_noise
 from fdi_torch.gap.problem import problem_of
+from fdi_torch.plant.effect import Placement
 from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.resampling import interpolate
 from tests.test_gap import noise, nominal_plant, recorded
@@ -325,6 +327,18 @@ def test_a_slow_periodic_draw_is_a_sinusoid_and_no_random_flow(periods: float) -
     found = localize(fitter, fit, noise, ("T1", "P13", "h1")).discrepancies
     assert found[0].location == "T1" and found[0].parameters <= 2
     assert found[0].periods[0] == pytest.approx(len(command) / periods, rel=0.02)
+
+
+def test_constants_stay_within_their_tolerances_beside_an_effect_and_the_error_of_its_law() -> None:
+    """A plugged outlet and regressors of its flow may nearly cancel, as a wider outlet does."""
+    case = problem_of(nominal_plant(), (recorded({"OUT2.laminar_flow.transition_head": 0.1}, 4),), (), Settings())
+    fitter, null, _ = recalibrate(case.data)
+    plugged = Candidate((Placement(effect("plugging"), "OUT2"),), ({"OUT2.plugging.size": 0.1},))
+    own, likely = with_estimated_noise(fitter, fitter.fit(plugged, null))
+    (found,) = localize(own, own.fit(plugged, null), likely.noise, ("OUT2",)).discrepancies
+    space, theta = found.fit.space, found.fit.theta
+    off = ((theta - space.nominal(theta)) / space.std(theta)).nan_to_num(0.0)
+    assert off.abs().max() < 2.0
 
 
 # Of the fast tests, test_gap_closure and test_gap_scales have a lag that the library lacks.

@@ -262,8 +262,8 @@ def with_rounding(noise: Noise, steps: Sequence[float], readings: Tensor) -> Noi
 
 
 def quantization_step(values: Tensor, noise: float) -> float:
-    """Distance between the values of a quantized channel, or 0 if rounding adds less than a hundredth to the variance of
-    the noise: it then costs less than a hundredth of the information.
+    """Distance between the values of a quantized channel, or 0 if rounding adds less than a hundredth to the variance
+    of the noise: it then costs less than a hundredth of the information.
 
     values (S,) are quantized if all differences between distinct values are multiples of the smallest one.
     """

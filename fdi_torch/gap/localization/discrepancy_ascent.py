@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -56,11 +58,29 @@ class EvaluatedDiscrepancy:
     def log_likelihood(self) -> float:
         return self.without + self.regressed.reduction
 
-    @property
-    def explained(self) -> Tensor:
-        """The part of the readings (S, C) that the discrepancy explains."""
+    @cached_property
+    def estimate(self) -> Estimate:
+        """The parameters of the fit beside the regressors."""
         used = self.regressed.used
-        return self.discrepancy.columns[used] @ self.regressed.mean[used]
+        columns, precision = self.discrepancy.columns[used], self.regressed.precision[used]
+        return Estimate.beside(self.under, self.regression.fit, self.discrepancy.linearised, columns, precision)
+
+    @property
+    def held(self) -> Mapping[str, float]:
+        """The parameters of the effects at the place, which keep them: the discrepancy is the error of their laws."""
+        fit = self.regression.fit
+        return fit.values_of([p for p in fit.candidate.placements if p.location == self.location])
+
+    @cached_property
+    def explained(self) -> Tensor:
+        """The part of the readings (S, C) that the discrepancy explains, beside the effects at its place as they are.
+
+        Regressors and such an effect may nearly cancel, so that the change of the effect belongs to the discrepancy.
+        """
+        used, fit, at = self.regressed.used, self.regression.fit, self.discrepancy
+        held = [fit.space.index(name) for name in self.held if name in fit.space]
+        change = (self.estimate.values - fit.theta)[held]
+        return at.columns[used] @ self.regressed.mean[used] + at.linearised.jacobian[0][..., held] @ change
 
     @property
     def selection(self) -> Selection:
@@ -69,7 +89,6 @@ class EvaluatedDiscrepancy:
     def localized(self, fitter: Fitter) -> LocalizedDiscrepancy:
         """The result. fitter: that of the explanation, whose sensor noise is the unit of the size."""
         explained, at, used, fit = self.explained, self.discrepancy, self.regressed.used, self.regression.fit
-        precision = self.regressed.precision[used]
         size = unexplained_norm(fitter, fit.space, fit.theta, at.linearised.jacobian[0], explained)
         return LocalizedDiscrepancy(
             self.location,
@@ -82,7 +101,7 @@ class EvaluatedDiscrepancy:
             self.selection,
             fit,
             self.noise,
-            Estimate.beside(self.under, fit, at.linearised, at.columns[used], precision),
+            self.estimate,
         )
 
 
@@ -221,13 +240,9 @@ class Ascent:
         )
 
     def _refitted(self, current: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
-        """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew.
-
-        An effect at the place keeps its parameters: the discrepancy is the error of its law.
-        """
+        """The discrepancy with the parameters of the fit refitted beside it, and the levels predicted anew."""
         data, fit = self.fitter.data, current.regression.fit
         corrected = replace(data, readings=data.readings - current.explained)
-        held = fit.values_of([p for p in fit.candidate.placements if p.location == current.location])
         candidate = Candidate(fit.candidate.placements, (fit.effect_values,))
-        new = current.under.of(corrected).fit(candidate, fit, held=held)
+        new = current.under.of(corrected).fit(candidate, fit, held=current.held)
         return self.about(new, current.explained, current.noise, current.location, current.selection)
