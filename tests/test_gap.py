@@ -56,9 +56,11 @@ def recorded(
     ar: float = 0.0,
     steady: bool = False,
     inputs: Tensor | None = None,
+    plant: PlantDescription | None = None,
 ) -> Recording:
-    """The three tanks with some parameters changed, under random steps, steady or given inputs, read with noise (m)."""
-    plant = nominal_plant()
+    """The three tanks, or another plant, with some parameters changed, under random steps, steady or given inputs, read
+    with noise (m)."""
+    plant = plant or nominal_plant()
     generator = torch.Generator().manual_seed(seed)
     time = torch.arange(samples, dtype=torch.float64)
     levels = 15e-6 + 60e-6 * torch.rand(samples // 70 + 1, 2, generator=generator, dtype=torch.float64)

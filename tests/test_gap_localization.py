@@ -40,6 +40,7 @@ from fdi_torch.gap.localization.sparse_regression import column_costs, sparse_fi
 from fdi_torch.gap.localization.whitened_discrepancy import WhitenedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, with_disturbances, with_estimated_noise
 from fdi_torch.gap.problem import problem_of
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.resampling import interpolate
@@ -191,11 +192,22 @@ def test_the_thresholds_of_a_relay_are_found_between_those_of_the_grid(nearest: 
     assert gain(found.columns.blocks[-1]) > gain(influence) - 0.5
 
 
+def random_steps(low: float, high: float, count: int, samples: int, seed: int) -> Tensor:
+    """Steps between two values, (K,), each of so many samples."""
+    generator = torch.Generator().manual_seed(seed)
+    return (low + (high - low) * torch.rand(count, generator=generator, dtype=torch.float64)).repeat_interleave(samples)
+
+
 def delivering(command: Tensor, delivered: Tensor, seed: int) -> tuple[Fitter, Fit, StateNoise]:
     """A pump Q1 with commands (K,) delivers other flows (K,): the fitter of its recording, the fit, and their noise."""
     both = [torch.stack([flow, torch.full_like(command, 40e-6)], dim=1) for flow in (command, delivered)]
-    run = replace(recorded({}, seed, samples=len(command), inputs=both[1]), inputs=both[0])
-    plain, null, _ = recalibrate(problem_of(nominal_plant(), (run,), (), Settings()).data)
+    return commanded(nominal_plant(), *both, seed)
+
+
+def commanded(plant: PlantDescription, inputs: Tensor, actual: Tensor, seed: int) -> tuple[Fitter, Fit, StateNoise]:
+    """A plant with other inputs (K, I) than recorded: the fitter of its recording, the fit, and their noise."""
+    run = replace(recorded({}, seed, samples=len(inputs), inputs=actual, plant=plant), inputs=inputs)
+    plain, null, _ = recalibrate(problem_of(plant, (run,), (), Settings()).data)
     fitter, likely = with_estimated_noise(plain, null)
     return fitter, null, likely.noise
 
@@ -203,8 +215,7 @@ def delivering(command: Tensor, delivered: Tensor, seed: int) -> tuple[Fitter, F
 @pytest.fixture(scope="module")
 def sticking() -> tuple[Fitter, Fit, StateNoise]:
     """A pump that holds its flow until the command has moved by more than a band between those of the grid."""
-    command = 15e-6 + 60e-6 * torch.rand(30, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    command = command.repeat_interleave(70)
+    command = random_steps(15e-6, 75e-6, 30, 70, 3)
     band = 0.363 * (command.max() - command.min()).reshape(1, 1)
     return delivering(command, stiction(command, band)[0], 3)
 
@@ -218,9 +229,21 @@ def test_a_stiction_with_a_band_between_those_of_the_grid_is_one_regressor(
     assert found[0].gain > found[1].gain + 50.0
 
 
+def test_a_valve_that_sticks_is_found_at_its_pipe() -> None:
+    """Its tank's draws and leaks do not know when the valve should have moved."""
+    plant = nominal_plant()
+    plant = replace(plant, pipes=tuple(replace(p, valve="V") if p.name == "OUT2" else p for p in plant.pipes))
+    opening, flow = random_steps(0.4, 0.9, 20, 75, 3), random_steps(15e-6, 75e-6, 15, 100, 4)
+    position = stiction(opening, opening.new_tensor([[0.12]]))[0]
+    both = [torch.stack([flow, torch.full_like(flow, 40e-6), v], dim=1) for v in (opening, position)]
+    fitter, fit, noise = commanded(plant, *both, 3)
+    found = localize(fitter, fit, noise, ("OUT2", "T2", "P32")).discrepancies
+    assert found[0].location == "OUT2" and found[0].parameters == 1
+    assert found[0].gain > found[1].gain + 50.0
+
+
 def test_a_pump_that_stalls_below_a_command_is_one_regressor() -> None:
-    generator = torch.Generator().manual_seed(3)
-    command = (15e-6 + 60e-6 * torch.rand(15, generator=generator, dtype=torch.float64)).repeat_interleave(70)
+    command = random_steps(15e-6, 75e-6, 15, 70, 3)
     fitter, fit, noise = delivering(command, torch.where(command < 22e-6, 0.0, command), 3)
     found = localize(fitter, fit, noise, ("Q1", "T1", "P13")).discrepancies
     assert found[0].location == "Q1" and found[0].parameters == 1
@@ -320,8 +343,7 @@ def test_the_frequency_of_a_pulsating_pump_is_estimated_to_its_phase() -> None:
 @pytest.mark.parametrize("periods", [1.0, 2.7])
 def test_a_slow_periodic_draw_is_a_sinusoid_and_no_random_flow(periods: float) -> None:
     """Its spectrum shows no line: so few periods in the recording are as slow as a random flow may be."""
-    generator = torch.Generator().manual_seed(7)
-    command = (40e-6 + 20e-6 * torch.rand(15, generator=generator, dtype=torch.float64)).repeat_interleave(100)
+    command = random_steps(40e-6, 60e-6, 15, 100, 7)
     turns = torch.arange(len(command), dtype=torch.float64) * periods / len(command)
     fitter, fit, noise = delivering(command, command + 3e-6 * torch.sin(2.0 * torch.pi * turns), 7)
     found = localize(fitter, fit, noise, ("T1", "P13", "h1")).discrepancies

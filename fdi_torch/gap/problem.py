@@ -31,7 +31,7 @@ that count as noise."""
 # Range of integration steps, in units of the plant's time scale. The shortest is a quarter of the shortest period and
 # lag that an effect describes; with steps longer than the longest, fits that meet a rim depend on their start.
 SHORTEST_STEP, LONGEST_STEP = 0.5, 2.5
-MANY_STEPS = 20_000
+MANY_STEPS = 1_500
 """Steps beyond which longer ones are taken, up to the longest. It limits computing time and memory, which grow with the
 number of steps; long recordings determine lags and periods well in any case."""
 

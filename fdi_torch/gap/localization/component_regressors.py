@@ -153,21 +153,37 @@ def _commanded(component: FlowComponent, plant: PlantDescription) -> Discrepancy
         }
 
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        regressors = [*ends.hinges(s, "command", 9), *lags_and_decays(s["flow"], step, scale)]
+        regressors = [*ends.hinges(s, "command", 9), *_of_actuator(s["flow"], step, ends("flow"), scale)]
         regressors += [s["flow"] * j for j in ends.steps_in_value(s, "below", 9)]
         regressors += [s["flow"] * b for b in ends.hinges(s, "level", 6)]
-        regressors += rate_limits(s["flow"], step, ends("flow"), scale)
-        regressors += stictions(s["flow"], ends("flow"))
-        return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
+        return [*regressors, *fatigues(s["flow"], step, ends("flow"), scale)]
 
     def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
-        slow = Curves(torch.stack(rate_limits(s["flow"], step, ends("flow"), scale, finer(TRAVEL_TIMES, FINER))))
-        sticking = Curves(torch.stack(stictions(s["flow"], ends("flow"), FINE_STICTION_BANDS)))
         kinks = [ends.kinks(s, "command", 9), ends.kinks(s, "level", 6, s["flow"])]
         jumps = ends.jumps(s, "below", 9, s["flow"])
-        return [*kinks, jumps, slow, sticking, ends.fine_backlashes(s, "flow")]
+        return [*kinks, jumps, *_fine_of_actuator(s["flow"], step, ends("flow"), scale)]
 
     return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
+
+
+def _of_actuator(x: Tensor, step: Tensor, ends: tuple[float, float], scale: float) -> list[Tensor]:
+    """What an actuator adds to x, its flow or opening, if it lags, sticks, or has a limited rate or play."""
+    return [
+        *lags_and_decays(x, step, scale),
+        *rate_limits(x, step, ends, scale),
+        *stictions(x, ends),
+        *backlashes(x, ends),
+    ]
+
+
+def _fine_of_actuator(x: Tensor, step: Tensor, ends: tuple[float, float], scale: float) -> list[Curves]:
+    """The rate limits, stictions and plays among `_of_actuator` on finer grids."""
+    families = (
+        rate_limits(x, step, ends, scale, finer(TRAVEL_TIMES, FINER)),
+        stictions(x, ends, FINE_STICTION_BANDS),
+        backlashes(x, ends, finer(BACKLASH_BANDS, FINER)),
+    )
+    return [Curves(torch.stack(family)) for family in families]
 
 
 def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyModel:
@@ -185,15 +201,18 @@ def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyMo
         regressors += [s["flow"] * j for j in ends.steps_in_value(s, "root", 24)]
         regressors += [s["flow"] * on for _, on in ends.relays(s, "root")]
         if has_valve:
-            regressors += [s["root"] * b for b in ends.hinges(s, "opening", 9)]
-            regressors += lags_and_decays(s["root"] * s["opening"], step, scale)
+            of_valve = _of_actuator(s["opening"], step, ends("opening"), scale)
+            regressors += [s["root"] * r for r in (*ends.hinges(s, "opening", 9), *of_valve)]
         return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
 
     def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
-        of_opening = [ends.kinks(s, "opening", 9, s["root"])] if has_valve else []
+        of_valve: FineRegressors = []
+        if has_valve:
+            past = _fine_of_actuator(s["opening"], step, ends("opening"), scale)
+            of_valve = [ends.kinks(s, "opening", 9, s["root"]), *(Curves(s["root"] * c.values) for c in past)]
         jumps, relays = ends.jumps(s, "root", 24, s["flow"]), ends.fine_relays(s, "root", s["flow"])
         kinks = [ends.kinks(s, "root", 16), ends.kinks(s, "head", 12)]
-        return [*kinks, jumps, relays, ends.fine_backlashes(s, "flow"), *of_opening]
+        return [*kinks, jumps, relays, ends.fine_backlashes(s, "flow"), *of_valve]
 
     return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
 
