@@ -35,6 +35,7 @@ from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_writing import write_csv
+from fdi_torch.recordings.plant_limits import denied_by
 
 KEPT, LARGE = 1 << 30, 1 << 26  # bytes of free memory to keep, and size from which an array is not kept
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt(3)
@@ -69,7 +70,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     diff = _adopt(arguments, plant, recordings, answer, screen)
     planned = _written(plant, answer, folder)
     adopted_file = arguments.adopt if diff else None
-    show(answer, plant, next_steps(answer, bool(holdouts), library, planned, adopted_file), screen)
+    rim_denied = bool(denied_by(plant, recordings))
+    show(answer, plant, next_steps(answer, bool(holdouts), library, planned, adopted_file, rim_denied), screen)
     for line in diff:
         screen.say(line)
     screen.say(log_words(log))

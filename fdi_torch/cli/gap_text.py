@@ -33,10 +33,10 @@ MOVED = 2.0  # tolerances by which a constant must have moved to be shown
 
 
 def show(answer: Answer, plant: PlantDescription, steps: Sequence[str], screen: Screen) -> None:
-    """Print the verdict, what to do next, doubts, and the tables."""
+    """Print the verdict, doubts, what to do next, and the tables."""
     as_json = answer.to_dict()
     screen.say(verdict_sentence(as_json))
-    for sentence in [*(f"next: {step}" for step in steps), *answer.remarks]:
+    for sentence in [*answer.remarks, *(f"next: {step}" for step in steps)]:
         screen.say(f"- {sentence}")
     _causes(answer, screen)
     _explanations(as_json, screen)
@@ -52,12 +52,22 @@ def show(answer: Answer, plant: PlantDescription, steps: Sequence[str], screen: 
 
 
 def next_steps(
-    answer: Answer, has_holdout: bool, library: Sequence[str] | None, planned: Path | None, adopted: str | None
+    answer: Answer,
+    has_holdout: bool,
+    library: Sequence[str] | None,
+    planned: Path | None,
+    adopted: str | None,
+    rim_denied: bool = False,
 ) -> list[str]:
     """What to do next. planned: path of the next input; adopted: path of the adopted plant file; None if
-    not written.
+    not written. rim_denied: whether readings lie above a rim of the plant file.
     """
     steps = []
+    if rim_denied:
+        steps.append(
+            "correct the plant file as said above, then repeat the diagnosis; until then train, refit and monitor "
+            "refuse this recording"
+        )
     moved = [name for name, c in answer.constants.items() if _tolerances_off(c, "augmented") > MOVED]
     if moved:
         steps.append(
@@ -83,7 +93,7 @@ def next_steps(
             "compare dimensions and constants of the plant file with the rig, calibrate it with a fault-free recording "
             "(fdi refit --adopt), and repeat the diagnosis before you adopt anything"
         )
-    elif any(c.effect != UNKNOWN and not rounds(c.effect) for c in answer.causes):
+    elif not rim_denied and any(c.effect != UNKNOWN and not rounds(c.effect) for c in answer.causes):
         benefit = "train and monitor no longer take the gap for a fault"
         written = f"with {adopted} as their plant, {benefit}" if adopted else ""
         steps.append(f"{written or f'--adopt FILE writes the plant file with the causes; with it {benefit}'}")

@@ -1,7 +1,7 @@
 """`fdi predict`: what it does and prints. Its options: `options/predict.py`.
 
 Path: cli.predict.run → config.loaded_recordings.named_recordings → gap.free_runs.prediction.predict →
-estimate.misfit.misfit_of → cli.explained.say_first → report.fit_figure.fit_figure
+estimate.misfit.misfit_of → recordings.plant_limits.denied_by → cli.explained.say_first → report.fit_figure.fit_figure
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from fdi_torch.gap.free_runs.prediction import Prediction, predict
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.plant_limits import denied_by
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import save
 
@@ -43,7 +44,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     predictions = [(recording, _predict(plant, recording, arguments)) for recording in recordings]
     misfits = [misfit_of(prediction.rmse, [recording], plant) for recording, prediction in predictions]
     worst = max(misfits, key=lambda misfit: misfit.ratio)
-    say_first(worst, screen)
+    doubts = [rim.text for rim in denied_by(plant, recordings)]
+    say_first(worst, screen, doubts=doubts)
     first = f"{arguments.start_samples} samples" if arguments.settle is None else f"{arguments.settle:g} s"
     screen.say(f"free run of {plant.name}, initial levels from the first {first}")
     before = [_predict(other, recording, arguments, vary="") for recording in recordings] if other else []
@@ -69,7 +71,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         title = misfits[-1].headline(f"free run along {Path(recording.source).name}")
         screen.note(f"picture: {save(fit_figure(recording, runs, title, columns), Path(arguments.picture))}")
     results = [_result(plant, *run, misfit, arguments) for run, misfit in zip(predictions, misfits, strict=True)]
-    screen.result(results[0] if len(results) == 1 else {"format": "fdi_torch.predictions/1", "runs": results})
+    several = {"format": "fdi_torch.predictions/1", "runs": results}
+    screen.result((results[0] if len(results) == 1 else several) | {"doubts": doubts})
     return exit_code(worst)
 
 

@@ -50,8 +50,8 @@ def errors_section(material: Material) -> Section | None:
     if extra and "ceiling" in closure:
         blocks.append(
             "Free functions of the component's own variables, added to the causes, show the best that better "
-            "equations could reach. If the errors with other constants are far larger, recalibration without the causes "
-            "had absorbed part of the gap; using both would count that part twice."
+            "equations could reach. If the errors with other constants are far larger, recalibration without the "
+            "causes had absorbed part of the gap; using both would count that part twice."
         )
     return Section("Errors on data not used for fitting", blocks)
 
