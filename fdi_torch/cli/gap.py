@@ -23,7 +23,7 @@ from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.clock import show_clock
 from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant_file import chosen_plant
-from fdi_torch.disk import write_text
+from fdi_torch.disk import expect_writable, write_text
 from fdi_torch.gap.answer import UNKNOWN, Answer, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.experiment_design import planned_recording
@@ -52,6 +52,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     library = names(arguments.library) or None
     if arguments.step is not None and not arguments.step > 0.0:
         raise ValueError(f"--step: expected a positive number of seconds, got {arguments.step:g}")
+    if arguments.adopt:
+        expect_writable(Path(arguments.adopt))
     if arguments.most < 1:
         raise ValueError(f"--most: expected at least one effect, got {arguments.most}")
     left_out = names(arguments.leave_out)
