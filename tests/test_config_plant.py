@@ -203,7 +203,7 @@ def test_a_plant_file_is_found_by_shipped_name_by_folder_and_by_path(tmp_path: P
     [
         ("tanks: [", "line 1: not valid YAML"),
         ("tanks: {}\nsensors: {h1: {tank: T1}, h1: {tank: T2}}", "line 2: expected each key once, got h1 twice"),
-        ("- 1", "expected keys and values .* got list"),
+        ("- 1", "expected keys and values .* got a list"),
         ("", "got nothing"),
     ],
 )

@@ -20,6 +20,7 @@ from fdi_torch.config.channels import (
     unrecorded_valves,
     without_column,
 )
+from fdi_torch.config.file_kinds import expect_kind
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.recording_config import (
     ColumnConfig,
@@ -117,8 +118,10 @@ def listed_recordings(
         expect_columns(find_data(name, base), plant, optional)
         return [config_of(name)], base
     path = find_file(name, base)
-    listed = read_extended(path).get("recordings")
+    data = read_extended(path)
+    listed = data.get("recordings")
     if not listed:
+        expect_kind(data, "run", path, "a recording or a file with the key recordings")
         raise ConfigError([f"{path}: recordings: expected at least one, got none; list files under it"])
     try:
         return [RecordingConfig.model_validate(entry) for entry in listed], path.parent

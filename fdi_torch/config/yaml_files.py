@@ -33,7 +33,7 @@ def parse_yaml(text: bytes, source: str) -> dict[str, Any]:
         raise ConfigError([f"{source}: expected at most {MOST_YAML_BYTES} bytes of YAML, got more; split the file"])
     data = _values(text, source)
     if not isinstance(data, dict):
-        got = "nothing" if data is None else type(data).__name__
+        got = "nothing" if data is None else {list: "a list", str: "text"}.get(type(data), "a single value")
         raise ConfigError([f"{source}: expected keys and values such as plant: three_tank, got {got}"])
     return data
 
@@ -43,6 +43,10 @@ def _values(text: bytes, source: str) -> Any:
         return yaml.load(text.decode("utf-8"), _Loader)
     except RecursionError:
         raise ConfigError([f"{source}: expected YAML of a few levels, got hundreds within each other"]) from None
+    except UnicodeDecodeError:
+        raise ConfigError(
+            [f"{source}: expected a YAML file (text in UTF-8), got other bytes; name another file"]
+        ) from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # the last two for impossible numbers and dates
         where = getattr(error, "problem_mark", None)
         line = f"line {where.line + 1}: " if where else ""
