@@ -88,7 +88,7 @@ def test_a_file_of_another_kind_is_called_what_it_is(given: str, tmp_path: Path)
     path = tmp_path / "file.yaml"
     path.write_text(template(given, load_plant("three_tank"), "three_tank", "run.csv"))
     for kind, load in LOADERS.items():
-        if kind == given:
+        if kind == given or (given, kind) == ("run", "study"):
             continue
         with pytest.raises(ConfigError, match=f"expected a {kind} file, got a {given} file; ") as told:
             load(path)

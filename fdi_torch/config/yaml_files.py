@@ -33,7 +33,7 @@ def parse_yaml(text: bytes, source: str) -> dict[str, Any]:
         raise ConfigError([f"{source}: expected at most {MOST_YAML_BYTES} bytes of YAML, got more; split the file"])
     data = _values(text, source)
     if not isinstance(data, dict):
-        got = "nothing" if data is None else {list: "a list", str: "text"}.get(type(data), "a single value")
+        got = "nothing" if data is None else "a list" if isinstance(data, list) else "a single value"
         raise ConfigError([f"{source}: expected keys and values such as plant: three_tank, got {got}"])
     return data
 
