@@ -176,6 +176,20 @@ def test_a_part_that_all_runs_have_shows_its_settings(tmp_path: Path) -> None:
     assert settings["plant.tanks"] == ("A", "A", "T1, T2")
 
 
+def test_a_long_setting_is_shown_whole_or_with_a_mark_of_what_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short, long = "A.leak, B.leak, A.leak.onset, B.leak.onset", ", ".join(f"T{k}.leak" for k in range(20))
+    configs = {"a": short, "b": long}
+    logs = [
+        write_fit(tmp_path / f"{name}.mcap", 0.001, config={"estimate.parameters": text})
+        for name, text in configs.items()
+    ]
+    assert cli.main(["compare", *map(str, logs)]) == cli.DONE
+    settings = capsys.readouterr().out.partition("settings")[2]
+    assert f"{short} " in settings and "T6.le…" in settings
+
+
 def test_terminal_and_page_lead_with_the_headline(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     logs = [write_fit(tmp_path / "a.mcap", 0.004), write_fit(tmp_path / "b.mcap", 0.001, config={"seed": 3})]
     assert cli.main(["compare", *map(str, logs)]) == cli.DONE
