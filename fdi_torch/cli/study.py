@@ -67,7 +67,7 @@ def _row(score: Score) -> list[str]:
 
 
 def _shown(ratio: Ratio | None) -> tuple[str, str]:
-    return ("", "") if ratio is None else (f"{ratio.value:.3f}", f"{ratio.low:.3f} .. {ratio.high:.3f}")
+    return ("", "") if ratio is None else (f"{ratio.value:.3f}", f"{ratio.low:.3f} … {ratio.high:.3f}")
 
 
 def heading(summary: Summary) -> str:
