@@ -201,6 +201,7 @@ def test_effects_of_a_plant_are_told_with_places_and_in_full(capsys: pytest.Capt
     fdi("effects", "leak", "--plant", "three_tank")
     told = capsys.readouterr().out
     assert "0 to 95" in told and "at `onset` (0 s: from the start)" in told and "T1.leak.size: 0.1" in told
+    assert "height: 9.5 cm, onset: 0 s" in told, "the example has the units of the table above it"
     fdi("effects", "leak", "--json")
     (leak,) = json.loads(capsys.readouterr().out)["effects"]
     assert [p["unit"] for p in leak["parameters"]] == ["1", "m", "s", "s"]
