@@ -44,8 +44,10 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     predictions = [(recording, _predict(plant, recording, arguments)) for recording in recordings]
     misfits = [misfit_of(prediction.rmse, [recording], plant) for recording, prediction in predictions]
     worst = max(misfits, key=lambda misfit: misfit.ratio)
+    name = Path(recordings[misfits.index(worst)].source).name
+    which = [f"of {len(recordings)} free runs, that along {name} is the worst"] if len(recordings) > 1 else []
     doubts = [rim.text for rim in denied_by(plant, recordings)]
-    say_first(worst, screen, doubts=doubts)
+    say_first(worst, screen, doubts=[*which, *doubts])
     first = f"{arguments.start_samples} samples" if arguments.settle is None else f"{arguments.settle:g} s"
     screen.say(f"free run of {plant.name}, initial levels from the first {first}")
     before = [_predict(other, recording, arguments, vary="") for recording in recordings] if other else []
