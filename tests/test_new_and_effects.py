@@ -14,7 +14,7 @@ from fdi_torch import cli
 from fdi_torch.config.channels import mapped
 from fdi_torch.config.estimation import parameter_values, placements_of
 from fdi_torch.config.file_templates import template
-from fdi_torch.config.loaded_recordings import listed_recordings
+from fdi_torch.config.loaded_recordings import listed_recordings, read_recording
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
@@ -97,6 +97,14 @@ def test_a_file_of_another_kind_is_called_what_it_is(given: str, tmp_path: Path)
     if given != "run":
         with pytest.raises(ConfigError, match=f"expected a recording or a file .*, got a {given} file"):
             listed_recordings(str(path), load_plant("three_tank"), tmp_path)
+
+
+def test_a_yaml_file_in_place_of_a_recording_is_no_table(tmp_path: Path) -> None:
+    (tmp_path / "runs.yaml").write_text("recordings: [{file: run.csv}]")
+    with pytest.raises(
+        ConfigError, match=r"runs\.yaml: expected a recording, got a YAML file; take the entries of its"
+    ):
+        read_recording("runs.yaml", load_plant("three_tank"), tmp_path)
 
 
 def test_a_spreadsheet_in_place_of_a_yaml_file_is_no_text(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from fdi_torch.config.channels import expect_columns
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings
 from fdi_torch.config.plant_file import chosen_plant, load_plant
 from fdi_torch.config.recording_config import RecordingConfig
-from fdi_torch.config.yaml_files import find_data
+from fdi_torch.config.yaml_files import YAML_ENDINGS, find_data
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import Misfit, misfit_of
 from fdi_torch.gap.free_runs.prediction import Prediction, predict
@@ -86,7 +86,7 @@ def _predict(
 
 
 def _recordings(name: str, plant: PlantDescription, arguments: argparse.Namespace) -> list[Recording]:
-    if Path(name).suffix in (".yaml", ".yml"):
+    if Path(name).suffix in YAML_ENDINGS:
         return named_recordings(name, plant, Path.cwd())
     columns = _constants(arguments, plant)
     constants = "if it was constant, add --constant {inputs}=0 (--from and --to select a part); "

@@ -15,6 +15,7 @@ from fdi_torch.names import nearest, shortened, unknown
 from fdi_torch.untrusted_input import MOST_DIGITS, MOST_YAML_BYTES, MOST_YAML_VALUES
 
 MOST_EXTENSIONS = 8
+YAML_ENDINGS = (".yaml", ".yml")
 SHIPPED = Path(__file__).resolve().parents[1] / "configs"
 DEFAULT_RUN = SHIPPED / "default.yaml"
 
@@ -218,7 +219,7 @@ def find_plant(name: str, base: Path) -> Path:
     plants = shipped_plants()
     if name in plants:
         return plants[name]
-    if Path(name).suffix in (".yaml", ".yml"):
+    if Path(name).suffix in YAML_ENDINGS:
         return find_file(name, base)
     raise ConfigError([f"plant: {unknown('a plant file (.yaml) or a shipped plant', name, plants)}"])
 
