@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
 
 _CAUSES = {
     errno.ENOSPC: "the disk is full; free some space",
@@ -66,6 +67,15 @@ def replacing(path: Path) -> Iterator[Path]:
             os.replace(new, target)
         finally:
             new.unlink(missing_ok=True)
+
+
+def expect_writable(path: Path) -> None:
+    """Raises DiskError if no file can be written at that path, before long work for it; creates missing folders."""
+    with named_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        TemporaryFile(dir=path.parent).close()
 
 
 def write_text(path: Path, text: str) -> Path:

@@ -49,5 +49,5 @@ def expect_unpacked(unpacked: int, packed: int, source: str, most: int, expansio
     if unpacked > allowed:
         raise ValueError(
             f"{source}: expected at most {allowed} bytes once unpacked, got more out of {packed}; "
-            "unpack it yourself where it is what it seems"
+            "if you trust the file, unpack it yourself"
         )

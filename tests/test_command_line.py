@@ -238,6 +238,18 @@ def test_a_file_that_cannot_be_written_is_misuse(
     assert capsys.readouterr().err == "fdi check: [Errno 13] Permission denied: '/logs/run.mcap'\n"
 
 
+def test_gap_asks_whether_the_adopted_file_can_be_written_before_it_searches(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, rig: str
+) -> None:
+    monkeypatch.setattr("fdi_torch.cli.gap.run_gap", lambda *given: pytest.fail("searched"))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    for target, reason in (("file/better.yaml", "a part of the path is a file"), (".", "it is a folder; name a file")):
+        words = ["gap", "--plant", "three_tank", "--recording", rig, "--adopt", target]
+        assert cli.main(words) == cli.MISUSE
+        assert f"fdi gap: {target}: {reason}" in capsys.readouterr().err
+
+
 def test_short_options_become_overrides_and_win() -> None:
     arguments = SimpleNamespace(set=["seed=1"], out="here", device=None, seed=2)
     assert overrides(arguments) == ["seed=1", "output.folder=here", "seed=2"]  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import torch
 
 import fdi_torch
 from fdi_torch import Pipe, PlacedEffect, Plant, Pump, Recording, Sensor, Tank
+from fdi_torch.cli import main
 from fdi_torch.recordings.plant_limits import denied_rims, with_rims_unknown
 
 RIG = Plant(
@@ -43,6 +45,25 @@ def test_the_true_cause_is_found_although_the_rim_in_the_plant_file_is_wrong(tmp
     assert re.match(TOLD, found.answer.remarks[0]) and not any("rim" in remark for remark in right.answer.remarks)
     assert "plant.tanks.A.height (34 cm; 60 cm)" in fdi_torch.compare([found.log, right.log]).headline
     assert found.adopted().tanks == LOW.tanks, "the plant file is the user's to correct"
+
+
+def test_gap_and_predict_say_it_before_what_to_do_next(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    leaking = recorded(**{"A.leak": 0.2})
+    (tmp_path / "low.yaml").write_text(fdi_torch.dump_plant(LOW))
+    fdi_torch.write_csv(leaking, tmp_path / "run.csv")
+    for command, code in (("gap", 0), ("predict", 4)):
+        assert main([command, "--plant", "low.yaml", "--recording", "run.csv"]) == code
+        told = capsys.readouterr().out.splitlines()
+        assert re.match(f"- {TOLD}", told[1]), told
+        assert told[2].startswith("- next: ") and "no longer take the gap for a fault" not in " ".join(told)
+    assert main(["predict", "--plant", "low.yaml", "--recording", "run.csv", "--json"]) == 4
+    assert re.match(TOLD, json.loads(capsys.readouterr().out)["doubts"][0])
+    run = fdi_torch.predict(LOW, leaking)
+    assert re.search(TOLD, run.headline) and "rim" not in fdi_torch.predict(RIG, leaking).headline
+    assert "rim" not in fdi_torch.predict(LOW, replace(leaking, trusted=True)).headline
 
 
 def test_train_refit_and_monitor_refuse_until_the_plant_file_is_right(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_a_plant_in_code_is_displayed_as_it_was_written() -> None:
     assert rig.units == {"m": "mm", "m^2": "mm^2", "m^3/s": "l/min", "1/m": "%/m", "LI7": "%"}
     assert replace(rig, name="other").units == rig.units
     assert Plant([Tank("A", 0.02, 0.6)], sensors=[Sensor("h", "A")]).units == {}
-    assert Plant([tank], [pipe], sensors=sensors, units={"m": "in"}).units == {"m": "in"}
+    assert Plant([tank], [pipe], rig.pumps, sensors, units={"m": "in"}).units == rig.units | {"m": "in"}
 
 
 def test_the_key_units_overrides_what_is_written() -> None:

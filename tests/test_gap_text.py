@@ -67,6 +67,21 @@ def test_the_terminal_prints_the_unknown_and_the_named_causes(capsys: pytest.Cap
     assert ["Q1", "97.0", "%"] in rows and not any(row[:1] == ["P13"] for row in rows)
 
 
+def test_errors_on_a_hold_out_are_those_of_the_models_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    errors = {"nominal": 12.0, "recalibrated": 11.0, "augmented": 11.0, "ceiling": 11.0, "noise_floor": 0.1}
+    closure = {"unit": "cm", "units": {"h1": "cm"}, "per_sensor": {"h1": errors}, "holdouts": ["b.csv"], **errors}
+    closure |= {"closed": 0.0, "closed_ci95": [0.0, 0.0], "augmented_with": [], "frozen": errors}
+    told = {}
+    for verdict in ("no_gap", "unknown", "named"):
+        show(replace(BOTH, verdict=verdict, closure=closure), nominal_plant(), [], Screen())
+        text = capsys.readouterr().out.partition("error of free runs on b.csv, cm\n")[2]
+        told[verdict] = text
+    models = [line.rsplit(maxsplit=2)[0] for line in told["no_gap"].splitlines()[1:4]]
+    assert models == ["nominal model", "recalibrated", "noise"] and "closes" not in told["no_gap"]
+    assert "with the free form" in told["unknown"] and "free functions" not in told["unknown"]
+    assert "with free functions there" in told["named"] and "0.0 % of the gap closes" in told["named"]
+
+
 def test_random_flows_below_the_noise_are_left_out(capsys: pytest.CaptureFixture[str]) -> None:
     """A flow of 2.5 cm^3/s moves T1, which empties in some 200 s from 154 cm^2, by 3 cm; 0.7 mm^3/s by 0.01 mm."""
     noise = {name: {"std": 1e-3, "unit": "m"} for name in ("h1", "h2", "h3")}

@@ -129,6 +129,15 @@ def test_inspect_exports_a_topic_once(
     assert "exists" in capsys.readouterr().err
 
 
+def test_a_single_message_is_one_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RunLog(tmp_path / "run.mcap", "train", env={}, git={}) as log:
+        log.write("/plant/truth", {"T1.leak.size": 0.1}, 0.0, units={"T1.leak.size": "1"})
+    words = ["inspect", str(tmp_path / "run.mcap")]
+    assert cli.main(words) == cli.main([*words, "--topic", "/plant/truth", "--out", str(tmp_path / "a")]) == cli.DONE
+    shown = capsys.readouterr()
+    assert "bytes, 1 message in 1 chunk; intact" in shown.out and "1 message of /plant/truth" in shown.err
+
+
 def test_inspect_of_an_unknown_topic_leaves_no_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log, out = write_estimate(tmp_path / "run.mcap", 0.3), tmp_path / "out"
     assert cli.main(["inspect", str(log), "--topic", "/nothing", "--out", str(out)]) == cli.MISUSE

@@ -14,6 +14,7 @@ from fdi_torch import cli
 from fdi_torch.config.channels import mapped
 from fdi_torch.config.estimation import parameter_values, placements_of
 from fdi_torch.config.file_templates import template
+from fdi_torch.config.loaded_recordings import listed_recordings, read_recording
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
@@ -73,12 +74,43 @@ def test_every_template_is_a_file_of_its_kind_for_every_shipped_plant(name: str,
     assert len(load_rehearsal(paths["rehearsal"]).plans) == 2
 
 
-def test_a_plant_file_in_place_of_a_run_file_is_called_one(tmp_path: Path) -> None:
-    path = tmp_path / "rig.yaml"
-    path.write_text(template("plant", load_plant("three_tank"), "", ""))
-    for load in (load_run, load_monitor, load_study, load_rehearsal):
-        with pytest.raises(ConfigError, match=r"got a plant file; .*: fdi new run --plant .*rig.yaml writes one"):
+LOADERS = {
+    "plant": load_plant,
+    "run": load_run,
+    "monitor": load_monitor,
+    "study": load_study,
+    "rehearsal": load_rehearsal,
+}
+
+
+@pytest.mark.parametrize("given", LOADERS)
+def test_a_file_of_another_kind_is_called_what_it_is(given: str, tmp_path: Path) -> None:
+    path = tmp_path / "file.yaml"
+    path.write_text(template(given, load_plant("three_tank"), "three_tank", "run.csv"))
+    for kind, load in LOADERS.items():
+        if kind == given or (given, kind) == ("run", "study"):
+            continue
+        with pytest.raises(ConfigError, match=f"expected a {kind} file, got a {given} file; ") as told:
             load(path)
+        words = f"fdi new {kind} --plant file.yaml writes one" if given == "plant" else "fdi "
+        assert words in str(told.value)
+    if given != "run":
+        with pytest.raises(ConfigError, match=f"expected a recording or a file .*, got a {given} file"):
+            listed_recordings(str(path), load_plant("three_tank"), tmp_path)
+
+
+def test_a_yaml_file_in_place_of_a_recording_is_no_table(tmp_path: Path) -> None:
+    (tmp_path / "runs.yaml").write_text("recordings: [{file: run.csv}]")
+    with pytest.raises(
+        ConfigError, match=r"runs\.yaml: expected a recording, got a YAML file; take the entries of its"
+    ):
+        read_recording("runs.yaml", load_plant("three_tank"), tmp_path)
+
+
+def test_a_spreadsheet_in_place_of_a_yaml_file_is_no_text(tmp_path: Path) -> None:
+    (tmp_path / "trend.xlsx").write_bytes(b"PK\x03\x04\x8c\x00")
+    with pytest.raises(ConfigError, match=r"expected a YAML file \(text in UTF-8\), got other bytes"):
+        load_run(tmp_path / "trend.xlsx")
 
 
 def test_an_effect_of_the_catalogue_is_shown_with_its_parameters() -> None:
@@ -177,6 +209,7 @@ def test_effects_of_a_plant_are_told_with_places_and_in_full(capsys: pytest.Capt
     fdi("effects", "leak", "--plant", "three_tank")
     told = capsys.readouterr().out
     assert "0 to 95" in told and "at `onset` (0 s: from the start)" in told and "T1.leak.size: 0.1" in told
+    assert "height: 9.5 cm, onset: 0 s" in told, "the example has the units of the table above it"
     fdi("effects", "leak", "--json")
     (leak,) = json.loads(capsys.readouterr().out)["effects"]
     assert [p["unit"] for p in leak["parameters"]] == ["1", "m", "s", "s"]

@@ -127,7 +127,10 @@ def test_the_table_of_modes_counts_missed_and_invented_faults() -> None:
 
 
 def test_wrongly_named_modes_are_told() -> None:
-    assert paper_tables.wrongly_named(modes_result()) == "Named otherwise: 1 as 1 2; 1 2 as 1."
+    assert (
+        paper_tables.wrongly_named(modes_result())
+        == "Wrong draws, by the numbers of their faults: 1 was named 1 2; 1 2 was named 1."
+    )
 
 
 def readings(values: torch.Tensor) -> Recording:

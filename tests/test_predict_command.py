@@ -104,6 +104,19 @@ def test_a_plant_that_does_not_explain_the_recording_is_said_first(
     assert run.headline == f"{warning}; free run of rig along {folder / 'novalve.csv'}"
 
 
+def test_of_several_recordings_the_one_that_is_not_explained_is_named(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [f"{100 + 10 * k},0.05,{k}\n" for k in range(40)]
+    (folder / "fast.csv").write_text("h_mm,Q_lps,t_s\n" + "".join(rows))
+    words = ["predict", "--plant", "rig.yaml", "--start-samples", "3"]
+    assert main([*words, "fast.csv", "novalve.csv"]) == NOT_EXPLAINED
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("Unreliable") and lines[1] == "- of 2 free runs, that along fast.csv is the worst"
+    assert main([*words, "fast.csv"]) == NOT_EXPLAINED
+    assert "the worst" not in capsys.readouterr().out
+
+
 def test_no_recording_is_misuse(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["predict", "--plant", "rig.yaml"]) == 2
     assert "expected a recording" in capsys.readouterr().err

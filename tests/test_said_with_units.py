@@ -48,7 +48,7 @@ def test_noise_by_sensor_is_in_its_own_unit() -> None:
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("1 kg", "noise of LT1: expected an amount in A or of the level"),
+        ("1 kg", "noise of LT1: expected a standard deviation of the reading .A. or of the level, with a unit"),
         ("LT1 = 1 mA", "got none for LT2"),
         ("LT3 = 1 mA, LT1 = 1 mA, LT2 = 1 %", "LT3"),
         ("0 mm", "expected a positive standard deviation"),

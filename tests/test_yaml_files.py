@@ -38,7 +38,7 @@ REFUSED = {
     "alias": ("*.area: 3 %", 'line 1: not valid YAML: text that begins with * needs quotes, as in "*.area": 3 %'),
     "undefined alias": ("a: *b", "line 1: not valid YAML: text that begins with * needs quotes"),
     "tab": ("a:\n\tb: 1", "line 2: not valid YAML: a line is indented by a tab; indent by spaces"),
-    "list": ("[1]", "expected keys and values such as plant: three_tank, got list"),
+    "list": ("[1]", "expected keys and values such as plant: three_tank, got a list"),
 }
 
 

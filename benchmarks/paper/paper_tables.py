@@ -91,8 +91,8 @@ def _group(result: Modes, chosen: Tensor, name: str) -> list[str]:
 def wrongly_named(result: Modes) -> str:
     """Every draw whose faults were not named correctly."""
     wrong = (~result.right).nonzero().tolist()
-    said = [f"{mode_name(result.modes[m])} as {mode_name(result.stated[m, d])}" for m, d in wrong]
-    return f"Named otherwise: {'; '.join(said)}." if said else "None was named otherwise."
+    said = [f"{mode_name(result.modes[m])} was named {mode_name(result.stated[m, d])}" for m, d in wrong]
+    return f"Wrong draws, by the numbers of their faults: {'; '.join(said)}." if said else "No draw was named wrongly."
 
 
 def windows(online: OnLine) -> str:

@@ -1,7 +1,7 @@
 """Draw of each named effect at a hidden rig: law, numbers and usual strength.
 
-Sizes are shares of what the sound rig does under this recording's inputs. Each function draws one effect: s is the
-sound rig's run, with the random numbers; at is the place.
+The size of an effect is drawn relative to the flows and levels of the sound rig under the inputs of the recording. Each
+function draws one effect: s is the run of the sound rig, with the random numbers; at is the place.
 """
 
 from __future__ import annotations

@@ -18,8 +18,6 @@ from fdi_torch.report.comparison import result_table
 from fdi_torch.report.comparison_headline import left_out_words, setting_differences
 from fdi_torch.report.style import save
 
-MOST_TEXT = 40
-
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     compared = compare(arguments.logs)
@@ -50,7 +48,7 @@ def show(compared: ComparisonResult, screen: Screen) -> None:
 def _show_tables(compared: ComparisonResult, screen: Screen) -> None:
     comparison, runs = compared.comparison, compared.runs
     settings, left_out = setting_differences(comparison, runs)
-    rows = [[key, *(text[:MOST_TEXT] for text in texts)] for key, texts in settings.items()]
+    rows = [[key, *texts] for key, texts in settings.items()]
     if rows and len({run.kind for run in runs}) == 1:  # runs of different kinds have different keys
         screen.say()
         screen.table("settings", ("key", *comparison.labels), rows, left=1 + len(comparison.labels))

@@ -23,7 +23,7 @@ from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.clock import show_clock
 from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant_file import chosen_plant
-from fdi_torch.disk import write_text
+from fdi_torch.disk import expect_writable, write_text
 from fdi_torch.gap.answer import UNKNOWN, Answer, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.experiment_design import planned_recording
@@ -35,6 +35,7 @@ from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_writing import write_csv
+from fdi_torch.recordings.plant_limits import denied_by
 
 KEPT, LARGE = 1 << 30, 1 << 26  # bytes of free memory to keep, and size from which an array is not kept
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # of mallopt(3)
@@ -51,6 +52,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     library = names(arguments.library) or None
     if arguments.step is not None and not arguments.step > 0.0:
         raise ValueError(f"--step: expected a positive number of seconds, got {arguments.step:g}")
+    if arguments.adopt:
+        expect_writable(Path(arguments.adopt))
     if arguments.most < 1:
         raise ValueError(f"--most: expected at least one effect, got {arguments.most}")
     left_out = names(arguments.leave_out)
@@ -69,7 +72,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     diff = _adopt(arguments, plant, recordings, answer, screen)
     planned = _written(plant, answer, folder)
     adopted_file = arguments.adopt if diff else None
-    show(answer, plant, next_steps(answer, bool(holdouts), library, planned, adopted_file), screen)
+    rim_denied = bool(denied_by(plant, recordings))
+    show(answer, plant, next_steps(answer, bool(holdouts), library, planned, adopted_file, rim_denied), screen)
     for line in diff:
         screen.say(line)
     screen.say(log_words(log))

@@ -25,45 +25,49 @@ from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_unit
 from fdi_torch.report.random_flows import flows_that_matter
+from fdi_torch.report.reference_models import has_causes, reference_models
 
 MOST_ROWS = 5
 SMALLEST_SHOWN = 1e-3  # probability
 MOVED = 2.0  # tolerances by which a constant must have moved to be shown
-STAGES = {
-    "nominal": "nominal model",
-    "recalibrated": "recalibrated",
-    "augmented": "with the causes",
-    "ceiling": "with free functions there",
-    "noise_floor": "noise",
-}
 
 
 def show(answer: Answer, plant: PlantDescription, steps: Sequence[str], screen: Screen) -> None:
-    """Print the verdict, what to do next, doubts, and the tables."""
+    """Print the verdict, doubts, what to do next, and the tables."""
     as_json = answer.to_dict()
     screen.say(verdict_sentence(as_json))
-    for sentence in [*(f"next: {step}" for step in steps), *answer.remarks]:
+    for sentence in [*answer.remarks, *(f"next: {step}" for step in steps)]:
         screen.say(f"- {sentence}")
     _causes(answer, screen)
     _explanations(as_json, screen)
     rows = [[place, probability_words(p)] for place, p in answer.where[:MOST_ROWS] if p >= SMALLEST_SHOWN]
-    if rows and answer.verdict != "no_gap":
+    if rows and has_causes(as_json):
         screen.table("where", ("location", "probability that the model is wrong there"), rows)
     _disturbances(flows_that_matter(as_json, plant), screen)
     if answer.closure:
-        _closure(answer.closure, screen)
+        _closure(as_json, screen)
     _constants(answer.constants, screen)
     for remark in [*_confusability(answer.impostors), *_limits(answer)]:
         screen.say(f"- {remark}")
 
 
 def next_steps(
-    answer: Answer, has_holdout: bool, library: Sequence[str] | None, planned: Path | None, adopted: str | None
+    answer: Answer,
+    has_holdout: bool,
+    library: Sequence[str] | None,
+    planned: Path | None,
+    adopted: str | None,
+    rim_denied: bool = False,
 ) -> list[str]:
     """What to do next. planned: path of the next input; adopted: path of the adopted plant file; None if
-    not written.
+    not written. rim_denied: whether readings lie above a rim of the plant file.
     """
     steps = []
+    if rim_denied:
+        steps.append(
+            "correct the plant file as said above, then repeat the diagnosis; until then train, refit and monitor "
+            "refuse this recording"
+        )
     moved = [name for name, c in answer.constants.items() if _tolerances_off(c, "augmented") > MOVED]
     if moved:
         steps.append(
@@ -89,7 +93,7 @@ def next_steps(
             "compare dimensions and constants of the plant file with the rig, calibrate it with a fault-free recording "
             "(fdi refit --adopt), and repeat the diagnosis before you adopt anything"
         )
-    elif any(c.effect != UNKNOWN and not rounds(c.effect) for c in answer.causes):
+    elif not rim_denied and any(c.effect != UNKNOWN and not rounds(c.effect) for c in answer.causes):
         benefit = "train and monitor no longer take the gap for a fault"
         written = f"with {adopted} as their plant, {benefit}" if adopted else ""
         steps.append(f"{written or f'--adopt FILE writes the plant file with the causes; with it {benefit}'}")
@@ -146,16 +150,19 @@ def _explanations(answer: Mapping[str, Any], screen: Screen) -> None:
         screen.table("explanations", ("causes", "probability"), rows)
 
 
-def _closure(closure: Mapping[str, Any], screen: Screen) -> None:
-    """Free-run errors: one row per model, one column per sensor."""
+def _closure(answer: Mapping[str, Any], screen: Screen) -> None:
+    """Free-run errors: one row per model, one column per sensor; and the share that closes, if there are causes."""
+    closure = answer["closure"]
     sensors = list(closure["per_sensor"])
     rows = []
-    for stage, name in STAGES.items():
+    for stage, name in reference_models(answer).items():
         each = [f"{closure['per_sensor'][s][stage]:.3g}" for s in sensors]
         rows.append([name, f"{closure[stage]:.3g}", *each])
     files = ", ".join(Path(source).name for source in closure["holdouts"])
     header = sensors if len(set(closure["units"].values())) == 1 else [f"{s}, {closure['units'][s]}" for s in sensors]
     screen.table(f"error of free runs on {files}, {closure['unit']}", ("plant", "all", *header), rows)
+    if not has_causes(answer):
+        return
     screen.say(closed_sentence(closure))
     for one in closure.get("per_holdout", []):
         closed = "undefined" if one["closed"] is None else f"{100 * one['closed']:.1f} %"

@@ -17,6 +17,7 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import named_errors, write_text
 from fdi_torch.logbook import Inspection, export, export_attachment, foxglove_layout, inspect_log, read_run
+from fdi_torch.names import counted
 from fdi_torch.report.estimate_table import HEADER, correlation_table, estimate_cells
 
 MOST_RESULTS, MOST_COLUMNS = 12, 11
@@ -58,7 +59,7 @@ def write_topic(arguments: argparse.Namespace, screen: Screen) -> None:
                 except OSError:
                     path.unlink()
                     raise
-    screen.note(f"{count} messages of {arguments.topic}: {arguments.out or 'standard output'}")
+    screen.note(f"{counted(count, 'message')} of {arguments.topic}: {arguments.out or 'standard output'}")
 
 
 def write_layout(arguments: argparse.Namespace, screen: Screen) -> None:
@@ -102,7 +103,8 @@ def show(inspection: Inspection, screen: Screen) -> None:
         screen.say(f"attachment {item.name}, {item.size} bytes")
     screen.say()
     state = "intact: all CRCs, indices and counts agree" if inspection.health.sound else "damaged"
-    screen.say(f"{inspection.size} bytes, {inspection.messages} messages in {inspection.health.chunks} chunks; {state}")
+    content = f"{counted(inspection.messages, 'message')} in {counted(inspection.health.chunks, 'chunk')}"
+    screen.say(f"{inspection.size} bytes, {content}; {state}")
     for sentence in (*inspection.health.problems, inspection.advice):
         if sentence:
             screen.say(f"- {sentence}")

@@ -27,7 +27,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     if path.suffix not in (".yaml", ".yml"):
         raise ValueError(f"--out: expected a file that ends in .yaml, got {path}; rename it")
     if arguments.recording and arguments.kind in ("rehearsal", "study"):
-        raise ValueError(f"--recording: expected it for a plant, run or monitor; a {arguments.kind} simulates its own")
+        raise ValueError(f"--recording: expected none for a {arguments.kind}, which simulates its own; leave it out")
     text = _text(arguments, path.stem)
     if path.exists():
         raise ValueError(f"{path}: expected a new file, but it exists; choose another name with --out")

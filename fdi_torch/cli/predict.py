@@ -1,7 +1,7 @@
 """`fdi predict`: what it does and prints. Its options: `options/predict.py`.
 
 Path: cli.predict.run → config.loaded_recordings.named_recordings → gap.free_runs.prediction.predict →
-estimate.misfit.misfit_of → cli.explained.say_first → report.fit_figure.fit_figure
+estimate.misfit.misfit_of → recordings.plant_limits.denied_by → cli.explained.say_first → report.fit_figure.fit_figure
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from fdi_torch.config.channels import expect_columns
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings
 from fdi_torch.config.plant_file import chosen_plant, load_plant
 from fdi_torch.config.recording_config import RecordingConfig
-from fdi_torch.config.yaml_files import find_data
+from fdi_torch.config.yaml_files import YAML_ENDINGS, find_data
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import Misfit, misfit_of
 from fdi_torch.gap.free_runs.prediction import Prediction, predict
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.plant_limits import denied_by
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import save
 
@@ -43,7 +44,10 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     predictions = [(recording, _predict(plant, recording, arguments)) for recording in recordings]
     misfits = [misfit_of(prediction.rmse, [recording], plant) for recording, prediction in predictions]
     worst = max(misfits, key=lambda misfit: misfit.ratio)
-    say_first(worst, screen)
+    name = Path(recordings[misfits.index(worst)].source).name
+    which = [f"of {len(recordings)} free runs, that along {name} is the worst"] if len(recordings) > 1 else []
+    doubts = [rim.text for rim in denied_by(plant, recordings)]
+    say_first(worst, screen, doubts=[*which, *doubts])
     first = f"{arguments.start_samples} samples" if arguments.settle is None else f"{arguments.settle:g} s"
     screen.say(f"free run of {plant.name}, initial levels from the first {first}")
     before = [_predict(other, recording, arguments, vary="") for recording in recordings] if other else []
@@ -69,7 +73,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         title = misfits[-1].headline(f"free run along {Path(recording.source).name}")
         screen.note(f"picture: {save(fit_figure(recording, runs, title, columns), Path(arguments.picture))}")
     results = [_result(plant, *run, misfit, arguments) for run, misfit in zip(predictions, misfits, strict=True)]
-    screen.result(results[0] if len(results) == 1 else {"format": "fdi_torch.predictions/1", "runs": results})
+    several = {"format": "fdi_torch.predictions/1", "runs": results}
+    screen.result((results[0] if len(results) == 1 else several) | {"doubts": doubts})
     return exit_code(worst)
 
 
@@ -81,7 +86,7 @@ def _predict(
 
 
 def _recordings(name: str, plant: PlantDescription, arguments: argparse.Namespace) -> list[Recording]:
-    if Path(name).suffix in (".yaml", ".yml"):
+    if Path(name).suffix in YAML_ENDINGS:
         return named_recordings(name, plant, Path.cwd())
     columns = _constants(arguments, plant)
     constants = "if it was constant, add --constant {inputs}=0 (--from and --to select a part); "

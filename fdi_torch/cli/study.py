@@ -13,6 +13,7 @@ from fdi_torch.cli.options import live, overrides
 from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.config.study_file import load_study
 from fdi_torch.jobs.study import StudyResult, run_study
+from fdi_torch.names import counted
 from fdi_torch.quantities import significant
 from fdi_torch.study.mode_isolation import Isolation
 from fdi_torch.study.summary import Ratio, Score, Summary
@@ -44,7 +45,7 @@ def show(result: StudyResult, screen: Screen) -> None:
     if result.isolation is not None:
         screen.say(isolation_in_words(result.isolation))
     per_trial = f", {1e3 * result.seconds / result.computed:.0f} ms each" if result.computed else ""
-    screen.say(f"{result.computed} trials in {result.seconds:.0f} s{per_trial}")
+    screen.say(f"{counted(result.computed, 'trial')} in {result.seconds:.0f} s{per_trial}")
     screen.say(log_words(result.log))
 
 
@@ -67,7 +68,7 @@ def _row(score: Score) -> list[str]:
 
 
 def _shown(ratio: Ratio | None) -> tuple[str, str]:
-    return ("", "") if ratio is None else (f"{ratio.value:.3f}", f"{ratio.low:.3f} .. {ratio.high:.3f}")
+    return ("", "") if ratio is None else (f"{ratio.value:.3f}", f"{ratio.low:.3f} … {ratio.high:.3f}")
 
 
 def heading(summary: Summary) -> str:

@@ -104,7 +104,7 @@ def show_uncertainty(done: TrainResult, screen: Screen) -> None:
     rows = []
     for profile in done.profiles:
         unit, scale = display_unit(profile.unit, profile.name)
-        limits = f"{scale * profile.low:.5g} .. {scale * profile.high:.5g}"
+        limits = f"{scale * profile.low:.5g} … {scale * profile.high:.5g}"
         note = " and ".join(f"{end} end is not determined" for end in profile.ends)
         rows.append([profile.name, unit or "1", f"{100 * profile.confidence:g} %", limits, note])
     if rows:
@@ -115,7 +115,7 @@ def show_uncertainty(done: TrainResult, screen: Screen) -> None:
         rows = []
         for p, median, low, high in zip(done.fitting.space, draws.median(), *draws.interval(0.95), strict=True):
             unit, scale = display_unit(p.unit, p.name)
-            limits = f"{scale * float(low):.5g} .. {scale * float(high):.5g}"
+            limits = f"{scale * float(low):.5g} … {scale * float(high):.5g}"
             rows.append([p.name, unit or "1", f"{scale * float(median):.6g}", limits])
         screen.table("draws from the posterior", ("parameter", "unit", "median", "95 % interval"), rows, left=2)
         screen.say()

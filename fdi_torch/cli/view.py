@@ -12,6 +12,7 @@ from pathlib import Path
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
+from fdi_torch.interruption import Terminated
 from fdi_torch.view.log_list import LogList, selected
 
 
@@ -22,12 +23,12 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     from fdi_torch.view.server import bound
 
     with bound(Path(arguments.folder), arguments.port) as (address, serve):
-        screen.say(f"logs of {arguments.folder}: {address} (only users of this machine can read it)")
-        screen.note("Ctrl-C ends it")
-        screen.result({"format": "fdi_torch.view/1", "address": address})
-        if arguments.open:
-            webbrowser.open(address)
-        with suppress(KeyboardInterrupt):  # the usual end
+        with suppress(KeyboardInterrupt, Terminated):  # the usual ends
+            screen.say(f"logs of {arguments.folder}: {address} (only users of this machine can read it)")
+            screen.note("Ctrl-C ends it")
+            screen.result({"format": "fdi_torch.view/1", "address": address})
+            if arguments.open:
+                webbrowser.open(address)
             serve()
         screen.note("ended")
     return DONE

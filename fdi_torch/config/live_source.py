@@ -77,7 +77,8 @@ class SourceConfig(Strict):
 class LiveRows(Iterator["Row | str"]):
     """Rows of a live source, and a sentence for each event of the connection.
 
-    Ends when no new row has arrived for `idle` s. earlier: rows of an earlier run that is resumed; origin: its origin.
+    Ends when no new row has arrived for `idle` s. earlier: rows of an earlier run that is resumed; origin: the time
+    origin of that run.
     Raises ConfigError for an unusable mapping, and if the source cannot be reached at first.
     """
 

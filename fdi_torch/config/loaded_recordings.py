@@ -20,6 +20,7 @@ from fdi_torch.config.channels import (
     unrecorded_valves,
     without_column,
 )
+from fdi_torch.config.file_kinds import expect_kind
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.recording_config import (
     ColumnConfig,
@@ -29,7 +30,7 @@ from fdi_torch.config.recording_config import (
     config_of,
     in_seconds,
 )
-from fdi_torch.config.yaml_files import find_data, find_file, read_extended
+from fdi_torch.config.yaml_files import YAML_ENDINGS, find_data, find_file, read_extended
 from fdi_torch.logbook import LogError
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
@@ -113,12 +114,14 @@ def listed_recordings(
     """
     if is_query(name):
         return [config_of(name)], base
-    if Path(name).suffix not in (".yaml", ".yml"):
+    if Path(name).suffix not in YAML_ENDINGS:
         expect_columns(find_data(name, base), plant, optional)
         return [config_of(name)], base
     path = find_file(name, base)
-    listed = read_extended(path).get("recordings")
+    data = read_extended(path)
+    listed = data.get("recordings")
     if not listed:
+        expect_kind(data, "run", path, "a recording or a file with the key recordings")
         raise ConfigError([f"{path}: recordings: expected at least one, got none; list files under it"])
     try:
         return [RecordingConfig.model_validate(entry) for entry in listed], path.parent
@@ -233,6 +236,8 @@ def _read(
 ) -> Recording:
     """Read by the file's ending: an MCAP log (also an incomplete one), else CSV or another table."""
     mapping = channel_mapping(config, plant)
+    if path.suffix in YAML_ENDINGS:
+        raise ValueError(f"{path}: expected a recording, got a YAML file; take the entries of its list recordings")
     if is_log(path):
         if config.also or config.tags or config.sheet or not config.header:
             raise ValueError(

@@ -91,7 +91,7 @@ class MonitorRun(ResolvedFile[MonitorConfig]):
 
 def load_monitor(path: str | Path, overrides: Iterable[str] = ()) -> MonitorRun:
     """A monitor file with overrides. Raises ConfigError with one sentence per problem."""
-    data, file = values_in(path, overrides)
+    data, file = values_in(path, overrides, "monitor")
     return build_monitor(data, file.parent, str(file))
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import Field, ValidationError
 
 from fdi_torch.config.component_sections import component_sections
+from fdi_torch.config.file_kinds import expect_kind
 from fdi_torch.config.plant_in_code import Plant, effect_in_si, effect_parameters, si_value, tolerances_in_si
 from fdi_torch.config.problems import explain, naming
 from fdi_torch.config.strict import Acceleration, Amount, Strict, quantity
@@ -77,6 +78,7 @@ def load_plant(name: str | Path, base: Path | None = None) -> Plant:
     """The plant in a file, or a shipped one by its name ('three_tank'). Raises ConfigError."""
     path = find_plant(str(name), base or Path.cwd())
     data = read_yaml(path)
+    expect_kind(data, "plant", path)
     return build_plant({"name": path.stem, **data}, str(path))
 
 

@@ -46,7 +46,8 @@ class Plant(PlantDescription):
     start level or a parameter of an effect in its unit. varying: patterns of the constants that differ between
     recordings. effects: the plant's known effects. further: components of the other kinds of `FLOW_KINDS`, such as
     weirs=[Weir(...)] and transfers=[Transfer(...)]. matters: least reported size and urgency of faults for a monitor,
-    SI. units: units for display by SI unit or channel, such as {"m": "mm", "m^3/s": "l/min"}; by default as written.
+    SI. units: units for display by SI unit or channel, such as {"m": "mm", "m^3/s": "l/min"}, in place of the written
+    ones.
 
     `dump_plant` writes it as a plant file, which `load_plant` reads as an equal plant. Raises ValueError naming
     component and field, with the expected and the given value.
@@ -99,7 +100,7 @@ class Plant(PlantDescription):
             tuple(matters),
             without_effects.gravity,
             **flows,
-            units=_units_as_written(with_effects) if units is None else dict(units),
+            units=_units_as_written(with_effects) | dict(units or {}),
         )
 
     def __eq__(self, other: object) -> bool:

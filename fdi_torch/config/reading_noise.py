@@ -34,8 +34,8 @@ def _std(text: str, sensor: Sensor) -> float:
             std = parse_quantity(text, "m") * abs(sensor.gain)
         except ValueError:
             raise ValueError(
-                f"noise of {sensor.name}: expected an amount in {sensor.unit} or of the level, such as '1 mm', "
-                f"got '{text}'"
+                f"noise of {sensor.name}: expected a standard deviation of the reading ({sensor.unit}) or of the "
+                f"level, with a unit such as '1 mm', got '{text}'"
             ) from None
     if not std > 0:
         raise ValueError(f"noise of {sensor.name}: expected a positive standard deviation, got '{text}'")

@@ -92,7 +92,7 @@ class Rehearsal(ResolvedFile[RehearsalConfig]):
 
 def load_rehearsal(path: str | Path, overrides: Iterable[str] = ()) -> Rehearsal:
     """A rehearsal file with overrides. Raises ConfigError with one sentence per problem."""
-    data, file = values_in(path, overrides)
+    data, file = values_in(path, overrides, "rehearsal")
     config, plant, text = resolve(RehearsalConfig, data, file.parent, str(file))
     plans = tuple(_plans(config, plant))
     if not plans:

@@ -9,6 +9,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from pydantic import Field, ValidationError, field_validator
 
+from fdi_torch.config.file_kinds import expect_kind
 from fdi_torch.config.key_reference import meanings
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
@@ -78,15 +79,11 @@ class ResolvedFile(Generic[AnyConfig]):
         return {"config_text": self.text, "config": self.resolved, "seeds": seeds, "data": list(data)}
 
 
-def values_in(path: str | Path, overrides: Iterable[str] = ()) -> tuple[dict[str, Any], Path]:
-    """The mapping of a file with overrides, and the file's path. Raises ConfigError, also for a plant file."""
+def values_in(path: str | Path, overrides: Iterable[str], kind: str) -> tuple[dict[str, Any], Path]:
+    """The mapping of a file of that kind with overrides, and the file's path. Raises ConfigError."""
     file = find_file(str(path), Path.cwd())
     data = read_extended(file)
-    if "tanks" in data:
-        text = (
-            "expected a run, monitor, study or rehearsal file, got a plant file; name it under the key plant of such a"
-        )
-        raise ConfigError([f"{file}: {text} file: fdi new run --plant {path} writes one (fdi new --help)"])
+    expect_kind(data, kind, file)
     return with_overrides(data, overrides), file
 
 

@@ -52,7 +52,7 @@ def load_run(path: str | Path | None = None, overrides: Iterable[str] = ()) -> R
 
     Raises ConfigError with one sentence per problem.
     """
-    data, file = values_in(DEFAULT_RUN if path is None else path, overrides)
+    data, file = values_in(DEFAULT_RUN if path is None else path, overrides, "run")
     return build_run(data, file.parent, str(file))
 
 

@@ -41,9 +41,7 @@ def quantity(value: Any, unit: str) -> float:
     elif unit == "1":
         number = float(value)
     else:
-        raise ValueError(
-            f"expected a quantity in {unit}, got the bare number {value}; write its unit, as in '{value} {unit}'"
-        )
+        raise ValueError(f"expected a quantity in {unit}, got the bare number {value}; write its unit, such as {unit}")
     if not abs(number) <= LARGEST:
         raise ValueError(f"expected a quantity in {unit} within {LARGEST:g}, got {value}")
     return number

@@ -83,7 +83,7 @@ class Study:
 
 def load_study(path: str | Path, overrides: list[str] | None = None) -> Study:
     """A study file with overrides. Raises ConfigError with one sentence per problem."""
-    data, file = values_in(path, overrides or ())
+    data, file = values_in(path, overrides or (), "study")
     return build_study(data, file.parent, str(file))
 
 

@@ -15,6 +15,7 @@ from fdi_torch.names import nearest, shortened, unknown
 from fdi_torch.untrusted_input import MOST_DIGITS, MOST_YAML_BYTES, MOST_YAML_VALUES
 
 MOST_EXTENSIONS = 8
+YAML_ENDINGS = (".yaml", ".yml")
 SHIPPED = Path(__file__).resolve().parents[1] / "configs"
 DEFAULT_RUN = SHIPPED / "default.yaml"
 
@@ -33,7 +34,7 @@ def parse_yaml(text: bytes, source: str) -> dict[str, Any]:
         raise ConfigError([f"{source}: expected at most {MOST_YAML_BYTES} bytes of YAML, got more; split the file"])
     data = _values(text, source)
     if not isinstance(data, dict):
-        got = "nothing" if data is None else type(data).__name__
+        got = "nothing" if data is None else "a list" if isinstance(data, list) else "a single value"
         raise ConfigError([f"{source}: expected keys and values such as plant: three_tank, got {got}"])
     return data
 
@@ -43,6 +44,10 @@ def _values(text: bytes, source: str) -> Any:
         return yaml.load(text.decode("utf-8"), _Loader)
     except RecursionError:
         raise ConfigError([f"{source}: expected YAML of a few levels, got hundreds within each other"]) from None
+    except UnicodeDecodeError:
+        raise ConfigError(
+            [f"{source}: expected a YAML file (text in UTF-8), got other bytes; name another file"]
+        ) from None
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # the last two for impossible numbers and dates
         where = getattr(error, "problem_mark", None)
         line = f"line {where.line + 1}: " if where else ""
@@ -214,7 +219,7 @@ def find_plant(name: str, base: Path) -> Path:
     plants = shipped_plants()
     if name in plants:
         return plants[name]
-    if Path(name).suffix in (".yaml", ".yml"):
+    if Path(name).suffix in YAML_ENDINGS:
         return find_file(name, base)
     raise ConfigError([f"plant: {unknown('a plant file (.yaml) or a shipped plant', name, plants)}"])
 

@@ -11,7 +11,8 @@ from fdi_torch.effects import EFFECTS, effect
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Effect, fits, place_kinds_of
-from fdi_torch.tables import Shown, Table
+from fdi_torch.quantities import quantity_text
+from fdi_torch.tables import Shown, Table, in_its_units
 
 # A rig with every kind of place, the default if no plant is given.
 _FURTHER: dict[str, Any] = {
@@ -60,13 +61,23 @@ class Entry(Shown):
     @property
     def in_a_run_file(self) -> str:
         """The fault as an entry of `simulate.faults` in a run file."""
-        return f"{self.at[0]}.{self.name}.{self.parameters[0].name}: {_amount(self.parameters[0])}"
+        return f"{self.at[0]}.{self.name}.{self.parameters[0].name}: {self._amount(self.parameters[0])}"
 
     @property
     def in_a_plant_file(self) -> str:
         """The effect as an entry of `effects` in a plant file."""
-        given = ", ".join(f"{p.name}: {_amount(p)}" for p in self.parameters)
+        given = ", ".join(f"{p.name}: {self._amount(p)}" for p in self.parameters)
         return f"- {{effect: {self.name}, location: {self.at[0]}, parameters: {{{given}}}}}"
+
+    @in_its_units
+    def _amount(self, parameter: Parameter) -> str:
+        """An example value for a file: a tenth of the range for parameters that are zero at nominal, else the nominal
+        value.
+        """
+        value = parameter.nominal
+        if value == 0.0 and parameter.name not in (*_ONSETS, "ramp"):
+            value = 0.1 * (parameter.high if abs(parameter.high) < 1e6 else 1.0)
+        return quantity_text(value, parameter.unit, 3)
 
     def table(self) -> Table:
         """One row per parameter, SI."""
@@ -136,13 +147,3 @@ def _entry(each: Effect, plant: PlantDescription) -> Entry | None:
 
 def _named(parameter: Parameter) -> str:
     return parameter.name if parameter.unit == "1" else f"{parameter.name} ({parameter.unit})"
-
-
-def _amount(parameter: Parameter) -> str:
-    """An example value for a file: a tenth of the range for parameters that are zero at nominal, else the nominal
-    value.
-    """
-    value = parameter.nominal
-    if value == 0.0 and parameter.name not in (*_ONSETS, "ramp"):
-        value = 0.1 * (parameter.high if abs(parameter.high) < 1e6 else 1.0)
-    return f"{value:.3g}" if parameter.unit == "1" else f"{value:.3g} {parameter.unit}"

@@ -90,7 +90,8 @@ class _Column:
     def unsmoothed(self, flow: torch.Tensor, local: Local) -> torch.Tensor:
         """Further rate of change of the flow without the smoothing of the root, m^3/s^2.
 
-        A column that the integrator resolves needs no smoothing: its head acts on the rate, and the rate is finite.
+        A water column whose acceleration the integrator resolves needs no smoothing: the head changes its flow at a
+        finite rate.
         """
         smallest = local.clock.resolution * self.least
         resolved = torch.clamp(self.inertia - smallest, min=0.0) / torch.maximum(self.inertia, smallest)

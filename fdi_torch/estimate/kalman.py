@@ -230,11 +230,12 @@ class Filtered:
 
 @dataclass(frozen=True)
 class Score:
-    """Derivatives of the log-likelihood.
+    """Derivatives of the log-likelihood by the logarithms of the parameters of the noise.
 
-    slope: by the logarithms of the intensities (n,), the scales (C,) and the wander's standard deviation (if any).
-    determined: effective number of readings that determine each of these; minus the second derivative is about twice
-    this number. shocks (S, d): smoothed shocks.
+    slope: first derivatives, by the intensities of the flows (n,), the scales of the sensors' noise (C,) and the
+    standard deviation of the wander, if there is one. determined: effective number of readings that determine each of
+    these parameters; the second derivative is about -2 times this number. shocks (S, d): smoothed random changes of the
+    state from sample to sample.
     """
 
     slope: Tensor

@@ -74,7 +74,7 @@ class Profile(Shown):
     def headline(self) -> str:
         ends = " and ".join(self.ends)
         unit, value, low, high = in_display_unit(self.name, self.unit, self.value, self.low, self.high)
-        text = f"{self.name}: {value:.5g}, {100 * self.confidence:g} % interval {low:.5g} .. {high:.5g}"
+        text = f"{self.name}: {value:.5g}, {100 * self.confidence:g} % interval {low:.5g} … {high:.5g}"
         text = f"{text} {unit.removeprefix('1')}".rstrip() + (f" (bounded only by its range: {ends})" if ends else "")
         return "; ".join([text, *self.warnings])
 

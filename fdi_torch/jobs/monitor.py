@@ -34,6 +34,7 @@ from fdi_torch.jobs.monitor_rows import (
 )
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook import RunLog
+from fdi_torch.names import counted
 
 IDLE = 60.0
 """Time without a sample after which a growing file counts as complete, s."""
@@ -134,7 +135,9 @@ def _follow(
             delay_watch.clock_jumped()
         if rows:
             monitor.process_items(delay_watch.processed(rows[-1][0]))
-            callbacks.tell(None, f"{_last_sample(rows)}, {delay_watch.delay:.1f} s behind; {monitor.events} events")
+            callbacks.tell(
+                None, f"{_last_sample(rows)}, {delay_watch.delay:.1f} s behind; {counted(monitor.events, 'event')}"
+            )
 
 
 def _until_fault_free_part_ends(

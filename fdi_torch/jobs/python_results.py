@@ -19,6 +19,7 @@ from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.plant_limits import denied_by
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.material import gather
 from fdi_torch.report.sections.gap import posterior_bars
@@ -125,6 +126,12 @@ class FreeRun(Shown):
     @property
     @in_its_units
     def headline(self) -> str:
+        doubts = "".join(f"; {rim.text}" for rim in denied_by(self.plant, [self.recording]))
+        return self.title + doubts
+
+    @property
+    def title(self) -> str:
+        """The headline without its doubts."""
         return self.misfit.headline(f"free run of {self.plant.name} along {self.recording.source}")
 
     @property
@@ -141,8 +148,8 @@ class FreeRun(Shown):
     def picture(self) -> str:
         """Measured and predicted readings, as SVG."""
         predictions = {self.plant.name: self.prediction.readings}
-        figure = fit_figure(self.recording, predictions, self.headline, self.plant.outputs())
-        return notebook_svg(figure, "free-run", self.headline)
+        figure = fit_figure(self.recording, predictions, self.title, self.plant.outputs())
+        return notebook_svg(figure, "free-run", self.title)
 
     def to_xarray(self) -> Any:
         """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI."""

@@ -89,7 +89,7 @@ def json_schema(definition: Topic, named: Mapping[str, Kind]) -> bytes:
         properties[name] = {**_JSON[kind], "description": f"{meaning}, {unit}" if unit else meaning}
     properties.update({name: dict(_JSON[kind]) for name, kind in named.items()})
     properties["non_finite"] = {**_JSON["texts"], "description": "numbers JSON cannot hold, as name=nan"}
-    properties["wall"] = {**_TIME, "description": "wall-clock time, where asked for"}
+    properties["wall"] = {**_TIME, "description": "wall-clock time, if requested"}
     schema = {
         "title": definition.schema,
         "description": definition.meaning,

@@ -62,7 +62,7 @@ class FlowFilter:
 
     @cached_property
     def transition(self) -> Tensor:
-        """F (D, D) of states, flows and correlated noise of sensors."""
+        """Transition matrix (D, D) of the levels, the random flows and the correlated noise of the sensors."""
         a, keep, noises = self.linear.transition, self.keep, self.linear.transition.new_zeros(self._noises)
         flows = keep * torch.eye(len(a), dtype=a.dtype)
         levels = torch.cat([torch.cat([a, forcing(a)], 1), torch.cat([torch.zeros_like(a), flows], 1)])

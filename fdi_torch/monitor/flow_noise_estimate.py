@@ -46,7 +46,8 @@ def estimate_flow_filter(
 
 
 def likeliest_correlation(estimate: Callable[[float], tuple[FlowFilter, float]]) -> tuple[FlowFilter, float]:
-    """The most likely filter with correlated noise of sensors, by a climb over CORRELATIONS, and its log-likelihood.
+    """The most likely filter with correlated noise of sensors, and its log-likelihood. The search starts in the middle
+    of CORRELATIONS and goes on to the better neighbour as long as there is one.
 
     estimate: `estimate_flow_filter` with a correlation.
     """

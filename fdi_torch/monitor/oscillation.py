@@ -1,7 +1,8 @@
 """Oscillation faults within a window: candidate periods from the residual's spectrum, and phase conventions.
 
-A fit uses the phase in the middle of the window, where it hardly depends on the period. Parameters hold the phase at
-t = 0, whose standard deviation grows by 2 pi t / T^2 times that of the period: many turns after a day.
+A fit uses the phase in the middle of the window, where it hardly depends on the period T. The parameters of an
+oscillation contain the phase at t = 0. Its standard deviation is 2 pi t / T^2 times that of the period for a window at
+time t, which is many turns after a day.
 """
 
 from __future__ import annotations

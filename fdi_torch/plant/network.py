@@ -139,7 +139,9 @@ class TankNetwork(nn.Module):
         return [*levels, *(state for states in self.steady_states(point).values() for state in states)]
 
     def steady_states(self, point: OperatingPoint) -> dict[str, tuple[Tensor, ...]]:
-        """States of each effect, m, by its prefix: those of the point, else those in steady state there."""
+        """States of each effect, m, by its prefix: those that the operating point has, else the steady ones at its
+        levels and commands.
+        """
         return {placement.prefix: local.states for placement, _, local in self._at_states(point)}
 
     def state_rates(self, point: OperatingPoint) -> dict[str, tuple[Tensor, ...]]:

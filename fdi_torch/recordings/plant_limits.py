@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 
@@ -60,9 +60,14 @@ def denied_rims(plant: PlantDescription, recording: Recording) -> list[DeniedRim
     return [denied for sensor in sensors if (denied := _denied(plant, sensor, recording))]
 
 
+def denied_by(plant: PlantDescription, recordings: Iterable[Recording]) -> list[DeniedRim]:
+    """The rims that recordings deny, those that are trusted left out."""
+    return [each for r in recordings if not r.trusted for each in denied_rims(plant, r)]
+
+
 def expect_no_denied_rim(plant: PlantDescription, recording: Recording) -> None:
     """Raises ValueError if the recording denies a rim, unless it is trusted."""
-    if not recording.trusted and (denied := denied_rims(plant, recording)):
+    if denied := denied_by(plant, [recording]):
         raise ValueError(refusal(recording, "; ".join(each.text for each in denied)))
 
 
@@ -84,9 +89,8 @@ def _denied(plant: PlantDescription, sensor: Sensor, recording: Recording) -> De
 
 def with_rims_unknown(plant: PlantDescription, recordings: Sequence[Recording]) -> PlantDescription:
     """The plant with tanks so high that they never overflow where the recordings, unless trusted, deny their rims."""
-    denied = [each for r in recordings if not r.trusted for each in denied_rims(plant, r)]
     heights: dict[str, float] = {}
-    for each in denied:
+    for each in denied_by(plant, recordings):
         heights[each.tank.name] = max(heights.get(each.tank.name, 0.0), FAR_ABOVE * each.highest)
     tanks = tuple(replace(t, height=heights.get(t.name, t.height)) for t in plant.tanks)
     unknown = {f"{name}.height" for name in heights}

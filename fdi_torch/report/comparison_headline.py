@@ -76,8 +76,10 @@ def _same_readings(runs: Sequence[Material]) -> bool:
 
 
 def _same(runs: Sequence[Material], columns: str) -> bool:
-    """Whether these columns of the recordings, `time`, `inputs` or `outputs`, are the same in all runs."""
-    first, *others = ([getattr(recording, columns) for recording in run.recordings] for run in runs)
+    """Whether these columns of the recordings, `time`, `inputs` or `outputs`, are the same in all runs, whatever their
+    hold-outs.
+    """
+    first, *others = ([getattr(recording, columns) for recording in run.fitted.values()] for run in runs)
     return all(
         len(first) == len(other)
         and all(np.array_equal(a, b, equal_nan=True) for a, b in zip(first, other, strict=True))
@@ -200,7 +202,7 @@ def _recordings_in_words(runs: Sequence[Material]) -> str:
     names = [_recordings(run) for run in runs]
     if len(set(names)) > 1:
         return "; ".join(names)
-    counts = [f"{sum(len(recording.time) for recording in run.recordings)} samples" for run in runs]
+    counts = [f"{sum(len(recording.time) for recording in run.fitted.values())} samples" for run in runs]
     return f"{names[0]}: {'; '.join(counts) if len(set(counts)) > 1 else 'other readings'}"
 
 

@@ -93,6 +93,11 @@ class Material:
     def recordings(self) -> list[Signals]:
         return [own_signals(self.run, group) for group in self.groups]
 
+    @property
+    def fitted(self) -> dict[int, Signals]:
+        """The recordings that the run was fitted to or watched, by their number from 0: all but the hold-outs."""
+        return {k: self.recordings[k] for k, group in enumerate(self.groups) if not group.startswith("holdout")}
+
     @cached_property
     def arrays(self) -> dict[str, np.ndarray]:
         """The run's result arrays; empty if they are missing or unreadable."""

@@ -53,7 +53,9 @@ def _share(done: Any, total: str) -> float | None:
 
 @dataclass(frozen=True)
 class SensorResidual:
-    """Root mean square of a sensor's residuals over all recordings, its SI unit, and the number of readings."""
+    """Root mean square of a sensor's residuals over all recordings but hold-outs, its SI unit, and the number of
+    readings.
+    """
 
     rms: float
     unit: str
@@ -66,7 +68,7 @@ def sensor_residuals(material: Material) -> dict[str, SensorResidual]:
     The estimate is the run's prediction, or the observer's in a monitor.
     """
     squares: dict[tuple[str, str], list[np.ndarray]] = {}
-    for k, recording in enumerate(material.recordings):
+    for k, recording in material.fitted.items():
         residual = residuals(material, k)
         for i, key in enumerate(zip(recording.output_names, recording.output_units, strict=True)):
             column = material.residuals.get(key[0]) if residual is None else residual[:, i]

@@ -12,9 +12,12 @@ Place = tuple[int, int]  # row from the top, column from the left
 def tank_places(plant: PlantDescription) -> dict[str, Place]:
     """Row and column of every tank, all different.
 
-    A tank is below all tanks that flow into it, and as close as possible to the tanks it is connected to.
+    A tank is below all tanks that pour into it, beside those with which a pipe levels it, and as close as possible to
+    the tanks it is connected to.
     """
-    rows = _rows([t.name for t in plant.tanks], _falls(plant))
+    floors = _floors(plant)
+    floor_rows = _rows(floors.values(), [(floors[a], floors[b]) for a, b in _falls(plant) if floors[a] != floors[b]])
+    rows = {name: floor_rows[floor] for name, floor in floors.items()}
     neighbours = _neighbours(plant)
     places: dict[str, Place] = {}
     for name in _walk(plant, neighbours):
@@ -30,6 +33,16 @@ def _falls(plant: PlantDescription) -> list[tuple[str, str]]:
     """(upper, lower) tank for every flow in free fall and every overflow."""
     flows = [(c.source, c.target) for c in plant.flow_components() if c.falls and c.target != OUTSIDE]
     return flows + [(t.name, t.overflow_to) for t in plant.tanks if t.overflow_to not in (OUTSIDE, t.name)]
+
+
+def _floors(plant: PlantDescription) -> dict[str, str]:
+    """The first tank with the same zero of the level, for every tank: a flow that depends on both levels has one."""
+    floors = {t.name: t.name for t in plant.tanks}
+    for c in plant.flow_components():
+        if c not in plant.metered_flows() and not c.falls and OUTSIDE not in (c.source, c.target):
+            lower = floors[c.target]
+            floors = {name: floors[c.source] if floor == lower else floor for name, floor in floors.items()}
+    return floors
 
 
 def _rows(names: Iterable[str], falls: list[tuple[str, str]]) -> dict[str, int]:

@@ -23,6 +23,7 @@ INCH = 0.8  # per unit of the drawing; a tank is one unit wide
 POINTS_PER_UNIT = 72 * INCH
 TALL = 1.4  # least height of a tank
 COLUMN, BETWEEN = 1.95, 1.7  # least distance from a tank's middle to the next one's; least free height between two rows
+LOWEST = 0.12  # height of a line between two tanks above their floors
 ASIDE, LANE = 0.68, 0.36  # from a tank's middle to a line beside its left wall, and on to the next one
 
 
@@ -179,12 +180,14 @@ class _Drawing:
                 self.words(component.name, (middle[0], top), "center", "bottom")
         elif component.target == OUTSIDE:
             self.words(component.name, (points[-1][0], points[-1][1] - 0.06), "center", "top")
+        elif start[1] == end[1] > self.corner(component.source)[1] + LOWEST:
+            self.words(component.name, (middle[0], middle[1] + 0.03 + sketch.round), "center", "bottom")
         elif middle[0] < self.corner(component.source)[0] - 0.5:
             self.words(component.name, (middle[0] - 0.08 - sketch.round, middle[1] + 0.1), "right", "top")
         elif component.falls and start[0] == end[0]:
             self.words(component.name, (middle[0] + 0.12, middle[1] + 0.1), "left", "top")
         else:
-            low = min(middle[1], self.corner(component.source)[1] + 0.12) - 0.18 - sketch.round
+            low = min(middle[1], self.corner(component.source)[1] + LOWEST) - 0.18 - sketch.round
             self.words(component.name, (middle[0], low), "center", "top")
 
     def route(self, component: FlowComponent, sketch: Sketch) -> list[Point]:
@@ -206,7 +209,7 @@ class _Drawing:
             return [(x + 0.22, y), (x + 0.22, y - 0.3), (to_x, y - 0.3), (to_x, to_y + self.tall + 0.06)]
         side = 0.5 if to_x > x else -0.5
         same = [c.name for c in flows if {c.source, c.target} == {component.source, component.target}]
-        rise += 0.12 + 0.28 * same.index(component.name)
+        rise += LOWEST + 0.28 * same.index(component.name)
         if y == to_y and abs(to_x - x) <= self.column:
             return [(x + side, y + rise), (to_x - side, to_y + rise)]
         if x == to_x and sketch.arrow:

@@ -52,8 +52,8 @@ def material_of(path: Path, plant: Any = None) -> Material:
     return gather(read_run(path, salvage=True), plant)
 
 
-def write_gap(path: Path) -> Path:
-    """A named gap with everything in it that the page can draw."""
+def write_gap(path: Path, **changes: Any) -> Path:
+    """A named gap with everything in it that the page can draw. changes: of the answer."""
     rng = np.random.default_rng(1)
     time = np.arange(1800.0)
     inputs = np.stack([4e-5 + 3e-5 * (np.sin(time / 130) > 0), 4e-5 + 3e-5 * (np.sin(time / 210) > 0)], 1)
@@ -65,7 +65,7 @@ def write_gap(path: Path) -> Path:
         log.recording(time, inputs, read, ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3)
         for place in GAP_ANSWER["where"]:
             log.gap_where(place["location"], place["share"], p_value=1e-9)
-        log.gap_verdict(GAP_ANSWER)
+        log.gap_verdict(GAP_ANSWER | changes)
         log.result_arrays(
             recalibrated=recalibrated,
             augmented=augmented,

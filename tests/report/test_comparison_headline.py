@@ -12,6 +12,7 @@ from fdi_torch.jobs.report import report
 from fdi_torch.logbook import RunLog, compare, read_run
 from fdi_torch.report.comparison_headline import comparison_headline, plain_text, setting_differences
 from fdi_torch.report.material import gather
+from fdi_torch.report.progress import residual_size
 
 SAMPLES = 100
 
@@ -24,14 +25,23 @@ def write_fit(
     config: dict[str, str] | None = None,
     explained: bool = True,
     flow: float = 4e-5,
+    held_out: float | None = None,
 ) -> Path:
-    """A fit of two sensors whose residuals alternate between + and - `error`, m, of readings that vary with `level`."""
+    """A fit of two sensors whose residuals alternate between + and - `error`, m, of readings that vary with `level`.
+
+    held_out: error on a hold-out, if there is one.
+    """
     time = np.arange(float(SAMPLES))
     read = level + 0.01 * np.sin(time)[:, None] * np.ones(2)
     model = read - error * np.where(np.arange(SAMPLES) % 2, 1.0, -1.0)[:, None]
     with RunLog(path, "train", config_text="plant: three_tank\n", config=config or {}, env={}, git={}) as log:
         log.recording(time, np.full((SAMPLES, 1), flow), read, ("Q1",), ("h1", "h2"), ("m^3/s",), ("m", "m"))
-        log.result_arrays(predicted=model)
+        if held_out is None:
+            log.result_arrays(predicted=model)
+        else:
+            channels = ("Q1",), ("h1", "h2"), ("m^3/s",), ("m", "m")
+            log.recording(time, np.full((SAMPLES, 1), flow), read, *channels, group="holdout")
+            log.result_arrays(augmented=model, holdout_augmented=read - held_out)
         log.result({"explained": explained})
     return path
 
@@ -55,6 +65,12 @@ def test_the_run_with_the_smaller_residuals_is_better_by_their_ratio(tmp_path: P
     assert same == "Recording, settings and versions are the same."
     third = write_fit(tmp_path / "c.mcap", 0.002)
     assert "50 % smaller than those of c" in sentences(a, b, third)[0]
+
+
+def test_the_error_of_a_run_is_that_of_what_it_was_fitted_to_and_not_of_its_hold_out(tmp_path: Path) -> None:
+    tested, plain = write_fit(tmp_path / "tested.mcap", 0.001, held_out=0.05), write_fit(tmp_path / "plain.mcap", 0.004)
+    assert residual_size(gather(read_run(tested)))[0] == pytest.approx(0.001, rel=1e-9)
+    assert sentences(plain, tested)[0].startswith("tested explains the recording best: its residuals are 75 % smaller")
 
 
 def test_a_recording_with_other_inputs_is_not_called_the_same(tmp_path: Path) -> None:
@@ -158,6 +174,20 @@ def test_a_part_that_all_runs_have_shows_its_settings(tmp_path: Path) -> None:
     settings, _ = settings_of(a, b, c)
     assert settings["plant.tanks.A.height"] == ("60 cm", "61 cm", "none"), "of the runs that have it, two differ"
     assert settings["plant.tanks"] == ("A", "A", "T1, T2")
+
+
+def test_a_long_setting_is_shown_whole_or_with_a_mark_of_what_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short, long = "A.leak, B.leak, A.leak.onset, B.leak.onset", ", ".join(f"T{k}.leak" for k in range(20))
+    configs = {"a": short, "b": long}
+    logs = [
+        write_fit(tmp_path / f"{name}.mcap", 0.001, config={"estimate.parameters": text})
+        for name, text in configs.items()
+    ]
+    assert cli.main(["compare", *map(str, logs)]) == cli.DONE
+    settings = capsys.readouterr().out.partition("settings")[2]
+    assert f"{short} " in settings and "T6.le…" in settings
 
 
 def test_terminal_and_page_lead_with_the_headline(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

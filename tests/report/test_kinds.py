@@ -122,6 +122,18 @@ def test_every_verdict_has_its_words(changes: dict[str, Any], words: str, tmp_pa
     assert headline(material_of(tmp_path / "run.mcap")) == words
 
 
+def test_without_a_gap_nothing_is_said_of_causes(tmp_path: Path, gap_page: str) -> None:
+    nothing = {"verdict": "no_gap", "causes": [], "posterior": [{"causes": [], "probability": 1.0}]}
+    made = report(lambda path: write_gap(path, **nothing), tmp_path)
+    text = page([made])
+    assert "with the cause" not in text and "free functions" not in text
+    assert not {"How far it closes", "Where the gap lies"} & set(titles(made))
+    assert {"Hold-out", "Errors on data not used for fitting"} <= set(titles(made))
+    models = re.findall("<td[^>]*>(nominal model|recalibrated|noise)</td>", text)
+    assert models == ["nominal model", "recalibrated", "noise"]
+    assert "with the causes" in gap_page
+
+
 def test_an_undefined_closed_share_is_called_so(tmp_path: Path) -> None:
     with RunLog(tmp_path / "run.mcap", "gap", env={}, git={}) as log:
         log.gap_verdict({**GAP_ANSWER, "closure": {**GAP_ANSWER["closure"], "closed": None}})
@@ -309,5 +321,5 @@ def test_residuals_are_divided_by_the_noise_of_the_diagnosis_also_where_readings
     section = profile_section(material)
     assert section is not None
     charts = [block for block in section.pictures if block.chart is not None]
-    line = next(line for line in charts[0].chart.lines if line.name == "with the cause")
+    line = next(line for line in charts[0].chart.lines if line.name == "with the causes")
     assert np.sqrt(np.nanmean(np.square(line.y))) == pytest.approx(1.0, abs=0.3)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from fdi_torch import Plant, Weir
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.report.rig_layout import tank_places
@@ -32,6 +33,19 @@ def test_what_pours_stands_above_what_catches_it(name: str) -> None:
     for pipe in plant.pipes:
         if pipe.target != OUTSIDE:
             assert (places[pipe.target][0] > places[pipe.source][0]) == pipe.free_fall
+
+
+def test_tanks_that_a_pipe_levels_stand_side_by_side_whatever_falls_between_them() -> None:
+    """Both ends of a pipe have one zero of the level, so that a weir between them, or beside a chain, lowers none."""
+    tanks = [Tank(name, 0.3, 0.9) for name in "ABCD"]
+    pipes = [
+        Pipe("ab", "A", "B", 3e-4, 0.6),
+        Pipe("bc", "B", "C", 3e-4, 0.6),
+        Pipe("cd", "C", "D", 3e-4, 0.6, free_fall=True),
+    ]
+    weirs = [Weir("over", "A", "C", crest=0.6, width=0.04), Weir("back", "B", "A", crest=0.7, width=0.04)]
+    plant = Plant(tanks, pipes, sensors=[Sensor("h", "A")], weirs=weirs)
+    assert {name: row for name, (row, _) in tank_places(plant).items()} == {"A": 0, "B": 0, "C": 0, "D": 1}
 
 
 def test_a_chain_is_drawn_in_its_order() -> None:

@@ -110,6 +110,15 @@ def client(folder: Path) -> Iterator[Client]:
             server.kill()
 
 
+def test_a_server_is_ended_by_kill_as_by_ctrl_c(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "fdi_torch", "view", str(tmp_path)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None and server.stdout.readline()
+        server.terminate()
+        said = server.communicate(timeout=30)[1]
+    assert server.returncode == 0 and said.endswith("ended\n") and "the same command" not in said
+
+
 def test_only_this_machine_is_served_and_under_its_own_name_only(client: Client) -> None:
     assert client.host == "127.0.0.1"
     for host, status in {

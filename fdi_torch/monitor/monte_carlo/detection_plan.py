@@ -100,8 +100,8 @@ class DetectionPlan:
                 low, high = wilson(right, len(named_faults))
                 mistakes = confusions(truth, [tuple(s.split(" + ")) if s else () for s in named_faults], 2)
                 q = quantiles(delay_values, (0.5, 0.05, 0.95))
-                delay = f"{q[0]:.0f} ({q[1]:.0f} .. {q[2]:.0f})"
-                named = f"{right} of {len(named_faults)} ({100 * low:.0f} .. {100 * high:.0f} %)"
+                delay = f"{q[0]:.0f} ({q[1]:.0f} … {q[2]:.0f})"
+                named = f"{right} of {len(named_faults)} ({100 * low:.0f} … {100 * high:.0f} %)"
                 wrong = "; ".join(f"{_short(t)} as {_short(s)}: {n}" for t, s, n in mistakes)
                 totals = [
                     a + b for a, b in zip(totals, (missed, len(delay_values), right, len(named_faults)), strict=True)
@@ -109,7 +109,7 @@ class DetectionPlan:
                 rows.append(
                     (f"{100 * size:g} %", chart, str(len(delay_values)), delay, str(missed), str(early), named, wrong)
                 )
-        header = ("size", "detector", "runs", "delay, s (5 .. 95 %)", "missed", "early", "named right", "mostly wrong")
+        header = ("size", "detector", "runs", "delay, s (5 … 95 %)", "missed", "early", "named right", "mostly wrong")
         summary = f"{totals[0]} of {totals[1]} faults missed, {totals[2]} of {totals[3]} named right"
         return ResultTable("faults found", header, tuple(rows), summary if rows else "")
 

@@ -71,13 +71,13 @@ class FalseAlarmPlan:
                 mean, low, high = mean_time(counts, self.every, expected)
                 single = [self.every * expected / max(c, 1) for c in (max(counts), min(counts))]
                 alarms = f"{sum(counts)} ({expected * len(counts):.0f})"
-                words = (f"{mean:.0f}", f"{low:.0f} .. {high:.0f}", f"{single[0]:.0f} .. {single[1]:.0f}")
+                words = (f"{mean:.0f}", f"{low:.0f} … {high:.0f}", f"{single[0]:.0f} … {single[1]:.0f}")
                 intervals = [n[f"{chart} interval"] for n in results]
                 within = sum(low <= c <= high for c, (low, high) in zip(counts, intervals, strict=True))
                 rows.append((kind, chart, str(len(counts)), alarms, *words, f"{within} of {len(counts)}"))
                 agreeing, total = agreeing + within, total + len(counts)
         what = ("noise", "detector", "calibrations", "alarms (asked)")
-        header = (*what, "s between", "95 %", "single calibrations", "within own 95 %")
+        header = (*what, "time between, s", "95 %", "single calibrations, s", "within own 95 %")
         summary = f"{agreeing} of {total} calibrations alarm falsely as often as they predict" if total else ""
         return ResultTable(
             f"false alarms; configured: one in {significant(self.every, 3)} s", header, tuple(rows), summary

@@ -125,7 +125,7 @@ class IsolationPlan:
         low, high = wilson(right, len(named_faults))
         delay_values = [float("inf") if d < 0 else d for n in results for d in n["delay"]]
         q, missed = quantiles(delay_values, (0.5, 0.95)), sum(d == float("inf") for d in delay_values)
-        first = (self.loop, str(len(named_faults)), f"{right} ({100 * low:.0f} .. {100 * high:.0f} %)", str(missed))
+        first = (self.loop, str(len(named_faults)), f"{right} ({100 * low:.0f} … {100 * high:.0f} %)", str(missed))
         rows = [(*first, str(sum(int(n["early"]) for n in results)), f"{q[0]:.0f}, {q[1]:.0f}", "")]
         wrong = [(t, tuple(s.split(" + ")) if s else ()) for t, s in zip(truth, named_faults, strict=True)]
         wrong = [(t, s) for t, s in wrong if s != (t.partition(" ")[0],)]

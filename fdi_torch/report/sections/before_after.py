@@ -1,4 +1,4 @@
-"""Residuals before and after the cause was added: on the hold-outs, and by time, level, input and flow."""
+"""Residuals before and after the causes were added: on the hold-outs, and by time, level, input and flow."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fdi_torch.logbook import Signals
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, axis, shown_unit
-from fdi_torch.report.predictions import MODELS, holdout_prefix
+from fdi_torch.report.predictions import MODELS, compared_models, holdout_prefix
 from fdi_torch.report.section import Picture, Section, signals
 from fdi_torch.report.sections.signals import clock_of
 from fdi_torch.sample_noise import sample_noise
@@ -29,8 +29,9 @@ def holdout_section(material: Material) -> Section | None:
         pictures = _holdout_panels(material, holdout_prefix(count))
         blocks += [pictures] if pictures else []
         count += 1
-    words = "Residuals of each model on readings that were not used for fitting."
-    return Section("Before and after", [words, *blocks]) if blocks else None
+    causes = len(compared_models(material)) > 1
+    words = f"Residuals{' of each model' if causes else ''} on readings that were not used for fitting."
+    return Section("Before and after" if causes else "Hold-out", [words, *blocks]) if blocks else None
 
 
 def _holdout_panels(material: Material, prefix: str) -> list[Picture]:
@@ -39,7 +40,7 @@ def _holdout_panels(material: Material, prefix: str) -> list[Picture]:
     for i, name in enumerate(recording.output_names):
         unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
         lines: list[Line] = []
-        for model in ("recalibrated", "augmented"):
+        for model in compared_models(material):
             predicted = arrays.get(f"{prefix}_{model}")
             if predicted is not None:
                 words, colour = MODELS[model]
@@ -58,9 +59,8 @@ def profile_section(material: Material) -> Section | None:
     if not material.recordings:
         return None
     recording = material.recordings[0]
-    excess = {
-        m: residual for m in ("recalibrated", "augmented") if (residual := _excess(material, recording, m)) is not None
-    }
+    each = {model: _excess(material, recording, model) for model in compared_models(material)}
+    excess = {model: residual for model, residual in each.items() if residual is not None}
     if not excess:
         return None
     pictures = []

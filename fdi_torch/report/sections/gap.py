@@ -20,6 +20,7 @@ from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, number, percent, probability_text, shown_unit, with_error
 from fdi_torch.report.panels import BAR_NAME, bar_panel
 from fdi_torch.report.random_flows import flows_that_matter
+from fdi_torch.report.reference_models import has_causes
 from fdi_torch.report.section import Picture, Section
 
 MOST_BARS = 10
@@ -28,11 +29,11 @@ CONTENT = 0.95  # probability of the plausible explanations together
 
 
 def where_section(material: Material) -> Section | None:
-    """Probability of a discrepancy at each component, whatever its law."""
+    """Probability of a discrepancy at each component, whatever its law; nothing without a gap."""
     where = {str(m["location"]): m for m in material.of("/gap/where")}
     where |= {str(place["location"]): place for place in material.answer.get("where", [])}
     ranked = sorted(where.items(), key=lambda item: -float(item[1]["share"]))
-    if not ranked:
+    if not ranked or not has_causes(material.answer):
         return None
     shown = [item for item in ranked if float(item[1]["share"]) >= LEAST_SHOWN] or ranked[:3]
     caption = f"Below {percent(LEAST_SHOWN)}: {len(ranked) - len(shown)} other places." if ranked[len(shown) :] else ""

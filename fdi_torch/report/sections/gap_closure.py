@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Any
 
@@ -11,26 +11,20 @@ from fdi_torch.report.html import table
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, axis, number, percent, shown_unit, with_error
 from fdi_torch.report.panels import bar_panel
+from fdi_torch.report.reference_models import has_causes, reference_models
 from fdi_torch.report.section import Picture, Section
 
-STAGES = {
-    "nominal": "nominal model",
-    "recalibrated": "recalibrated",
-    "augmented": "with the cause",
-    "ceiling": "with free functions",
-    "noise_floor": "noise",
-}
-FROZEN = {"recalibrated": "constants recalibrated without it", "nominal": "nominal constants"}
+FROZEN = {"recalibrated": "constants recalibrated without them", "nominal": "nominal constants"}
 
 
 def closure_section(material: Material) -> Section | None:
-    """Errors on data that no fit has seen."""
+    """Errors on data that no fit has seen, if there are causes that could close a gap."""
     closure = material.answer.get("closure") or {}
-    stages, words = _stages(material)
-    if not stages:
+    stages = _stages(material)
+    if not stages or not has_causes(material.answer):
         return None
     unit = str(closure.get("unit", ""))
-    names = [words[name] for name in stages]
+    names = list(stages.values())
     values = [float(closure[name]) for name in stages]
     texts = [f"{number(v, 3)} {unit}".rstrip() for v in values]
     label = axis("free-run error on hold-outs (rms)", unit)
@@ -41,37 +35,38 @@ def closure_section(material: Material) -> Section | None:
 def errors_section(material: Material) -> Section | None:
     """The errors behind the closure: by model and sensor, and by hold-out."""
     closure = material.answer.get("closure") or {}
-    stages, words = _stages(material)
+    stages = _stages(material)
     if not stages:
         return None
     unit = str(closure.get("unit", ""))
-    frozen, named = closure.get("frozen") or {}, words["augmented"]
+    named = stages.get("augmented")
+    frozen = (closure.get("frozen") or {}) if named else {}
     extra = [(f"{named}, {other}", as_float(frozen.get(key))) for key, other in FROZEN.items() if key in frozen]
     header = [f"plant{', error in ' + unit if unit else ''}", "all", *_headed(closure)]
-    rows = [[words[m], number(float(closure[m]), 3), *_by_sensor(closure, m)] for m in stages]
+    rows = [[name, number(float(closure[m]), 3), *_by_sensor(closure, m)] for m, name in stages.items()]
     rows += [[name, number(value, 3), *[""] * (len(header) - 2)] for name, value in extra]
     blocks: list[Any] = [table(header, rows)]
-    blocks += _each_holdout(closure, unit)
+    blocks += _each_holdout(closure, unit, stages)
     if extra and "ceiling" in closure:
         blocks.append(
-            "Free functions of the component's own variables, added to the cause, show the best that a better equation "
-            "could reach. If the errors with other constants are far larger, recalibration without the cause had "
-            "absorbed part of it; using both would count the gap twice."
+            "Free functions of the component's own variables, added to the causes, show the best that better "
+            "equations could reach. If the errors with other constants are far larger, recalibration without the "
+            "causes had absorbed part of the gap; using both would count that part twice."
         )
     return Section("Errors on data not used for fitting", blocks)
 
 
-def _stages(material: Material) -> tuple[list[str], dict[str, str]]:
-    """The models that have an error, and the name of each model."""
-    closure, unknown = material.answer.get("closure") or {}, material.answer.get("verdict") == "unknown"
-    stages = [name for name in STAGES if isinstance(closure.get(name), int | float)]
-    words = STAGES | ({"augmented": "with the free form"} if unknown else {})
-    return [name for name in stages if name != "ceiling" or not unknown], words
+def _stages(material: Material) -> dict[str, str]:
+    """Names of the models that have an error, by their key in the closure."""
+    closure = material.answer.get("closure") or {}
+    models = reference_models(material.answer).items()
+    return {key: name for key, name in models if isinstance(closure.get(key), int | float)}
 
 
 def constants_section(material: Material) -> Section | None:
-    """Nominal value of each calibration constant, and its values without and with the cause."""
+    """Nominal value of each calibration constant, and its values without and with the causes, if there are any."""
     constants = material.answer.get("constants") or {}
+    causes = has_causes(material.answer)
     rows = []
     for name, c in constants.items():
         unit, scale = shown_unit(str(c.get("unit", "1")), str(name))
@@ -79,11 +74,12 @@ def constants_section(material: Material) -> Section | None:
         off = [(values[m] - values["nominal"]) / values["tolerance"] for m in ("recalibrated", "augmented")]
         fitted = with_error(values["augmented"], scale * as_float(c.get("std")))
         nominal = with_error(values["nominal"], values["tolerance"])
-        rows.append([str(name), nominal, number(values["recalibrated"]), number(off[0], 2), fitted, number(off[1], 2)])
-        rows[-1].append(unit)
+        without = [number(values["recalibrated"]), number(off[0], 2)] if causes else ["", ""]
+        rows.append([str(name), nominal, *without, fitted, number(off[1], 2), unit])
     if not rows:
         return None
-    header = ["constant", "nominal", "recalibrated", "tolerances off", "with the cause", "tolerances off", "unit"]
+    last = "with the causes" if causes else "fitted"
+    header = ["constant", "nominal", "recalibrated", "tolerances off", last, "tolerances off", "unit"]
     words = "Constants with a tolerance are always refitted; a value far outside it compensates for a model error."
     return Section("Calibration constants", [words, table(header, rows)])
 
@@ -102,14 +98,15 @@ def _by_sensor(closure: Mapping[str, Any], stage: str) -> list[str]:
     return [number(as_float(errors.get(stage)), 3) for errors in (closure.get("per_sensor") or {}).values()]
 
 
-def _each_holdout(closure: Mapping[str, Any], unit: str) -> list[Any]:
-    """One row per file, if there are several."""
+def _each_holdout(closure: Mapping[str, Any], unit: str, stages: Mapping[str, str]) -> list[Any]:
+    """One row per file, if there are several; the share that closes if there are causes."""
+    shown = {key: name for key, name in stages.items() if key in ("recalibrated", "augmented", "noise_floor")}
     rows = []
     for one in closure.get("per_holdout") or []:
         share = one.get("closed")
         closed = percent(share) if isinstance(share, int | float) else "undefined"
-        stages: Sequence[str] = ("recalibrated", "augmented", "noise_floor")
         name = PurePath(str(one.get("source", ""))).name
-        rows.append([name, *(number(as_float(one.get(m)), 3) for m in stages), closed])
-    header = (f"hold-out, error in {unit}", "recalibrated", "with the cause", "noise", "closed")
+        errors = [number(as_float(one.get(key)), 3) for key in shown]
+        rows.append([name, *errors, closed if "augmented" in shown else ""])
+    header = (f"hold-out, error in {unit}", *shown.values(), "closed")
     return [table(header, rows)] if rows else []
