@@ -23,6 +23,7 @@ from fdi_torch.gap.marginal_likelihood import (
     evidence_under,
     log_evidence,
     log_prior,
+    with_disturbances,
     with_estimated_noise,
     with_likeliest_parameters,
 )
@@ -92,6 +93,9 @@ class ExplanationPool:
             fit = replace(fit, cost=own_fitter.cost(fit))
             lead = log_evidence(own_fitter, fit, self.choices) - rival
             fit = own_fitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit, fit.cost + 2.0 * lead)
+            # Beside strong flows a fit may go where the plant, linearised about its trajectory, is another one.
+            own_fitter = with_disturbances(self.fitter, fit, likely.noise)
+            fit = replace(fit, cost=own_fitter.cost(fit))
             updated = RankedExplanation(fit, own_fitter, likely.noise, log_evidence(own_fitter, fit, self.choices))
             gain = updated.log_evidence - best.log_evidence if best else math.inf
             if best is None or gain > 0.0:
