@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import torch
 
+from fdi_torch import Pipe, Plant, Sensor, Tank
 from fdi_torch.cli import main
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import dump_plant
@@ -22,7 +23,7 @@ from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
 from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
 from fdi_torch.gap.library import possible_places
 from fdi_torch.gap.localization.localize import localize
-from fdi_torch.gap.marginal_likelihood import with_disturbances, with_estimated_noise
+from fdi_torch.gap.marginal_likelihood import evidence_under, with_disturbances, with_estimated_noise
 from fdi_torch.gap.onsets import fine_onsets
 from fdi_torch.gap.problem import problem_of
 from fdi_torch.gap.screening import Option, options_of, screen
@@ -212,3 +213,24 @@ def test_a_calibration_beside_random_flows_narrows_tolerances_that_hold_the_trut
         name = f"{pipe.name}.discharge_coefficient"
         share = pipe.discharge_coefficient / truth.discharge_coefficient - 1.0
         assert abs(share) < 3.0 * found.tolerances[name] < 3.0 * nominal.tolerances[name]
+
+
+def test_the_evidence_beside_strong_flows_is_that_about_the_own_trajectory() -> None:
+    """A plugged tank runs dry. Without plugging, flows keep it filled, and a fit under them may run dry earlier."""
+    outlet = Pipe("out", "T", "outside", area=0.45e-4, discharge_coefficient=0.6)
+    tank, tolerances = Tank("T", area=0.06, height=0.8), {"*.discharge_coefficient": 0.03}
+    plant = Plant([tank], pipes=[outlet], sensors=[Sensor("h", tank="T")], tolerances=tolerances)
+    generator = torch.Generator().manual_seed(3)
+    level, flow, levels = 0.75, 0.0, []
+    for shock in torch.randn(1200, generator=generator).tolist():
+        levels.append([level])
+        flow = math.exp(-1.0 / 15.0) * flow + 2e-6 * math.sqrt(1.0 - math.exp(-2.0 / 15.0)) * shock
+        root = math.sqrt(2.0 * plant.gravity * level)
+        level = max(level + (flow - 0.8 * outlet.discharge_coefficient * outlet.area * root) / tank.area, 0.0)
+    blank = blank_recording(plant, torch.zeros(1200, 0, dtype=torch.float64), torch.arange(1200.0).double())
+    noise = 8e-4 * torch.randn(1200, 1, generator=generator, dtype=torch.float64)
+    drain = replace(blank, outputs=torch.tensor(levels, dtype=torch.float64) + noise, mask=None)
+    fitter, null, _ = recalibrate(problem_of(plant, (drain,), (), Settings()).data)
+    found = ExplanationPool(fitter, null, 20).evaluate(null)
+    about = with_disturbances(fitter, found.fit, found.noise)
+    assert evidence_under(about, found.fit, 20) == pytest.approx(found.log_evidence, abs=1.0)
