@@ -103,13 +103,9 @@ def _noise_free(
     plant: PlantDescription, nominal_effects: Sequence[Placement], recording: Recording, step: float, noise: float
 ) -> Fitter:
     """A fitter whose readings are the plant file's prediction, from its initial levels or from rest."""
-    sensors = len(plant.sensors)
-    names = tuple(s.column for s in plant.sensors)
-    units = tuple(s.unit for s in plant.sensors)
-    blank = torch.zeros(len(recording), sensors, dtype=torch.float64)
-    planned = replace(
-        recording, outputs=blank, output_names=names, output_units=units, mask=torch.ones_like(blank, dtype=torch.bool)
-    )
+    blank = recording.time.new_zeros(len(recording), len(plant.sensors))
+    names, units = plant.outputs(), tuple(plant.output_units().values())
+    planned = replace(recording, outputs=blank, output_names=names, output_units=units, mask=torch.isfinite(blank))
     data = data_set_of(plant, nominal_effects, planned, step)
     std = noise * torch.tensor([abs(s.gain) for s in plant.sensors], dtype=torch.float64)
     white = Noise(std, torch.zeros_like(std))

@@ -190,12 +190,8 @@ def _initial_values(
 
 def _is_limit_from_readings(placed: PlacedEffect, plant: PlantDescription, recording: Recording) -> bool:
     """Whether the effect is a limit of a sensor that the readings themselves show."""
-    for sensor in plant.sensors:
-        if sensor.name == placed.location and sensor.column in recording.output_names:
-            i = recording.output_names.index(sensor.column)
-            limits = limits_of(recording.outputs[recording.mask[:, i], i])
-            return limits.get(placed.effect) == placed.parameters.get("limit", float("nan"))
-    return False
+    values = (recording.valid_readings(s.column) for s in plant.sensors if s.name == placed.location)
+    return any(limits_of(x).get(placed.effect) == placed.parameters.get("limit", math.nan) for x in values)
 
 
 def _typical(run_constants: Sequence[RunConstant], fit: Fit, plant: PlantDescription) -> dict[str, float]:

@@ -135,12 +135,8 @@ def blocked_recording(plant: PlantDescription, recording: Recording, noise: Tens
 
 def noise_of(plant: PlantDescription, recording: Recording) -> Tensor:
     """Standard deviation (C,) of each sensor's noise, quantization included, in the units of the readings."""
-    stds = []
-    for sensor in plant.sensors:
-        column = recording.output_names.index(sensor.column)
-        spread = scatter(recording.outputs[recording.mask[:, column], column])
-        stds.append(math.hypot(spread.noise, spread.step / math.sqrt(12.0)))
-    return torch.tensor(stds, dtype=torch.float64)
+    scatters = [scatter(recording.valid_readings(column)) for column in plant.outputs()]
+    return torch.tensor([math.hypot(s.noise, s.step / math.sqrt(12.0)) for s in scatters], dtype=torch.float64)
 
 
 def blockwise_fit(

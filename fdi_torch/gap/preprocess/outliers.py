@@ -21,6 +21,7 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet, at_recorded_times
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.repeated_readings import resolution
 
 FAR = 5.0  # size of a jump in usual differences of neighbours: seven standard deviations of white noise
 NEARER = 3.5  # the same for a sensor that is known to have outliers
@@ -117,17 +118,11 @@ def _channel_outliers(recording: Recording, model: Tensor, channel: int, far: fl
     if len(at) < ENOUGH:
         return []
     values, predicted, time = recording.outputs[at, channel], model[at], recording.time[at]
-    spans = jumps_and_returns(values - predicted, torch.diff(predicted).abs(), _resolution(values), far)
+    spans = jumps_and_returns(values - predicted, torch.diff(predicted).abs(), resolution(values), far)
     return [
         Outlier(slice(int(at[a]), int(at[b - 1]) + 1), (float(time[a]), float(time[b - 1])), jumps)
         for a, b, jumps in spans
     ]
-
-
-def _resolution(values: Tensor) -> float:
-    """Smallest distance between two distinct values (S,)."""
-    distinct = torch.unique(values)
-    return float(torch.diff(distinct).min()) if len(distinct) > 1 else 0.0
 
 
 def jumps_and_returns(x: Tensor, slope: Tensor, least: float, far: float = FAR) -> list[tuple[int, int, float]]:
