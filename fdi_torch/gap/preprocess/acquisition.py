@@ -15,14 +15,8 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.preprocess.blockwise_likelihood import (
-    BlockwiseFit,
-    blocked_recording,
-    blockwise_fit,
-    noise_of,
-    thinned,
-)
-from fdi_torch.gap.preprocess.recording_fault_decision import SURE, log_odds, recording_fault
+from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit, blocked_recording, blockwise_fit
+from fdi_torch.gap.preprocess.recording_fault_decision import SURE, recording_fault
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, not_held
 from fdi_torch.plant.description import PlantDescription, Sensor, with_tolerances
 from fdi_torch.quantities import quantity_text
@@ -120,7 +114,7 @@ def stuck_in(plant: PlantDescription, recording: Recording) -> tuple[StuckSegmen
     unclear = [each for of_sensor in segments.values() for each in of_sensor if each not in stuck]
     remaining = without(recording, [*stuck, *unclear])
     if ambiguous := [each for each in unclear if _other_readings(recording, each).numel()]:
-        fitted = blockwise_fit(blocked_recording(plant, thinned(remaining), noise_of(plant, recording)))
+        fitted = blockwise_fit(blocked_recording(plant, remaining))
         stuck += [each for each in ambiguous if _level_inside_range(plant, recording, each, ambiguous, fitted)]
     return tuple(stuck)
 
@@ -238,7 +232,7 @@ def _level_inside_range(
     gains = torch.tensor([s.gain for s in plant.sensors], dtype=torch.float64)
     model_error = float(((fitted.variance / gains**2)[fitted.means > 0]).max()) * stuck.sensor.gain**2
     count = blocked.blocks * float(stuck_now.double().mean())
-    return 0.5 * count * math.log(max(mean_square, model_error) / model_error) > log_odds(SURE)
+    return 0.5 * count * math.log(max(mean_square, model_error) / model_error) > SURE
 
 
 def _constant_sensors(plant: PlantDescription, recording: Recording) -> list[Sensor]:
