@@ -27,6 +27,7 @@ from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
+from fdi_torch.gap.extensions import size_of
 from fdi_torch.gap.library import canonical, library_of
 from fdi_torch.gap.screening import Option, Pairs, options_of, pairs_of, screen
 from fdi_torch.plant.description import PlantDescription
@@ -156,8 +157,7 @@ def _possible(option: Option, strength: Tensor, gap: float) -> bool:
     """Whether an effect can cause such a gap within its range, to first order from its start."""
     if float(strength) <= VISIBLE:
         return False
-    name, start = next(iter(option.start.items()))
-    size = next(p for p in option.parameters if option.placement.full_name(p.name) == name)
+    _, start, size = size_of(option)
     needed = size.nominal + (gap / float(strength)) ** 0.5 * (start - size.nominal)
     return size.low <= needed <= size.high
 

@@ -79,7 +79,7 @@ def _masked_outliers(outliers: SensorOutliers) -> str:
 
 def _free_form_is_worse(held: HeldOut) -> bool:
     """Whether the free form predicts a hold-out worse than the recalibrated plant."""
-    with_form, without = (float((held.weight * held.squares(m)).sum()) for m in ("augmented", "recalibrated"))
+    with_form, without = (float((held.weight * held.squares[m]).sum()) for m in ("augmented", "recalibrated"))
     return with_form > WORSE**2 * without
 
 
