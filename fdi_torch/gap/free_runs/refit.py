@@ -122,9 +122,8 @@ def refit(
         tolerances=plant.tolerances,
         varying=plant.varying,
     )
-    before, after = (
-        rmse_by_sensor(data.plant, data.readings - f.linearised.readings[0], data.mask) for f in (null, fit)
-    )
+    residuals = (data.readings - each.linearised.readings[0] for each in (null, fit))
+    before, after = (rmse_by_sensor(plant, residual, data.mask) for residual in residuals)
     return Refit(refitted, before, after, len(fit.space), _errors(fitter, fit), run_constants)
 
 
