@@ -24,6 +24,7 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
     ROUNDS,
     blocked_recording,
     blockwise_fit,
+    noise_of,
 )
 from fdi_torch.gap.preprocess.corrected_fit import first_order_log_likelihood
 from fdi_torch.gap.trajectory_problem import BEHIND
@@ -136,8 +137,8 @@ def test_a_correction_that_masks_readings_is_compared_to_first_order() -> None:
     plant, run = nominal_plant(), sound()
     mask = run.mask.clone()
     mask[:, 0] = False
-    fit = blockwise_fit(blocked_recording(plant, run))
-    masked = first_order_log_likelihood(fit, blocked_recording(plant, replace(run, mask=mask)))
+    fit = blockwise_fit(blocked_recording(plant, run, noise_of(plant, run)))
+    masked = first_order_log_likelihood(fit, blocked_recording(plant, replace(run, mask=mask), noise_of(plant, run)))
     others = -0.5 * float((fit.means * torch.log(fit.variance))[1:].sum()) - 0.5 * fit.prior_chi_square
     assert masked == pytest.approx(others, abs=1.0)
 
@@ -145,7 +146,7 @@ def test_a_correction_that_masks_readings_is_compared_to_first_order() -> None:
 def test_a_swap_is_compared_to_first_order() -> None:
     plant, run = nominal_plant(), sound()
     swapped = replace(run, inputs=run.inputs.flip(1))
-    right, wrong = (blocked_recording(plant, r) for r in (run, swapped))
+    right, wrong = (blocked_recording(plant, r, noise_of(plant, r)) for r in (run, swapped))
     fit, fit_to_swapped = blockwise_fit(right), blockwise_fit(wrong)
     # Where the constants are already the best, a further step changes nothing.
     assert first_order_log_likelihood(fit, right) == pytest.approx(fit.log_likelihood, abs=0.1)
@@ -267,7 +268,7 @@ def test_a_recording_without_a_sensor_that_reads_is_refused() -> None:
 
 def test_a_rival_that_lags_far_behind_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     plant, run = nominal_plant(), sound()
-    blocked, fits = blocked_recording(plant, run), 0
+    blocked, fits = blocked_recording(plant, run, noise_of(plant, run)), 0
     fit = Fitter.fit
 
     def counted(*arguments: Any, **options: Any) -> Fit:

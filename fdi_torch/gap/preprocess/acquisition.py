@@ -15,7 +15,7 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit, blocked_recording, blockwise_fit
+from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit, blocked_recording, blockwise_fit, noise_of
 from fdi_torch.gap.preprocess.recording_fault_decision import SURE, recording_fault
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, not_held
 from fdi_torch.plant.description import PlantDescription, Sensor, with_tolerances
@@ -106,7 +106,7 @@ def _stuck(plant: PlantDescription, recording: Recording) -> list[StuckSegment]:
     unclear = [each for each in segments if _may_be_clipped(plant, recording, each)]
     stuck, remaining = [each for each in segments if each not in unclear], without(recording, segments)
     if ambiguous := [each for each in unclear if _other_readings(recording, each).numel()]:
-        fitted = blockwise_fit(blocked_recording(plant, remaining))
+        fitted = blockwise_fit(blocked_recording(plant, remaining, noise_of(plant, remaining)))
         stuck += [each for each in ambiguous if _level_inside_range(plant, recording, each, ambiguous, fitted)]
     return stuck
 

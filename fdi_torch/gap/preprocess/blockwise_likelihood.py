@@ -115,12 +115,8 @@ def slowest(plant: PlantDescription) -> float:
     return max(t.area * t.height / flow_scale(plant, t.name) for t in plant.tanks)
 
 
-def blocked_recording(plant: PlantDescription, recording: Recording, noise: Tensor | None = None) -> BlockedRecording:
-    """Thin a recording to at most about SAMPLES samples, and divide it into blocks.
-
-    noise (C,): standard deviation of each sensor's readings, in the plant's order; by default from their scatter.
-    """
-    noise = noise_of(plant, recording) if noise is None else noise
+def blocked_recording(plant: PlantDescription, recording: Recording, noise: Tensor) -> BlockedRecording:
+    """Thin a recording to at most about SAMPLES samples, and divide it into blocks. noise (C,): as of `noise_of`."""
     thinned = recording.every(max(1, len(recording) // SAMPLES))
     nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     data = data_set_of(plant, nominal_effects, thinned, float(torch.median(torch.diff(thinned.time))))

@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit, noise_of
+from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit
 from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Correction
 from fdi_torch.gap.preprocess.recording_fault_texts import clock_offset
 from fdi_torch.recording import Recording
@@ -42,7 +42,7 @@ def _correction(fits: CorrectedFits, late: list[int], delay: float, steps: int) 
     columns = tuple(fits.plant.sensors[i].column for i in late)
     fault = clock_offset(columns, delay, len(late) == len(fits.plant.sensors))
     cost = 0.5 * math.log(float(fits.as_is.means.sum()))
-    return Correction(fault, _shifted(fits, late, delay), cost, noise_of(fits.plant, fits.recording), refined)
+    return Correction(fault, _shifted(fits, late, delay), cost, refined=refined)
 
 
 def _shifted(fits: CorrectedFits, late: list[int], delay: float) -> Recording:

@@ -27,7 +27,7 @@ class Correction:
     """A recording in which a suspected fault is undone.
 
     cost: log-likelihood that undoing the fault takes, for its parameter or for readings that are explained without a
-    level. noise (C,): standard deviation of the readings, if undoing the fault smooths them. refined: a better
+    level. noise (C,): standard deviation of each sensor's readings, if undoing the fault changes it. refined: a better
     correction of the same fault, from the fit to this one; None if there is none.
     """
 
@@ -48,12 +48,21 @@ class WeightedFault:
 
 @dataclass(frozen=True)
 class CorrectedFits:
-    """A recording and its corrections. as_is: fit without one. prior: log prior probability of one fault."""
+    """A recording and its corrections. as_is: fit without one. prior: log prior probability of one fault.
+
+    noise (C,): standard deviation of each sensor's readings as recorded.
+    """
 
     plant: PlantDescription
     recording: Recording
     as_is: BlockwiseFit
     prior: float
+    noise: Tensor
+
+    @property
+    def thinned(self) -> Recording:
+        """The recording with the samples that are fitted."""
+        return self.as_is.blocked.recording
 
     def column(self, sensor: int) -> int:
         """Column of the recording that holds this sensor of the plant."""
@@ -61,7 +70,7 @@ class CorrectedFits:
 
     def fit(self, corrected: Recording, noise: Tensor | None = None) -> BlockwiseFit:
         """The plant fitted to a corrected recording. noise: as in `Correction`."""
-        return blockwise_fit(blocked_recording(self.plant, corrected, noise), base=self.as_is)
+        return blockwise_fit(self._blocked(corrected, noise), base=self.as_is)
 
     def weighed(self, correction: Correction) -> WeightedFault:
         """The fault of a correction with its weight by fits."""
@@ -75,9 +84,12 @@ class CorrectedFits:
 
         The constants have to be free: those of the uncorrected fit were adapted to the wrong recording.
         """
-        corrected = blocked_recording(self.plant, correction.recording, correction.noise)
+        corrected = self._blocked(correction.recording, correction.noise)
         gain = first_order_log_likelihood(self.as_is, corrected) - self.as_is.log_likelihood
         return gain - correction.cost + self.prior
+
+    def _blocked(self, corrected: Recording, noise: Tensor | None) -> BlockedRecording:
+        return blocked_recording(self.plant, corrected, self.noise if noise is None else noise)
 
     def channel_log_likelihood(self, sensor: int, residual: Tensor) -> float:
         """Log-likelihood of one sensor with these residuals (S,)."""

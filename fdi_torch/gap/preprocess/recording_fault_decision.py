@@ -10,16 +10,15 @@ in most recordings one of them explains the gap so well that no fault need be tr
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import torch
 
-from fdi_torch.estimate.evidence import RARE
 from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.library import library_of
 from fdi_torch.gap.marginal_likelihood import log_prior
-from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit, blocked_recording, blockwise_fit
-from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Correction, WeightedFault
+from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit, blocked_recording, blockwise_fit, noise_of
+from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault
 from fdi_torch.gap.preprocess.recording_faults import DECADES, suspected
 from fdi_torch.gap.screening import Option, options_of, screen
@@ -46,13 +45,14 @@ def recording_fault(
 
     constant: columns of sensors that never move although noise should move them. They may also be clipped throughout.
     """
-    as_is = blockwise_fit(blocked_recording(plant, recording))
+    noise = noise_of(plant, recording)
+    as_is = blockwise_fit(blocked_recording(plant, recording, noise))
     count = len(plant.sensors) + len(plant.channels())
     prior = math.log(FAULT_PROBABILITY / (len(DECADES) * count + math.comb(count, 2) + 2 * len(plant.sensors) + 1))
     most = as_is.most + prior - SURE  # what a perfect fit of a corrected recording allows the others
     if most < as_is.log_likelihood:
         return None
-    fits = CorrectedFits(plant, recording, as_is, prior)
+    fits = CorrectedFits(plant, recording, as_is, prior, noise)
     corrections = suspected(fits, constant)
     if not corrections:
         return None
@@ -63,28 +63,11 @@ def recording_fault(
         rivals.append(rival)
         if most < rival:
             return None
-    faults = _weighed(fits, corrections, max(rivals))
+    faults = [fits.weighed(correction) for _, correction in corrections]
     total = torch.logsumexp(torch.tensor([f.log_weight for f in faults]), 0)
     if float(total - torch.logsumexp(torch.tensor(rivals), 0)) < SURE:
         return None
     return max(faults, key=lambda f: f.log_weight).fault
-
-
-def _weighed(fits: CorrectedFits, corrections: Sequence[tuple[float, Correction]], rival: float) -> list[WeightedFault]:
-    """The fitted faults, without those that cannot be relevant against the likeliest fault or the likeliest rival.
-
-    corrections: as `suspected` returns them. A fit may gain more than its first-order estimate, by the largest factor
-    among all faults that were fitted so far.
-    """
-    faults: list[WeightedFault] = []
-    base, factor = fits.as_is.log_likelihood, 1.0
-    for gain, correction in corrections:
-        best = max([rival, *(f.log_weight for f in faults)])
-        if faults and base + factor * gain < best + math.log(RARE):
-            continue
-        faults.append(fits.weighed(correction))
-        factor = max(factor, (faults[-1].log_weight - base) / gain)
-    return faults
 
 
 def _weights_with_an_effect(as_is: BlockwiseFit, excluded: set[str], target: float) -> Iterator[float]:

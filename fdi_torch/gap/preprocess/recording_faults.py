@@ -19,6 +19,7 @@ import math
 from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, combinations
+from operator import itemgetter
 
 from torch import Tensor
 
@@ -37,22 +38,20 @@ def suspected(fits: CorrectedFits, constant: Collection[str]) -> list[tuple[floa
     constant: columns of sensors that never move.
     """
     alternatives = chain(_units(fits), _swaps(fits), clock_offsets(fits), silent_sensors(fits, constant))
-    gains = [[(fits.first_order_gain(correction), correction) for correction in each] for each in alternatives]
-    likeliest = [max(each, key=lambda item: item[0]) for each in gains if each]
-    return sorted((item for item in likeliest if item[0] > 0.0), key=lambda item: -item[0])
+    likeliest = [max(((fits.first_order_gain(c), c) for c in each), key=itemgetter(0)) for each in alternatives if each]
+    return sorted((item for item in likeliest if item[0] > 0.0), key=itemgetter(0), reverse=True)
 
 
 def _units(fits: CorrectedFits) -> Iterator[list[Correction]]:
     """The wrong units of each sensor, and of each input."""
-    r = fits.recording
+    r = fits.thinned
     for i, sensor in enumerate(fits.plant.sensors):
+        outputs = {k: _scaled(r.outputs, fits.column(i), k) for k in DECADES}
         # Jacobian of the change of unit: an error of the level is 10^k times as large in the recorded numbers.
-        jacobian = float(fits.as_is.means[i]) * math.log(10.0)
+        cost = float(fits.as_is.means[i]) * math.log(10.0)
         yield [
-            Correction(
-                wrong_unit(sensor.column, k), replace(r, outputs=_scaled(r.outputs, fits.column(i), k)), k * jacobian
-            )
-            for k in DECADES
+            Correction(wrong_unit(sensor.column, k), replace(r, outputs=x), k * cost, _scaled(fits.noise, i, k))
+            for k, x in outputs.items()
         ]
     for channel in fits.plant.channels():
         column = r.input_names.index(channel)
@@ -60,17 +59,19 @@ def _units(fits: CorrectedFits) -> Iterator[list[Correction]]:
 
 
 def _scaled(values: Tensor, column: int, decade: int) -> Tensor:
-    """The values (S, C) with one column divided by 10^decade."""
+    """The values (*, C) with one column divided by 10^decade."""
     values = values.clone()
-    values[:, column] /= 10.0**decade
+    values[..., column] /= 10.0**decade
     return values
 
 
 def _swaps(fits: CorrectedFits) -> Iterator[list[Correction]]:
     """The pairs of sensors, and of inputs, that may be swapped."""
-    r = fits.recording
-    sensors = {s.column: (s.unit, s.gain, s.offset) for s in fits.plant.sensors}
-    yield [Correction(swapped(*p), replace(r, output_names=_exchanged(r.output_names, p))) for p in _alike(sensors)]
+    r, columns = fits.thinned, fits.plant.outputs()
+    alike = _alike({s.column: (s.unit, s.gain, s.offset) for s in fits.plant.sensors})
+    noise = {p: fits.noise[[columns.index(name) for name in _exchanged(columns, p)]] for p in alike}
+    sensors = {p: replace(r, output_names=_exchanged(r.output_names, p)) for p in alike}
+    yield [Correction(swapped(*p), sensors[p], noise=noise[p]) for p in alike]
     inputs = _alike(fits.plant.channel_units())
     yield [Correction(swapped(*p), replace(r, input_names=_exchanged(r.input_names, p))) for p in inputs]
 

@@ -67,28 +67,15 @@ def noise_before_clipping(noise: Noise, data: DataSet, predicted: Tensor) -> Noi
 
     predicted (S, C): about the readings without noise.
     """
-    innovation, residual = noise.innovation.clone(), data.readings - predicted
+    std, residual = noise.std.clone(), data.readings - predicted
     for c, ends in enumerate(_limits_per_sensor(data)):
-        valid = unclipped = data.mask[:, c]
+        unclipped = data.mask[:, c]
         for name, end in ends.items():
             unclipped = unclipped & (_beyond(name, predicted[:, c], end) < -CLEAR * float(noise.std[c]))
-        if ends and int(unclipped.sum()) > FEWEST * int(valid.sum()):
-            innovation[c] *= _rms_difference(residual[:, c], unclipped) / _rms_difference(
-                residual[:, c], valid, data.rows
-            )
-    return replace(noise, innovation=innovation)
-
-
-def _rms_difference(x: Tensor, selected: Tensor, tapered: Sequence[slice] = ()) -> float:
-    """Root mean square difference of neighbouring samples among some (S,).
-
-    tapered: segments weighted by the taper that the noise spectrum uses.
-    """
-    weight = torch.ones_like(x) if not tapered else torch.zeros_like(x)
-    for rows in tapered:
-        weight[rows] = torch.hann_window(len(x[rows]), periodic=False, dtype=x.dtype) ** 2
-    weight = weight[1:] * (selected[1:] & selected[:-1])
-    return float((weight * torch.diff(x) ** 2).sum() / weight.sum()) ** 0.5
+        if ends and int(unclipped.sum()) > FEWEST * int(data.mask[:, c].sum()):
+            differences = torch.diff(residual[:, c])[unclipped[1:] & unclipped[:-1]]
+            std[c] = torch.sqrt(differences.square().mean() / (2.0 * (1.0 - noise.lag_one[c])))
+    return replace(noise, innovation=std / torch.sqrt(noise.energy))
 
 
 def with_noise_limits(data: DataSet, null: Fit, noise: Noise) -> DataSet:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 
-from fdi_torch.gap.preprocess.blockwise_likelihood import noise_of
 from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Correction
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, stuck, unrelated
 from fdi_torch.recording import Recording
@@ -22,11 +21,11 @@ def silent_sensors(fits: CorrectedFits, constant: Collection[str]) -> Iterator[l
     constant: columns of the latter.
     """
     data, model = fits.as_is.blocked.data, fits.as_is.readings
-    noise, moves = noise_of(fits.plant, fits.recording), model.std(dim=0)
+    moves = model.std(dim=0)
     sensors = {i: s for i, s in enumerate(fits.plant.sensors) if bool(data.mask[:, i].any())}
     still = [i for i, s in sensors.items() if s.column in constant]
     for i, sensor in sensors.items():
-        if i not in still and float(noise[i]) > float(moves[i]):
+        if i not in still and float(fits.noise[i]) > float(moves[i]):
             yield [_correction(fits, unrelated(sensor), [i])]
     if not still:
         return
@@ -48,9 +47,9 @@ def _correction(fits: CorrectedFits, fault: RecordingFault, silent: list[int]) -
 
 
 def _without(fits: CorrectedFits, sensors: list[int]) -> Recording:
-    mask = fits.recording.mask.clone()
+    mask = fits.thinned.mask.clone()
     mask[:, [fits.column(i) for i in sensors]] = False
-    return replace(fits.recording, mask=mask)
+    return replace(fits.thinned, mask=mask)
 
 
 def _about_mean(fits: CorrectedFits, sensor: int) -> float:
