@@ -2,15 +2,17 @@
 
     P(fault) = sum of the weights of all faults / (that sum + weights of the unchanged recording)
 
-The unchanged recording is explained without an effect and with one effect of the library, so that an unusual plant is
-not mistaken for a wrong recording. A fault is reported if P(fault) exceeds 95 %. The effects are fitted first, because
-in most recordings one of them explains the gap so well that no fault need be tried.
+The unchanged recording is explained without an effect and with one or two effects of the library, so that an unusual
+plant is not mistaken for a wrong recording (two pumps that lag alike look like a late clock). A fault is reported if
+P(fault) exceeds 95 %. Single effects are fitted first, because in most recordings one of them explains the gap so well
+that no fault need be tried.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from itertools import chain, islice
 
 import torch
 
@@ -34,8 +36,8 @@ SURE = math.log(0.95 / 0.05)
 EVALUATIONS = 30
 """Most evaluations of the fit of a rival effect. It limits computing time: a fit that is stopped early understates the
 evidence for the rival, so that a fault of the recording is reported more easily."""
-RIVALS = 6
-"""Most rival effects fitted; it limits computing time as well."""
+RIVALS, MOST_EFFECTS = 6, 2
+"""Most rival effects fitted, and most effects in one combination; they limit computing time as well."""
 
 
 def recording_fault(
@@ -58,34 +60,45 @@ def recording_fault(
         return None
     silent = {c for _, each in corrections if each.fault.silent for c in each.fault.channels}
     target = as_is.log_likelihood + corrections[0][0] - SURE
+    others = _weights_with_effects(as_is, {s.name for s in plant.sensors if s.column in silent}, target)
     rivals = [as_is.log_likelihood]
-    for rival in _weights_with_an_effect(as_is, {s.name for s in plant.sensors if s.column in silent}, target):
+    for rival in islice(others, RIVALS):
         rivals.append(rival)
         if most < rival:
             return None
     faults = [fits.weighed(correction) for _, correction in corrections]
     total = torch.logsumexp(torch.tensor([f.log_weight for f in faults]), 0)
-    if float(total - torch.logsumexp(torch.tensor(rivals), 0)) < SURE:
-        return None
+    for rival in chain([-math.inf], others):
+        rivals.append(rival)
+        if float(total - torch.logsumexp(torch.tensor(rivals), 0)) <= SURE:
+            return None
     return max(faults, key=lambda f: f.log_weight).fault
 
 
-def _weights_with_an_effect(as_is: BlockwiseFit, excluded: set[str], target: float) -> Iterator[float]:
-    """Log weights of the uncorrected recording with each of the likeliest effects of the library.
+def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str], target: float) -> Iterator[float]:
+    """Log weights of the uncorrected recording with one and with two effects of the library, by a greedy search.
 
     excluded: places at which no effect is tried. target: log-likelihood below which an effect changes no decision.
     """
-    blocked, fit, fitter, plant = as_is.blocked, as_is.fit, as_is.fitter, as_is.blocked.plant
+    blocked, plant, parent = as_is.blocked, as_is.blocked.plant, as_is
     library = [p for p in library_of(plant) if not p.effect.quantizes and p.location not in excluded]
     known = {p.prefix for p in blocked.data.nominal_effects}
-    reach = with_simulated_levels(operating_range_of_all([blocked.recording], plant), plant, fit.linearised.levels[0])
-    screening = screen(fitter, fit, options_of([p for p in library if p.prefix not in known], fitter, reach))
-    best: dict[tuple[str, str], Option] = {}
-    for k in torch.argsort(screening.gain, descending=True).tolist():
-        best.setdefault(screening.options[k].cause, screening.options[k])
-    for option in list(best.values())[:RIVALS]:
-        fitted = blockwise_fit(blocked, Candidate((option.placement,), (option.start,)), as_is, EVALUATIONS, target)
-        yield _log_weight(fitted, len(library))
+    ranges = operating_range_of_all([blocked.recording], plant)
+    for _ in range(MOST_EFFECTS):
+        fit, fitter = parent.fit, parent.fitter
+        reach = with_simulated_levels(ranges, plant, fit.linearised.levels[0])
+        further = [p for p in library if p.prefix not in known and (p.effect.name, p.location) not in fit.key]
+        screening = screen(fitter, fit, options_of(further, fitter, reach))
+        best: dict[tuple[str, str], Option] = {}
+        for k in torch.argsort(screening.gain, descending=True).tolist():
+            best.setdefault(screening.options[k].cause, screening.options[k])
+        fits: list[BlockwiseFit] = []
+        for option in list(best.values())[:RIVALS]:
+            start = fit.effect_values | dict(option.start)
+            candidate = Candidate((*fit.candidate.placements, option.placement), (start,))
+            fits.append(blockwise_fit(blocked, candidate, as_is, EVALUATIONS, target))
+            yield _log_weight(fits[-1], len(library))
+        parent = max(fits, key=lambda each: each.log_likelihood, default=as_is)
 
 
 def _log_weight(fitted: BlockwiseFit, choices: int) -> float:
