@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from scipy.special import chdtri
 
 DETERMINED = 0.5  # share of the tolerance; a larger standard error means that the recording does not determine it
 
@@ -39,6 +38,8 @@ def between_run_spread(constants: Sequence[RunConstant], tolerance: float) -> Be
 
     For independent normal values, (n - 1) s^2 / sigma^2 is chi-square with n - 1 degrees of freedom.
     """
+    from scipy.special import chdtri  # SciPy takes a while to load, and few plants have constants that vary
+
     values = torch.tensor([o.value for o in constants if o.std < DETERMINED * tolerance], dtype=torch.float64)
     count = len(values)
     if count < 2:
