@@ -9,7 +9,7 @@ do along the trajectory, averaged over samples with the same value of the variab
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -46,10 +46,8 @@ class Curve:
     effect: Tensor | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        curve: dict[str, Any] = {"location": self.location, "variable": self.variable, "unit": self.unit}
-        curve |= {"quantity": self.quantity, "quantity_unit": self.quantity_unit, "at": self.at.tolist()}
-        curve |= {"free": self.free.tolist(), "free_std": self.free_std.tolist()}
-        return curve | ({"effect": self.effect.tolist()} if self.effect is not None else {})
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {n: v.tolist() if isinstance(v, Tensor) else v for n, v in values.items() if v is not None}
 
 
 def curves_at(fitter: Fitter, fit: Fit, place: str, reach: OperatingRange) -> list[Curve]:

@@ -39,14 +39,6 @@ class Correction:
 
 
 @dataclass(frozen=True)
-class WeightedFault:
-    """A fault with its log posterior weight, not normalised."""
-
-    fault: RecordingFault
-    log_weight: float
-
-
-@dataclass(frozen=True)
 class CorrectedFits:
     """A recording and its corrections. as_is: fit without one. prior: log prior probability of one fault.
 
@@ -72,12 +64,12 @@ class CorrectedFits:
         """The plant fitted to a corrected recording. noise: as in `Correction`."""
         return blockwise_fit(self._blocked(corrected, noise), base=self.as_is)
 
-    def weighed(self, correction: Correction) -> WeightedFault:
-        """The fault of a correction with its weight by fits."""
+    def weighed(self, correction: Correction) -> tuple[float, RecordingFault]:
+        """The log posterior weight of a correction by fits, not normalised, and its fault."""
         fitted = self.fit(correction.recording, correction.noise)
         while better := correction.refined(fitted):
             correction, fitted = better, self.fit(better.recording, better.noise)
-        return WeightedFault(correction.fault, self.prior + fitted.log_likelihood - correction.cost)
+        return self.prior + fitted.log_likelihood - correction.cost, correction.fault
 
     def first_order_gain(self, correction: Correction) -> float:
         """Gain in log posterior weight to first order in the constants.

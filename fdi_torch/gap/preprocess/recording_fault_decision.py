@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import chain, islice
+from operator import itemgetter
 
 import torch
 
@@ -67,12 +68,12 @@ def recording_fault(
         if most < rival:
             return None
     faults = [fits.weighed(correction) for _, correction in corrections]
-    total = torch.logsumexp(torch.tensor([f.log_weight for f in faults]), 0)
+    total = torch.logsumexp(torch.tensor([weight for weight, _ in faults]), 0)
     for rival in chain([-math.inf], others):
         rivals.append(rival)
         if float(total - torch.logsumexp(torch.tensor(rivals), 0)) <= SURE:
             return None
-    return max(faults, key=lambda f: f.log_weight).fault
+    return max(faults, key=itemgetter(0))[1]
 
 
 def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str], target: float) -> Iterator[float]:
