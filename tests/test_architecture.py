@@ -58,6 +58,7 @@ DOORS = {
         "recordings/matlab.py",
         "blind/statistics.py",
         "estimate/state_noise.py",
+        "gap/free_runs/between_runs.py",
         "logbook/compare.py",
         "monitor/false_alarm_rate.py",
         "monitor/monte_carlo/false_alarm_plan.py",

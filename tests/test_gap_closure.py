@@ -97,7 +97,7 @@ def test_the_noise_of_a_hold_out_is_right_even_if_the_augmented_model_diverges()
     swinging = {"h1.sensor_oscillation.amplitude": 0.05, "h1.sensor_oscillation.period": 5.0}
     models = {"recalibrated": Model(), "augmented": Model(placements_for(swinging), swinging)}
     found = run_reference_models(held, white, models, [0.0, 0.0, 0.0])
-    assert found.squares("augmented").sum() > 1.5 * found.squares("recalibrated").sum()
+    assert found.squares["augmented"].sum() > 1.5 * found.squares["recalibrated"].sum()
     assert found.noise.std.tolist() == pytest.approx([1e-3] * 3, rel=0.1)
 
 

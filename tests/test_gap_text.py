@@ -27,7 +27,7 @@ BOTH = Answer(
     where=[("Q1", 0.97), ("T1", 0.96), ("P13", 1e-6)],
     causes=[LEAK, Cause(*ODD)],
     ambiguity_set=[],
-    posterior=[ProbableExplanation((("leak", "T1"),), 0.97, "Q1"), ProbableExplanation((("leak", "T1"),), 0.01)],
+    posterior=[ProbableExplanation((("leak", "T1"), ODD), 0.97), ProbableExplanation((("leak", "T1"),), 0.01)],
     closure={},
     noise={},
     unexamined=0.02,
@@ -109,7 +109,7 @@ def test_constants_that_stay_out_of_their_tolerances_are_to_be_calibrated_first(
 
 def test_an_ambiguous_verdict_states_which_causes_are_certain() -> None:
     sets = [(("leak", "T1"), ODD), (("leak", "T1"),)]
-    posterior = [ProbableExplanation((("leak", "T1"),), 0.6, "Q1"), ProbableExplanation((("leak", "T1"),), 0.39)]
+    posterior = [ProbableExplanation((("leak", "T1"), ODD), 0.6), ProbableExplanation((("leak", "T1"),), 0.39)]
     answer = replace(BOTH, verdict="ambiguous", ambiguity_set=sets, posterior=posterior)
     assert answer.certain == [("leak", "T1")]
     assert verdict_sentence(answer.to_dict()) == (
@@ -121,7 +121,7 @@ def test_an_ambiguous_verdict_states_which_causes_are_certain() -> None:
 def test_several_places_of_one_unknown_are_told_as_such() -> None:
     leak, posterior = (
         ("leak", "T1"),
-        [ProbableExplanation((("leak", "T1"),), p, at) for p, at in ((0.6, "Q1"), (0.38, "h1"))],
+        [ProbableExplanation((("leak", "T1"), ("unknown", at)), p) for p, at in ((0.6, "Q1"), (0.38, "h1"))],
     )
     answer = replace(BOTH, ambiguity_set=[(leak, ODD), (leak, ("unknown", "h1"))], posterior=posterior)
     assert answer.verdict == "unknown"
@@ -142,7 +142,7 @@ def test_a_single_explanation_that_does_not_suffice_states_the_unfitted_probabil
 
 
 def test_where_the_plant_as_it_is_remains_plausible_there_may_be_a_gap() -> None:
-    posterior = [ProbableExplanation((), 0.88), ProbableExplanation((), 0.11, "T1")]
+    posterior = [ProbableExplanation((), 0.88), ProbableExplanation((("unknown", "T1"),), 0.11)]
     answer = replace(BOTH, verdict="ambiguous", ambiguity_set=[(), (("unknown", "T1"),)], posterior=posterior)
     assert verdict_sentence(answer.to_dict()) == (
         "There may be a gap; 2 explanations are plausible at 95 %, the likeliest is nothing beyond tolerances, "

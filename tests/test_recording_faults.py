@@ -14,7 +14,7 @@ from fdi_torch.blind.inputs import FACTORS, command_unit
 from fdi_torch.blind.plants import RIGS
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.preprocess.acquisition import examined
-from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits
+from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Correction
 from fdi_torch.gap.preprocess.recording_fault_decision import recording_fault
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
 from tests.rigs import blank_recording, random_steps
@@ -79,10 +79,10 @@ def test_no_fault_is_fitted_where_one_effect_explains_the_recording(monkeypatch:
     suspected = 0
     original = CorrectedFits.first_order_gain
 
-    def counted(self: CorrectedFits, *arguments: object) -> float:
+    def counted(self: CorrectedFits, correction: Correction) -> float:
         nonlocal suspected
-        gain = original(self, *arguments)  # type: ignore[arg-type]
-        suspected += gain + self.prior > 0.0
+        gain = original(self, correction)
+        suspected += gain > 0.0
         return gain
 
     def refused(self: CorrectedFits, *arguments: object) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
 
 import torch
@@ -46,16 +46,10 @@ class Cause:
 
 @dataclass(frozen=True)
 class ProbableExplanation:
-    """A set of causes, empty for the nominal plant, and its posterior probability."""
+    """A set of causes, something unknown included, empty for the nominal plant; and its posterior probability."""
 
     causes: tuple[CauseName, ...]
     probability: float
-    unknown_at: str | None = None
-
-    @property
-    def every(self) -> tuple[CauseName, ...]:
-        """All causes, something unknown included."""
-        return (*self.causes, *(((UNKNOWN, self.unknown_at),) if self.unknown_at else ()))
 
 
 @dataclass(frozen=True)
@@ -91,34 +85,22 @@ class Answer:
         """Causes, unknown ones included, with a marginal probability of 95 %."""
         share: dict[CauseName, float] = {}
         for e in self.posterior:
-            for cause in e.every:
+            for cause in e.causes:
                 share[cause] = share.get(cause, 0.0) + e.probability
         return [cause for cause, probability in share.items() if probability >= CERTAIN]
 
     def to_dict(self) -> dict[str, Any]:
-        answer: dict[str, Any] = {
-            "format": FORMAT,
-            "verdict": self.verdict,
+        answer = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("p_value", "arrays")}
+        posterior = [{"causes": names(e.causes), "probability": e.probability} for e in self.posterior]
+        as_json = {
             "alarm": {"p_value": self.p_value},
             "where": [{"location": place, "share": share} for place, share in self.where],
             "causes": [_cause(c) for c in self.causes],
             "ambiguity_set": [names(causes) for causes in self.ambiguity_set],
-            "posterior": [_explanation(e) for e in self.posterior],
-            "closure": dict(self.closure),
-            "unexamined": self.unexamined,
+            "posterior": posterior,
             "certain": names(self.certain),
-            "converged": self.converged,
-            "noise": dict(self.noise),
-            "disturbances": dict(self.disturbances),
-            "shape": self.shape,
-            "next_input": self.next_input,
-            "impostors": self.impostors,
-            "excitation": dict(self.excitation),
-            "constants": dict(self.constants),
-            "curves": [dict(c) for c in self.curves],
-            "remarks": list(self.remarks),
         }
-        return finite(answer)
+        return finite({"format": FORMAT} | answer | as_json)
 
 
 def adopted(plant: PlantDescription, answer: Answer, constants: bool = False) -> PlantDescription:
@@ -201,11 +183,6 @@ def names(causes: Iterable[CauseName]) -> list[dict[str, str]]:
 
 
 def _cause(cause: Cause) -> dict[str, Any]:
-    parameters = {n: {"value": a.value, "std": a.std, "unit": a.unit} for n, a in cause.parameters.items()}
+    parameters = {n: asdict(a) for n, a in cause.parameters.items()}
     named: dict[str, Any] = {"effect": cause.effect, "location": cause.location, "parameters": parameters}
     return named | ({"same_as": names(cause.same_as)} if cause.same_as else {})
-
-
-def _explanation(explanation: ProbableExplanation) -> dict[str, Any]:
-    shown: dict[str, Any] = {"causes": names(explanation.every), "probability": explanation.probability}
-    return shown | ({"unknown_at": explanation.unknown_at} if explanation.unknown_at else {})

@@ -8,11 +8,12 @@ from typing import Any
 
 from torch import Tensor
 
+from fdi_torch.effects import effect
 from fdi_torch.gap.answer import UNKNOWN, Amount, Answer, Cause, CauseName, ProbableExplanation, names
 from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.cause_hypothesis import CauseHypothesis
 from fdi_torch.gap.dataset import DataSet
-from fdi_torch.gap.diagnosis_result import DiagnosisResult, p_value
+from fdi_torch.gap.diagnosis_result import DiagnosisResult
 from fdi_torch.gap.discrepancy_curves import curves_at
 from fdi_torch.gap.experiment_design import discriminating_input
 from fdi_torch.gap.free_form import discrepancy_tables
@@ -42,11 +43,11 @@ def build_answer(result: DiagnosisResult, holdouts: Sequence[DataSet]) -> Answer
     hypotheses = zip(posterior.hypotheses[:MOST_EXPLANATIONS], posterior.probabilities, strict=False)
     return Answer(
         verdict=result.verdict,
-        p_value=_p_value(result),
+        p_value=result.p_value,
         where=_where(result),
         causes=_causes(result),
         ambiguity_set=[_names(result, h) for h in result.credible_set] if result.verdict != "no_gap" else [],
-        posterior=[ProbableExplanation((*h.causes, *result.from_readings), p, h.unknown_at) for h, p in hypotheses],
+        posterior=[ProbableExplanation(_names(result, h), p) for h, p in hypotheses],
         unexamined=posterior.unexamined,
         converged=result.best.converged,
         closure=closure_to_dict(runs, result) if runs else {},
@@ -154,31 +155,16 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
         causes.append(Cause(*cause, amounts, tuple(sorted(others))))
     if result.posterior.best.unknown_at:
         causes.append(Cause(UNKNOWN, result.posterior.best.unknown_at))
-    steps = {s.name: ("step", step) for s, step in zip(plant.sensors, result.quantization_steps, strict=True)}
-    limits = {(p.effect.name, p.location): p for p in result.limits}
-    units = {s.name: s.unit for s in plant.sensors}
-    for name, place in result.from_readings:
-        if name == UNKNOWN:
-            causes.append(Cause(UNKNOWN, place))
-        elif (name, place) in limits:
-            causes.append(Cause(name, place, _amounts_from_readings(limits[name, place], plant)))
-        else:
-            parameter, value = steps[place]
-            causes.append(Cause(name, place, {parameter: Amount(value, 0.0, units[place])}))
-    return tuple(causes)
+    steps = zip(plant.sensors, result.quantization_steps, strict=True)
+    rounded = [Placement(effect("sensor_quantization"), s.name, {"step": step}) for s, step in steps]
+    shown = {(p.effect.name, p.location): _amounts_from_readings(p, plant) for p in (*result.limits, *rounded)}
+    return (*causes, *(Cause(*name, shown.get(name, {})) for name in result.from_readings))
 
 
 def _amounts_from_readings(placement: Placement, plant: PlantDescription) -> dict[str, Amount]:
     """Parameters of an effect that the readings show without a fit."""
     parameters, values = placement.effect.parameters(placement.location, plant), placement.values or {}
     return {p.name: Amount(values[p.name], 0.0, p.unit) for p in parameters if p.name in values}
-
-
-def _p_value(result: DiagnosisResult) -> float:
-    """Probability that noise alone explains the gap; 0 if the readings themselves show a cause."""
-    if result.from_readings:
-        return 0.0
-    return p_value(result.search)
 
 
 def _disturbances(result: DiagnosisResult) -> dict[str, dict[str, object]]:

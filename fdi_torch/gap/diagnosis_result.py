@@ -72,8 +72,11 @@ class DiagnosisResult:
             self.gap, float(self.undisturbed.data.mask.sum())
         )
 
-
-def p_value(result: SearchResult) -> float:
-    """Probability that noise alone lets some option of the library gain as much as the best one (Bonferroni)."""
-    gain = float(result.alarm.gain.max())
-    return min(1.0, len(result.alarm.options) * math.erfc(math.sqrt(max(gain, 0.0) / 2.0)))
+    @property
+    def p_value(self) -> float:
+        """Probability that noise alone lets some option of the library gain as much as the best one (Bonferroni); 0 if
+        the readings themselves show a cause."""
+        if self.from_readings:
+            return 0.0
+        gain = float(self.search.alarm.gain.max())
+        return min(1.0, len(self.search.alarm.options) * math.erfc(math.sqrt(max(gain, 0.0) / 2.0)))

@@ -9,7 +9,7 @@ do along the trajectory, averaged over samples with the same value of the variab
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -46,10 +46,8 @@ class Curve:
     effect: Tensor | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        curve: dict[str, Any] = {"location": self.location, "variable": self.variable, "unit": self.unit}
-        curve |= {"quantity": self.quantity, "quantity_unit": self.quantity_unit, "at": self.at.tolist()}
-        curve |= {"free": self.free.tolist(), "free_std": self.free_std.tolist()}
-        return curve | ({"effect": self.effect.tolist()} if self.effect is not None else {})
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {n: v.tolist() if isinstance(v, Tensor) else v for n, v in values.items() if v is not None}
 
 
 def curves_at(fitter: Fitter, fit: Fit, place: str, reach: OperatingRange) -> list[Curve]:
@@ -66,7 +64,8 @@ def curves_at(fitter: Fitter, fit: Fit, place: str, reach: OperatingRange) -> li
     else:
         coefficients = coefficients_of(fitter, fit, free, reach, returned=here)
         effect = _effect(fitter, fit, place, here) if here else None
-    units = _local(fitter, fit, place, [_unit(free, name, coefficients.names) for name in coefficients.names]) / UNIT
+    names = coefficients.names
+    units = _local(fitter, fit, place, free, [{n: UNIT if n == one else 0.0 for n in names} for one in names]) / UNIT
     quantity, quantity_unit = _quantity(fitter, free, place)
     curves = []
     for variable, unit, x in (*_phases(fitter, free, place), *_variables(fitter, fit, place)):
@@ -80,25 +79,12 @@ def curves_at(fitter: Fitter, fit: Fit, place: str, reach: OperatingRange) -> li
     return curves
 
 
-def _neutral(fitter: Fitter, placements: Sequence[Placement]) -> tuple[tuple[Placement, ...], Mapping[str, float]]:
-    """Placements with their sizes at nominal, which switches them off."""
-    plant, sizes = fitter.data.plant, {}
-    for p in placements:
-        size = p.effect.parameters(p.location, plant)[0]
-        sizes[p.full_name(size.name)] = size.nominal
-    return tuple(placements), sizes
-
-
 def _effect(fitter: Fitter, fit: Fit, place: str, here: tuple[Placement, ...]) -> Tensor:
-    """The influence (X,) of the fit's causes at the place."""
-    without = _local(fitter, fit, place, [_neutral(fitter, here)])[0]
+    """The influence (X,) of the fit's causes at the place: the change by their sizes at nominal, which switches them
+    off, with the opposite sign."""
+    sizes = [(p, p.effect.parameters(p.location, fitter.data.plant)[0]) for p in here]
+    without = _local(fitter, fit, place, here, [{p.full_name(size.name): size.nominal for p, size in sizes}])[0]
     return -without / (1.0 + without) if any(p.effect.stage is Stage.STORAGE for p in here) else -without
-
-
-def _unit(
-    free: Sequence[Placement], name: str, names: Sequence[str]
-) -> tuple[tuple[Placement, ...], Mapping[str, float]]:
-    return tuple(free), {n: UNIT if n == name else 0.0 for n in names}
 
 
 def _of_stage(free: Sequence[Placement], here: Sequence[Placement]) -> tuple[Placement, ...]:
@@ -108,42 +94,38 @@ def _of_stage(free: Sequence[Placement], here: Sequence[Placement]) -> tuple[Pla
 
 
 def _local(
-    fitter: Fitter, fit: Fit, place: str, changed: Sequence[tuple[tuple[Placement, ...], Mapping[str, float]]]
+    fitter: Fitter,
+    fit: Fit,
+    place: str,
+    placements: Sequence[Placement],
+    changes: Sequence[Mapping[str, float]],
 ) -> Tensor:
     """Change of what happens at the place along the fit's trajectory by each change, (M, X): of the flow at the middle
     of each step, the share of the cross-section, or the reading at each sample.
 
-    changed: placements that replace those of the same name in the fit, and the values that change.
+    placements: effects that the changes belong to. changes: values of their parameters; coefficients of free forms
+    change from zero, other parameters from their fitted values.
     """
-    plant, linearised = fitter.data.plant, fit.linearised
-    middle = 0.5 * (linearised.levels[:, 1:] + linearised.levels[:, :-1])
-    fitted_engine = fitter.engine(fit.candidate, list(fit.effect_values))
-    theta = fit.theta.unsqueeze(0)
-    placements = changed[0][0]
-    prefixes = {p.prefix for p in placements}
-    others = [p for p in fit.candidate.placements if p.prefix not in prefixes]
-    free = set(fit.effect_values) | {n for _, values in changed for n in values}
-    engine = fitter.engine(Candidate((*others, *placements)), sorted(free))
-    fitted = {n: v for n, v in fit.values.items() if n in engine.space}
-    base = {n: 0.0 for n in free if is_free_coefficient(n)}  # one coefficient at a time
-    rows = torch.stack([engine.space.vector({**fitted, **base, **values}) for _, values in changed])
-    if is_free_coefficient(next(iter(changed[0][1]))):
-        before = engine.space.vector({**fitted, **base}).unsqueeze(0)
-        rates, readings = engine.rates(middle, before), engine.read(linearised.levels, before)
-    else:
-        rates, readings = fitted_engine.rates(middle, theta), fitted_engine.read(linearised.levels, theta)
+    plant, levels = fitter.data.plant, fit.linearised.levels
+    present = {p.prefix for p in fit.candidate.placements}
+    candidate = Candidate((*fit.candidate.placements, *(p for p in placements if p.prefix not in present)))
+    free = {*fit.effect_values, *changes[0]}
+    engine = fitter.engine(candidate, sorted(free))
+    start = {n: v for n, v in fit.values.items() if n in engine.space}
+    start |= {n: 0.0 for n in free if is_free_coefficient(n)}
+    rows = torch.stack([engine.space.vector({**start, **change}) for change in ({}, *changes)])
     component = None if len(plant.tanks_at(place)) == 2 else plant.component(place)
     if isinstance(component, Sensor):
-        index = [s.name for s in plant.sensors].index(place)
-        return (engine.read(linearised.levels, rows) - readings)[..., index]
-    tanks = {t.name: i for i, t in enumerate(plant.tanks)}
+        readings = engine.read(levels, rows)[..., [s.name for s in plant.sensors].index(place)]
+        return readings[1:] - readings[:1]
     name, sign = _tank_and_sign(component, place, plant)
-    after = engine.rates(middle, rows)[..., tanks[name]]
-    before_rate = rates[..., tanks[name]]
+    tank = [t.name for t in plant.tanks].index(name)
+    rates = engine.rates(0.5 * (levels[:, 1:] + levels[:, :-1]), rows)[..., tank]
+    before, after = rates[:1], rates[1:]
     if any(p.effect.stage is Stage.STORAGE for p in placements):
-        moving = before_rate.abs() > 1e-9 * before_rate.abs().max()
-        return torch.where(moving, before_rate / torch.where(moving, after, 1.0) - 1.0, 0.0)
-    return sign * (after - before_rate) * plant.tanks[tanks[name]].area
+        moving = before.abs() > 1e-9 * before.abs().max()
+        return torch.where(moving, before / torch.where(moving, after, 1.0) - 1.0, 0.0)
+    return sign * (after - before) * plant.tanks[tank].area
 
 
 def _tank_and_sign(component: Any, place: str, plant: PlantDescription) -> tuple[str, float]:

@@ -8,7 +8,6 @@ and the tolerances, and with free initial levels.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -21,7 +20,6 @@ from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.experiment import lay_out
 
 DESIGNS, SEED = 6, 0
 DURATION, HOLDS = 1500.0, (60.0, 120.0, 250.0)  # in units of the plant's time scale
@@ -60,14 +58,7 @@ def _design(fitter: Fitter, hold: float, generator: torch.Generator) -> Recordin
         shift = float(torch.rand(1, generator=generator, dtype=torch.float64))
         index = torch.clamp(torch.floor(time / hold + shift).long(), max=len(steps) - 1)
         columns.append(low + (high - low) * steps[index])
-    blank = torch.zeros(len(time), len(data.plant.sensors), dtype=torch.float64)
-    outputs = tuple(s.column for s in data.plant.sensors)
-    units = tuple(s.unit for s in data.plant.sensors)
-    inputs = torch.stack(columns, dim=1)
-    channels = data.plant.channels()
-    return Recording(
-        time, inputs, blank, channels, outputs, tuple(data.plant.channel_units()[c] for c in channels), units
-    )
+    return data.plant.recording(time, torch.stack(columns, dim=1), time.new_zeros(len(time), len(data.plant.sensors)))
 
 
 def _limits(fitter: Fitter) -> list[tuple[float, float]]:
@@ -84,21 +75,16 @@ def _separation(fitter: Fitter, first: Fit, second: Fit, recording: Recording) -
     """Chi-square between both predictions, and after how many seconds it suffices; None if a tank gets too full."""
     data = fitter.data
     step = float(torch.median(data.experiment.steps))
-    planned_recording = replace(
-        data_set_of(data.plant, data.nominal_effects, recording, step),
-        experiment=lay_out(recording, data.plant.channels(), step),
-    )
-    planned_fitter = Fitter(planned_recording, fitter.noise)
+    planned = data_set_of(data.plant, data.nominal_effects, recording, step)
+    planned_fitter = Fitter(planned, fitter.noise)
     (predicted, slopes, levels), (rival, _, other_levels) = (
         _planned_run(planned_fitter, fit) for fit in (first, second)
     )
     heights = torch.tensor([t.height for t in data.plant.tanks], dtype=torch.float64)
     if bool((levels > FULL * heights).any()) or bool((other_levels > FULL * heights).any()):
         return None
-    difference = planned_fitter.noise.whiten(predicted - rival, planned_recording.mask)
-    separation = _cumulative_separation(
-        difference, planned_fitter.noise.whiten(slopes, planned_recording.mask), _prior_information(fitter, first)
-    )
+    difference, slopes = (fitter.noise.whiten(x, planned.mask) for x in (predicted - rival, slopes))
+    separation = _cumulative_separation(difference, slopes, _prior_information(fitter, first))
     sufficient = (separation > PARTED).nonzero().flatten()
     return float(separation[-1]), float(recording.time[sufficient[0]]) if len(sufficient) else None
 
@@ -147,16 +133,12 @@ def _planned_run(planned_fitter: Fitter, fit: Fit) -> tuple[Tensor, Tensor, Tens
 def planned_recording(table: Mapping[str, Any], plant: PlantDescription) -> Recording:
     """The input of an answer as a recording without readings."""
     time = torch.arange(0.0, table["duration"] + 0.5 * table["interval"], table["interval"], dtype=torch.float64)
-    channels = plant.channels()
     columns = []
-    for channel in channels:
+    for channel in plant.channels():
         at = torch.tensor(table[channel]["at"], dtype=torch.float64)
         step = torch.searchsorted(at, time, right=True) - 1
         columns.append(torch.tensor(table[channel]["value"], dtype=torch.float64)[step])
-    units = tuple(table["unit"][c] for c in channels)
-    names, reading_units = tuple(s.column for s in plant.sensors), tuple(s.unit for s in plant.sensors)
-    blank = torch.full((len(time), len(names)), torch.nan, dtype=torch.float64)
-    return Recording(time, torch.stack(columns, dim=1), blank, channels, names, units, reading_units)
+    return plant.recording(time, torch.stack(columns, dim=1), time.new_full((len(time), len(plant.sensors)), torch.nan))
 
 
 def _step_table(recording: Recording, interval: float) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import torch
 
 from fdi_torch.gap.candidate import Candidate, Fit, Key
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult
+from fdi_torch.parameters import Parameter
 
 
 @dataclass(frozen=True)
@@ -21,11 +22,15 @@ class ExpectedGain:
     prior: float
 
 
+def size_of(option: Option) -> tuple[str, float, Parameter]:
+    """Full name, start value and description of an option's size."""
+    name, start = next(iter(option.start.items()))
+    return name, start, next(p for p in option.parameters if option.placement.full_name(p.name) == name)
+
+
 def log_prior_width(screening: ScreeningResult, i: int) -> float:
     """Cost of the size of an option with a uniform prior: log of its range in standard errors."""
-    option = screening.options[i]
-    name, start = next(iter(option.start.items()))
-    size = next(p for p in option.parameters if option.placement.full_name(p.name) == name)
+    _, start, size = size_of(screening.options[i])
     width, unit = size.high - size.low, abs(start - size.nominal)
     if not math.isfinite(width) or unit == 0.0:
         return 0.0
@@ -43,10 +48,8 @@ def sized(option: Option, factor: float) -> dict[str, float]:
     """The start with its size multiplied within bounds; that of a threshold stays."""
     if not option.placement.effect.smooth:
         return dict(option.start)
-    name = next(iter(option.start))
-    size = next(p for p in option.parameters if option.placement.full_name(p.name) == name)
-    factor = min(max(factor, 0.1), 4.0)
-    value = size.nominal + factor * (option.start[name] - size.nominal)
+    name, start, size = size_of(option)
+    value = size.nominal + min(max(factor, 0.1), 4.0) * (start - size.nominal)
     return {**option.start, name: min(max(value, size.low), size.high)}
 
 

@@ -53,7 +53,8 @@ def coefficients_of(
     columns = fitter.whiten(effect_columns(fitter, fit, options)) / UNIT
     residual = fitter.residual(fit.linearised.readings)[0]
     if returned:
-        changes = effect_columns(fitter, fit, [_as_fitted(fitter, fit, p) for p in returned])
+        fitted = [Option(p, fit.values_of([p]), p.effect.parameters(p.location, fitter.data.plant)) for p in returned]
+        changes = effect_columns(fitter, fit, fitted)
         residual = residual + fitter.whiten(changes).sum(-1)
     columns, residual = _without_initial_levels(fitter, fit, columns, residual)
     prior = torch.tensor([o.parameters[0].std for o in options], dtype=columns.dtype)
@@ -98,10 +99,3 @@ def fitted_coefficients(fitter: Fitter, fit: Fit, free: Sequence[Placement]) -> 
     indices = [fit.space.index(n) for n in fit.values_of(free)]
     selected = covariance(fitter, fit)[indices][:, indices]
     return Coefficients(tuple(fit.space.names[i] for i in indices), fit.theta[indices], selected)
-
-
-def _as_fitted(fitter: Fitter, fit: Fit, placement: Placement) -> Option:
-    """The placement with its fitted parameters."""
-    return Option(
-        placement, fit.values_of([placement]), placement.effect.parameters(placement.location, fitter.data.plant)
-    )

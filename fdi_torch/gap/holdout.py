@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -46,7 +47,8 @@ def model_of(fit: Fit) -> Model:
 class HeldOut:
     """Free runs (S, C) of each model on one hold-out, and the noise of the hold-out.
 
-    The noise is estimated from the residual of the augmented or the recalibrated model, whichever is smaller: a free
+    squares: squared residuals (S, C) of each model, and as "noise_floor" the variance of the noise; 0 where masked. The
+    noise is estimated from the residual of the augmented or the recalibrated model, whichever is smaller: a free
     form may diverge outside the range where it was fitted.
     """
 
@@ -60,10 +62,11 @@ class HeldOut:
         one_unit = len({s.unit for s in self.data.plant.sensors}) == 1
         return torch.ones_like(self.noise.std) if one_unit else 1.0 / self.noise.std.clamp(min=1e-300) ** 2
 
-    def squares(self, model: str) -> Tensor:
-        """Squared residuals (S, C), 0 for masked readings."""
-        residual = self.data.readings - self.runs[model]
-        return torch.where(self.data.mask, residual * residual, 0.0)
+    @cached_property
+    def squares(self) -> Mapping[str, Tensor]:
+        each = {model: (self.data.readings - run) ** 2 for model, run in self.runs.items()}
+        each["noise_floor"] = self.noise.std.expand_as(self.data.readings) ** 2
+        return {model: torch.where(self.data.mask, square, 0.0) for model, square in each.items()}
 
 
 @dataclass(frozen=True)
@@ -93,15 +96,15 @@ def run_reference_models(
 
 def closure(holdouts: Sequence[HeldOut]) -> Closure:
     """The closure over all hold-outs together."""
-    count = torch.stack([h.data.mask.sum(dim=0) for h in holdouts]).sum(dim=0)
-    sums = {m: torch.stack([h.squares(m).sum(dim=0) for h in holdouts]).sum(dim=0) for m in holdouts[0].runs}
-    sums["noise_floor"] = torch.stack([h.noise.std**2 * h.data.mask.sum(dim=0) for h in holdouts]).sum(dim=0)
-    weighted = {m: torch.stack([(h.weight * h.squares(m)).sum() for h in holdouts]).sum() for m in holdouts[0].runs}
-    weighted["noise_floor"] = torch.stack([(h.weight * h.noise.std**2 * h.data.mask).sum() for h in holdouts]).sum()
-    pooled = {m: float(torch.sqrt(total / count.sum())) for m, total in weighted.items()}
-    rmse = {m: torch.sqrt(total / count.clamp(min=1)) for m, total in sums.items()}
+    models, count = holdouts[0].squares, torch.stack([h.data.mask.sum(dim=0) for h in holdouts]).sum(dim=0)
+    pooled, rmse = {}, {}
+    for m in models:
+        sums = torch.stack([h.squares[m].sum(dim=0) for h in holdouts])
+        weighted = torch.stack([(h.weight * h.squares[m]).sum() for h in holdouts])
+        pooled[m] = math.sqrt(weighted.sum() / count.sum())
+        rmse[m] = torch.sqrt(sums.sum(dim=0) / count.clamp(min=1)).tolist()
     names = [s.name for s in holdouts[0].data.plant.sensors]
-    sensors = {s: {m: float(v[i]) for m, v in rmse.items()} for i, s in enumerate(names)}
+    sensors = {s: {m: rmse[m][i] for m in models} for i, s in enumerate(names)}
     return Closure(pooled, sensors, *_closed(holdouts))
 
 
@@ -150,8 +153,8 @@ def _closed(holdouts: Sequence[HeldOut]) -> tuple[float | None, tuple[float, flo
     The noise of a hold-out is the same in both runs. The gap is therefore the difference of their squares, plus the
     excess of the augmented run over the noise, as far as it exceeds the uncertainty of the noise.
     """
-    difference = torch.cat([_blocks(h.weight * (h.squares("recalibrated") - h.squares("augmented"))) for h in holdouts])
-    excess = sum(float((h.weight * (h.squares("augmented") - h.noise.std**2 * h.data.mask)).sum()) for h in holdouts)
+    difference = torch.cat([_blocks(h.weight * (h.squares["recalibrated"] - h.squares["augmented"])) for h in holdouts])
+    excess = sum(float((h.weight * (h.squares["augmented"] - h.squares["noise_floor"])).sum()) for h in holdouts)
     noise_error = math.sqrt(sum(_floor_variance(h) for h in holdouts))
     remaining = math.copysign(max(abs(excess) - noise_error, 0.0), excess)
     total, error = float(difference.sum()) + max(remaining, 0.0), float(difference.std()) * math.sqrt(len(difference))

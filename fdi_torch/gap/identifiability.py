@@ -27,6 +27,7 @@ from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
+from fdi_torch.gap.extensions import size_of
 from fdi_torch.gap.library import equivalence_class, library_of
 from fdi_torch.gap.screening import Option, Pairs, options_of, pairs_of, screen
 from fdi_torch.plant.description import PlantDescription
@@ -103,13 +104,9 @@ def _noise_free(
     plant: PlantDescription, nominal_effects: Sequence[Placement], recording: Recording, step: float, noise: float
 ) -> Fitter:
     """A fitter whose readings are the plant file's prediction, from its initial levels or from rest."""
-    sensors = len(plant.sensors)
-    names = tuple(s.column for s in plant.sensors)
-    units = tuple(s.unit for s in plant.sensors)
-    blank = torch.zeros(len(recording), sensors, dtype=torch.float64)
-    planned = replace(
-        recording, outputs=blank, output_names=names, output_units=units, mask=torch.ones_like(blank, dtype=torch.bool)
-    )
+    blank = recording.time.new_zeros(len(recording), len(plant.sensors))
+    names, units = plant.outputs(), tuple(plant.output_units().values())
+    planned = replace(recording, outputs=blank, output_names=names, output_units=units, mask=torch.isfinite(blank))
     data = data_set_of(plant, nominal_effects, planned, step)
     std = noise * torch.tensor([abs(s.gain) for s in plant.sensors], dtype=torch.float64)
     white = Noise(std, torch.zeros_like(std))
@@ -160,8 +157,7 @@ def _possible(option: Option, strength: Tensor, gap: float) -> bool:
     """Whether an effect can cause such a gap within its range, to first order from its start."""
     if float(strength) <= VISIBLE:
         return False
-    name, start = next(iter(option.start.items()))
-    size = next(p for p in option.parameters if option.placement.full_name(p.name) == name)
+    _, start, size = size_of(option)
     needed = size.nominal + (gap / float(strength)) ** 0.5 * (start - size.nominal)
     return size.low <= needed <= size.high
 

@@ -21,7 +21,7 @@ from fdi_torch.gap.holdout import HeldOut
 from fdi_torch.gap.preprocess.outliers import SensorOutliers
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.quantities import display_unit
+from fdi_torch.quantities import quantity_text
 from fdi_torch.recordings.check import data_warnings
 
 SHOWN_TIMES = 5  # outliers whose times are listed
@@ -54,8 +54,8 @@ def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
         )
     remarks += [_masked_outliers(s) for group in result.outliers for s in group]
     remarks += [*_nominal_values_out_of_range(data.plant), *_values_at_bounds(result), *_periods(result)]
-    remarks += [_free_form_fails(result, h) for h in held if result.free_form_fit and _free_form_is_worse(h)]
-    return remarks + [sentence for h in held if (sentence := rig_difference(result, h))]
+    on_holdouts = [remark(result, h) for remark in (_free_form_fails, rig_difference) for h in held]
+    return remarks + [sentence for sentence in on_holdouts if sentence]
 
 
 def _averaged(part: RecordingPart) -> str:
@@ -77,14 +77,11 @@ def _masked_outliers(outliers: SensorOutliers) -> str:
     return f"{count} of {outliers.sensor} in {source}: outliers or stuck, masked in all fits ({when})"
 
 
-def _free_form_is_worse(held: HeldOut) -> bool:
-    """Whether the free form predicts a hold-out worse than the recalibrated plant."""
-    with_form, without = (float((held.weight * held.squares(m)).sum()) for m in ("augmented", "recalibrated"))
-    return with_form > WORSE**2 * without
-
-
-def _free_form_fails(result: DiagnosisResult, held: HeldOut) -> str:
-    """The remark on a free form that fails on a hold-out."""
+def _free_form_fails(result: DiagnosisResult, held: HeldOut) -> str | None:
+    """The remark on a free form that predicts a hold-out worse than the recalibrated plant, or None."""
+    with_form, without = (float((held.weight * held.squares[m]).sum()) for m in ("augmented", "recalibrated"))
+    if not result.free_form_fit or with_form <= WORSE**2 * without:
+        return None
     source = Path(held.data.recording.source).name or "the hold-out"
     return (
         f"the free function for the unknown discrepancy at {result.posterior.best.unknown_at} "
@@ -111,28 +108,26 @@ def _nominal_values_out_of_range(plant: PlantDescription) -> list[str]:
     for placed in plant.effects:
         for p in effect(placed.effect).parameters(placed.location, plant):
             name = placed.full_name(p.name)
-            value, (unit, scale) = placed.parameters.get(p.name, p.nominal), display_unit(p.unit, name)
+            value = placed.parameters.get(p.name, p.nominal)
             if not p.low <= value <= p.high:
-                ends = f"{scale * p.low:.4g} to {scale * p.high:.4g}"
+                shown, low, high = (quantity_text(x, p.unit, name=name) for x in (value, p.low, p.high))
                 remarks.append(
-                    f"the plant file has {name} at {scale * value:.4g} {unit}".rstrip()
-                    + f", outside its sensible range ({ends} {unit}".rstrip()
-                    + "), which affects all results; check it"
+                    f"the plant file has {name} at {shown}, outside its sensible range ({low} to {high}), which "
+                    "affects all results; check it"
                 )
     return remarks
 
 
 def _values_at_bounds(result: DiagnosisResult) -> list[str]:
     """Fitted parameters that reached a bound of their sensible range."""
-    remarks, fit = [], result.effects_fit
-    for name, value in fit.effect_values.items():
-        (unit, scale), reached = display_unit(fit.space[name].unit, name), end_reached(fit.space[name], value)
-        if reached is not None:
-            end = f"{scale * reached:.4g} {unit}".rstrip()
-            remarks.append(
-                f"{name} is at the bound of its sensible range ({end}): that effect alone is probably not the cause"
-            )
-    return remarks
+    fit = result.effects_fit
+    ends = {name: end_reached(fit.space[name], value) for name, value in fit.effect_values.items()}
+    return [
+        f"{name} is at the bound of its sensible range ({_shown(end, fit, name)}): that effect alone is probably not "
+        "the cause"
+        for name, end in ends.items()
+        if end is not None
+    ]
 
 
 OPEN_SHARE, OPEN_LEAST = 0.2, 200.0  # unexplained share of the hold-out's gap, and chi-square, that require a refit
@@ -157,13 +152,11 @@ def rig_difference(result: DiagnosisResult, held: HeldOut) -> str | None:
     fitter = Fitter(held.data, noise)
     refit = fitter.fit(Candidate(result.best.candidate.placements, (result.best.effect_values,)))
     source = Path(held.data.recording.source).name or "the hold-out"
-    changed = (
-        _changed(result, fitter, refit) if unexplained_chi_square(fitter, refit) < REFIT_EXPLAINS * unexplained else []
-    )
+    closes = unexplained_chi_square(fitter, refit) < REFIT_EXPLAINS * unexplained
+    changed = ", ".join(_changed(result, fitter, refit)[:3]) if closes else ""
     if changed:
-        needed = ", ".join(changed[:3])
         return (
-            f"{source} needs other constants than the recording ({needed}): it is of another rig, or the rig was "
+            f"{source} needs other constants than the recording ({changed}): it is of another rig, or the rig was "
             "changed in between; its closure is not meaningful"
         )
     return (
@@ -186,5 +179,4 @@ def _changed(result: DiagnosisResult, fitter: Fitter, refit: Fit) -> list[str]:
 
 
 def _shown(value: float, fit: Fit, name: str) -> str:
-    unit, scale = display_unit(fit.space[name].unit, name)
-    return f"{scale * value:.4g} {unit}".rstrip()
+    return quantity_text(value, fit.space[name].unit, name=name)

@@ -44,7 +44,7 @@ def _usable_readings(run: Run, recording: Recording) -> Recording:
     """
     checked = usable(run.plant, recording)
     objectives = run.config.estimate.objective.search, run.config.estimate.objective.refine
-    stuck_throughout = [s for s in checked.stuck if not bool(checked.recording.mask[:, s.column_in(recording)].any())]
+    stuck_throughout = [s for s in checked.stuck if not len(checked.recording.valid_readings(s.sensor.column))]
     if stuck_throughout and "correlation" in objectives:
         raise ValueError(
             f"{recording.source}: expected readings that vary, but {stuck_throughout[0].text}; leave the sensor out of "

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import torch
 
 DETERMINED = 0.5  # share of the tolerance; a larger standard error means that the recording does not determine it
-HALVINGS = 60
 
 
 @dataclass(frozen=True)
@@ -39,21 +38,12 @@ def between_run_spread(constants: Sequence[RunConstant], tolerance: float) -> Be
 
     For independent normal values, (n - 1) s^2 / sigma^2 is chi-square with n - 1 degrees of freedom.
     """
+    from scipy.special import chdtri  # SciPy takes a while to load, and few plants have constants that vary
+
     values = torch.tensor([o.value for o in constants if o.std < DETERMINED * tolerance], dtype=torch.float64)
     count = len(values)
     if count < 2:
         return None
     std = float(values.std())
-    low, high = (std * math.sqrt((count - 1) / chi_square(share, count - 1)) for share in (0.975, 0.025))
+    low, high = (std * math.sqrt((count - 1) / chdtri(count - 1, share)) for share in (0.025, 0.975))
     return BetweenRunSpread(count, float(values.mean()), std, low, high)
-
-
-def chi_square(share: float, freedom: int) -> float:
-    """Quantile of the chi-square distribution at probability `share`, by bisection."""
-    low, high = 0.0, 50.0 + 10.0 * freedom
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        half = torch.tensor([0.5 * freedom, 0.5 * middle], dtype=torch.float64)
-        below = float(torch.special.gammainc(half[0], half[1]))
-        low, high = (middle, high) if below < share else (low, middle)
-    return 0.5 * (low + high)

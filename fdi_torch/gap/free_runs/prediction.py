@@ -82,7 +82,7 @@ def predict(
         start_samples = skipped = _samples_within(recording, settle)
     if start_samples < 1:
         raise ValueError(f"expected at least 1 sample for the start levels, got {start_samples}")
-    plant = without_startup_effects(_varying(plant, vary), recording.ran)
+    plant = without_startup_effects(with_varying(plant, vary), recording.ran)
     nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
     duration = float(recording.time[-1] - recording.time[0])
     step = step or max(0.5 * float(torch.median(torch.diff(recording.time))), duration / MOST_STEPS)
@@ -111,7 +111,7 @@ def _samples_within(recording: Recording, seconds: float) -> int:
     return samples
 
 
-def _varying(plant: PlantDescription, patterns: Collection[str]) -> PlantDescription:
+def with_varying(plant: PlantDescription, patterns: Collection[str]) -> PlantDescription:
     """The plant with further varying constants. Raises ValueError for a pattern that matches none with a tolerance."""
     more = matching("a constant with a tolerance to vary", patterns, plant.tolerances)
     return replace(plant, varying=tuple(dict.fromkeys([*plant.varying, *more])))
@@ -129,18 +129,23 @@ def _run(data: DataSet, start_samples: int, skipped: int) -> Prediction:
     engine, theta = _start_from_segment(fitter, skipped) if skipped else _start_from_samples(fitter)
     run = engine.converge(theta)
     readings = run.readings[0]
-    residuals = torch.where(data.mask, data.readings - readings, torch.zeros_like(readings))
-    rmse = torch.sqrt((residuals[skipped:] ** 2).sum(dim=0) / data.mask[skipped:].sum(dim=0))
+    residuals = torch.where(data.mask, data.readings - readings, 0.0)
     values = dict(zip(engine.space.names, theta[0].tolist(), strict=True))
     return Prediction(
         readings,
         residuals,
         {t.name: values[f"{t.name}.start_level"] for t in plant.tanks},
         {name: values[name] for name in plant.varying},
-        dict(zip((s.name for s in plant.sensors), rmse.tolist(), strict=True)),
+        rmse_by_sensor(plant, residuals[skipped:], data.mask[skipped:]),
         float(run.defect.max()) < CONVERGED * length_scale(plant),
         float(run.defect.max()),
     )
+
+
+def rmse_by_sensor(plant: PlantDescription, residuals: Tensor, mask: Tensor) -> dict[str, float]:
+    """Root mean square by sensor of the residuals (S, C) in mask (S, C), in the sensor's unit."""
+    mean_squares = torch.where(mask, residuals**2, 0.0).sum(dim=0) / mask.sum(dim=0)
+    return dict(zip((s.name for s in plant.sensors), mean_squares.sqrt().tolist(), strict=True))
 
 
 def _start_from_samples(fitter: Fitter) -> tuple[Collocation, Tensor]:

@@ -23,11 +23,12 @@ from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.channel_noise import Noise, estimate_noise
 from fdi_torch.gap.dataset import DataSet, RecordingPart
 from fdi_torch.gap.free_runs.between_runs import DETERMINED, RunConstant
+from fdi_torch.gap.free_runs.prediction import rmse_by_sensor, with_varying
 from fdi_torch.gap.preprocess.sensor_limits import limits_of
 from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.names import matching
 from fdi_torch.parameters import ParameterName, by_prefix, common_name, name_in_recording
-from fdi_torch.plant.description import PlacedEffect, PlantDescription
+from fdi_torch.plant.description import PlacedEffect, PlantDescription, with_tolerances
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of_all
 from fdi_torch.recording import Recording
@@ -88,26 +89,20 @@ def refit(
 
     Raises ValueError for a pattern that matches no name.
     """
-    kept = tuple(e for e in plant.effects if e.effect not in leave_out)
-    placements = [Placement(effect(e.effect), e.location, e.parameters) for e in kept]
-    omitted = {e.prefix for e in plant.effects if e.effect in leave_out}
-    tolerances = {n: v for n, v in plant.tolerances.items() if ParameterName.parse(n).prefix not in omitted}
     held_names = set(matching("a constant of the plant to hold", hold, build_network(plant).constants.names))
-    varying = dict.fromkeys([*plant.varying, *matching("a constant with a tolerance to vary", vary, tolerances)])
-    held_plant = replace(
-        plant,
-        effects=kept,
-        tolerances={n: v for n, v in tolerances.items() if n not in held_names},
-        varying=tuple(n for n in varying if n not in held_names),
-    )
+    omitted = {e.prefix for e in plant.effects if e.effect in leave_out}
+    plant = replace(plant, effects=tuple(e for e in plant.effects if e.prefix not in omitted))
+    plant = with_tolerances(plant, lambda name: name.prefix not in omitted)
+    held_plant = with_tolerances(with_varying(plant, vary), lambda name: str(name) not in held_names)
+    placements = [Placement(effect(e.effect), e.location, e.parameters) for e in plant.effects]
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     for recording in recordings:
         expect_right_units(held_plant, recording)
         expect_no_denied_rim(held_plant, recording)
     step = step or 0.5 * recordings[0].interval
     data = checked_data_set(held_plant, placements, recordings, step)
-    start = {n: v for n, v in _initial_values(kept, plant, recordings).items() if n not in tolerances}
-    start = {n: v for n, v in start.items() if n not in held_names}
+    fixed = {*plant.tolerances, *held_names}
+    start = {n: v for n, v in _initial_values(plant, recordings).items() if n not in fixed}
     free = [p for p in placements if p.prefix in by_prefix(start)]
     std = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
     size = 1e-2 * std if white is None else white * std.new_tensor([abs(s.gain) for s in plant.sensors])
@@ -124,10 +119,12 @@ def refit(
     run_constants = _run_constants(fitter, fit)
     refitted = replace(
         _refitted_plant(held_plant, fit, _typical(run_constants, fit, held_plant)),
-        tolerances=tolerances,
+        tolerances=plant.tolerances,
         varying=plant.varying,
     )
-    return Refit(refitted, _rmse(fitter, null), _rmse(fitter, fit), len(fit.space), _errors(fitter, fit), run_constants)
+    residuals = (data.readings - each.linearised.readings[0] for each in (null, fit))
+    before, after = (rmse_by_sensor(plant, residual, data.mask) for residual in residuals)
+    return Refit(refitted, before, after, len(fit.space), _errors(fitter, fit), run_constants)
 
 
 def _with_a_trajectory(fit: Fit, recordings: Sequence[Recording]) -> Fit:
@@ -172,13 +169,11 @@ def _run_constants(fitter: Fitter, fit: Fit) -> tuple[RunConstant, ...]:
     )
 
 
-def _initial_values(
-    kept: Collection[PlacedEffect], plant: PlantDescription, recordings: Sequence[Recording]
-) -> dict[str, float]:
+def _initial_values(plant: PlantDescription, recordings: Sequence[Recording]) -> dict[str, float]:
     """Present values of the effects' parameters that a fit may change; limits that the readings show are not fitted."""
     reach = operating_range_of_all(recordings, plant)
     start: dict[str, float] = {}
-    for placed in kept:
+    for placed in plant.effects:
         movable = {n for s in effect(placed.effect).starts(placed.location, plant, reach) for n in s}
         if not effect(placed.effect).quantizes and not any(
             _is_limit_from_readings(placed, plant, r) for r in recordings
@@ -190,12 +185,8 @@ def _initial_values(
 
 def _is_limit_from_readings(placed: PlacedEffect, plant: PlantDescription, recording: Recording) -> bool:
     """Whether the effect is a limit of a sensor that the readings themselves show."""
-    for sensor in plant.sensors:
-        if sensor.name == placed.location and sensor.column in recording.output_names:
-            i = recording.output_names.index(sensor.column)
-            limits = limits_of(recording.outputs[recording.mask[:, i], i])
-            return limits.get(placed.effect) == placed.parameters.get("limit", float("nan"))
-    return False
+    values = (recording.valid_readings(s.column) for s in plant.sensors if s.name == placed.location)
+    return any(limits_of(x).get(placed.effect) == placed.parameters.get("limit", math.nan) for x in values)
 
 
 def _typical(run_constants: Sequence[RunConstant], fit: Fit, plant: PlantDescription) -> dict[str, float]:
@@ -217,13 +208,6 @@ def _refitted_plant(plant: PlantDescription, fit: Fit, typical: dict[str, float]
     fitted = by_prefix(common)
     effects = tuple(replace(e, parameters={**e.parameters, **fitted.get(e.prefix, {})}) for e in plant.effects)
     return replace(with_constants(plant, constants), effects=effects)
-
-
-def _rmse(fitter: Fitter, fit: Fit) -> dict[str, float]:
-    mask = fitter.data.mask
-    squares = torch.where(mask, (fitter.data.readings - fit.linearised.readings[0]) ** 2, 0.0)
-    each = torch.sqrt(squares.sum(dim=0) / mask.sum(dim=0)).tolist()
-    return dict(zip((s.name for s in fitter.data.plant.sensors), each, strict=True))
 
 
 WIDENINGS = (64.0, 16.0, 4.0, 2.0)

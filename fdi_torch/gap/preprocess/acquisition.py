@@ -15,14 +15,8 @@ from statistics import median
 import torch
 from torch import Tensor
 
-from fdi_torch.gap.preprocess.blockwise_likelihood import (
-    BlockwiseFit,
-    blocked_recording,
-    blockwise_fit,
-    noise_of,
-    thinned,
-)
-from fdi_torch.gap.preprocess.recording_fault_decision import SURE, log_odds, recording_fault
+from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit, blocked_recording, blockwise_fit, noise_of
+from fdi_torch.gap.preprocess.recording_fault_decision import SURE, recording_fault
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, not_held
 from fdi_torch.plant.description import PlantDescription, Sensor, with_tolerances
 from fdi_torch.quantities import quantity_text
@@ -51,9 +45,6 @@ class StuckSegment:
     stop: float
     for_good: bool
 
-    def column_in(self, recording: Recording) -> int:
-        return _column(recording, self.sensor)
-
     @property
     def text(self) -> str:
         until = "on" if self.for_good else f"to {self.stop:g} s"
@@ -79,14 +70,15 @@ def examined(plant: PlantDescription, recording: Recording) -> CheckedRecording:
         return CheckedRecording(recording, (), RecordingFault(("units",), wrong))
     rims = [] if recording.trusted else denied_rims(plant, recording)
     plant = with_rims_unknown(plant, [recording])
-    stuck = list(stuck_in(plant, recording))
+    stuck = _stuck(plant, recording)
     remaining, fault = without(recording, stuck), None
-    constant = _constant_sensors(plant, remaining)
+    # One value throughout may also be due to small noise, or to an end of the range.
+    constant = [s for s in plant.sensors if len(remaining.valid_readings(s.column).unique()) == 1]
     while not recording.trusted and (fault := recording_fault(plant, remaining, tuple(s.column for s in constant))):
         silent = [s for s in constant if s.column in fault.channels]
         if not (fault.silent and silent):
             break
-        stuck += _all_readings(remaining, silent)
+        stuck += [_segment(remaining, sensor) for sensor in silent]
         remaining, constant = without(recording, stuck), [s for s in constant if s not in silent]
     if not recording.trusted and fault is None and (channels := inputs_not_held(remaining, plant)):
         fault = not_held(channels, recording.interval)
@@ -108,21 +100,15 @@ def usable(plant: PlantDescription, recording: Recording, effects: bool = False)
     return checked
 
 
-def stuck_in(plant: PlantDescription, recording: Recording) -> tuple[StuckSegment, ...]:
+def _stuck(plant: PlantDescription, recording: Recording) -> list[StuckSegment]:
     """Segments in which a sensor is stuck and not clipped."""
-    plant = _with_recorded_sensors(plant, recording)
-    if len(recording) < FEWEST or not plant.sensors:
-        return ()
-    segments = {s: _segments(plant, recording, s) for s in plant.sensors}
-    stuck = [
-        each for of_sensor in segments.values() for each in of_sensor if not _may_be_clipped(plant, recording, each)
-    ]
-    unclear = [each for of_sensor in segments.values() for each in of_sensor if each not in stuck]
-    remaining = without(recording, [*stuck, *unclear])
+    segments = [each for sensor in plant.sensors for each in _segments(plant, recording, sensor)]
+    unclear = [each for each in segments if _may_be_clipped(plant, recording, each)]
+    stuck, remaining = [each for each in segments if each not in unclear], without(recording, segments)
     if ambiguous := [each for each in unclear if _other_readings(recording, each).numel()]:
-        fitted = blockwise_fit(blocked_recording(plant, thinned(remaining), noise_of(plant, recording)))
+        fitted = blockwise_fit(blocked_recording(plant, remaining, noise_of(plant, remaining)))
         stuck += [each for each in ambiguous if _level_inside_range(plant, recording, each, ambiguous, fitted)]
-    return tuple(stuck)
+    return stuck
 
 
 def without_sensors(plant: PlantDescription, names: Collection[str]) -> PlantDescription:
@@ -156,40 +142,26 @@ def _longest_first(stuck: Sequence[StuckSegment]) -> list[StuckSegment]:
     return kept
 
 
-def _column(recording: Recording, sensor: Sensor) -> int:
-    return recording.output_names.index(sensor.column)
-
-
-def _values(recording: Recording, sensor: Sensor) -> tuple[Tensor, Tensor]:
-    """Valid rows of a sensor, and its readings there."""
-    column = _column(recording, sensor)
-    rows = recording.mask[:, column].nonzero().flatten()
-    return rows, recording.outputs[rows, column]
-
-
 def _segments(plant: PlantDescription, recording: Recording, sensor: Sensor) -> list[StuckSegment]:
     """Segments of repeated readings of one sensor."""
-    rows, values = _values(recording, sensor)
-    usual = _typical_scatter(plant, recording, sensor) if len(values) and bool((values == values[0]).all()) else None
-    time = recording.time
-    return [
-        StuckSegment(
-            sensor,
-            int(rows[first]),
-            int(rows[beyond - 1]) + 1,
-            float(values[first]),
-            float(time[rows[first]]),
-            float(time[rows[beyond - 1]]),
-            beyond == len(values),
-        )
-        for first, beyond in stuck_runs(values, usual)
-    ]
+    values = recording.valid_readings(sensor.column)
+    usual = _typical_scatter(plant, recording, sensor) if len(values.unique()) == 1 else None
+    return [_segment(recording, sensor, *run) for run in stuck_runs(values, usual)]
+
+
+def _segment(recording: Recording, sensor: Sensor, first: int = 0, beyond: int | None = None) -> StuckSegment:
+    """A segment of some valid readings of a sensor, by default of all: from the `first` to before the one `beyond`."""
+    column = recording.output_names.index(sensor.column)
+    rows = recording.mask[:, column].nonzero().flatten()
+    a, b = int(rows[first]), int(rows[first:beyond][-1])
+    value, start, stop = (float(x) for x in (recording.outputs[a, column], recording.time[a], recording.time[b]))
+    return StuckSegment(sensor, a, b + 1, value, start, stop, beyond in (None, len(rows)))
 
 
 def _typical_scatter(plant: PlantDescription, recording: Recording, sensor: Sensor) -> Scatter:
     """Scatter of the other sensors of this unit, converted to this sensor's gain; the median over them."""
     others = [s for s in plant.sensors if s is not sensor and s.unit == sensor.unit]
-    scatters = [(scatter(_values(recording, s)[1]), abs(sensor.gain / s.gain)) for s in others]
+    scatters = [(scatter(recording.valid_readings(s.column)), abs(sensor.gain / s.gain)) for s in others]
     moving = [(each, scale) for each, scale in scatters if each.step > 0.0]
     if not moving:
         return Scatter(0.0, 0.0)
@@ -198,7 +170,7 @@ def _typical_scatter(plant: PlantDescription, recording: Recording, sensor: Sens
 
 def _other_readings(recording: Recording, stuck: StuckSegment) -> Tensor:
     """The sensor's valid readings that differ from the value at which it is stuck."""
-    _, values = _values(recording, stuck.sensor)
+    values = recording.valid_readings(stuck.sensor.column)
     return values[values != stuck.value]
 
 
@@ -238,33 +210,12 @@ def _level_inside_range(
     gains = torch.tensor([s.gain for s in plant.sensors], dtype=torch.float64)
     model_error = float(((fitted.variance / gains**2)[fitted.means > 0]).max()) * stuck.sensor.gain**2
     count = blocked.blocks * float(stuck_now.double().mean())
-    return 0.5 * count * math.log(max(mean_square, model_error) / model_error) > log_odds(SURE)
-
-
-def _constant_sensors(plant: PlantDescription, recording: Recording) -> list[Sensor]:
-    """Sensors with one value only, which small noise or an end of the range may explain."""
-    constant = []
-    for sensor in plant.sensors:
-        _, values = _values(recording, sensor)
-        if len(values) and bool((values == values[0]).all()):
-            constant.append(sensor)
-    return constant
-
-
-def _all_readings(recording: Recording, sensors: Sequence[Sensor]) -> list[StuckSegment]:
-    """One segment per sensor that covers all its readings."""
-    stuck = []
-    for sensor in sensors:
-        rows, values = _values(recording, sensor)
-        first, last = int(rows[0]), int(rows[-1])
-        span = float(recording.time[first]), float(recording.time[last])
-        stuck.append(StuckSegment(sensor, first, last + 1, float(values[0]), *span, True))
-    return stuck
+    return 0.5 * count * math.log(max(mean_square, model_error) / model_error) > SURE
 
 
 def without(recording: Recording, stuck: Sequence[StuckSegment]) -> Recording:
     """Mask these segments, including their first reading: that of a dead sensor is wrong as well."""
     mask = recording.mask.clone()
     for each in stuck:
-        mask[each.first : each.beyond, each.column_in(recording)] = False
+        mask[each.first : each.beyond, recording.output_names.index(each.sensor.column)] = False
     return replace(recording, mask=mask)

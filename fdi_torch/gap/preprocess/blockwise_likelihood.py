@@ -64,11 +64,11 @@ class BlockedRecording:
         return (time / float(time[-1]) * self.blocks * (1.0 - 1e-9)).long()
 
     def means(self, x: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Block means (B, C) of x (S, C), and the number of valid samples in each."""
-        count = torch.zeros(int(self.block[-1]) + 1, x.shape[1], dtype=x.dtype)
-        total = count.index_add(0, self.block, torch.where(mask, x, 0.0))
-        count = count.index_add(0, self.block, mask.to(x.dtype))
-        return total / count.clamp(min=1.0), count
+        """Block means (B, C, *) of x (S, C, *) over the samples in mask (S, C), and their number (B, C)."""
+        blocks, each = int(self.block[-1]) + 1, (..., *(None,) * (x.dim() - 2))
+        count = x.new_zeros(blocks, x.shape[1]).index_add(0, self.block, mask.to(x.dtype))
+        total = x.new_zeros(blocks, *x.shape[1:]).index_add(0, self.block, torch.where(mask[each], x, 0.0))
+        return total / count.clamp(min=1.0)[each], count
 
     def variance(self, residual: Tensor) -> Tensor:
         """v_c (C,) of residuals (S, C)."""
@@ -115,32 +115,21 @@ def slowest(plant: PlantDescription) -> float:
     return max(t.area * t.height / flow_scale(plant, t.name) for t in plant.tanks)
 
 
-def thinned(recording: Recording) -> Recording:
-    """The recording with at most about SAMPLES samples."""
-    return recording.every(max(1, len(recording) // SAMPLES))
-
-
 def blocked_recording(plant: PlantDescription, recording: Recording, noise: Tensor) -> BlockedRecording:
-    """Divide a thinned recording into blocks.
-
-    noise (C,): standard deviation of each sensor's readings, in the plant's order.
-    """
+    """Thin a recording to at most about SAMPLES samples, and divide it into blocks. noise (C,): as of `noise_of`."""
+    thinned = recording.every(max(1, len(recording) // SAMPLES))
     nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
-    data = data_set_of(plant, nominal_effects, recording, float(torch.median(torch.diff(recording.time))))
-    blocks = max(float(recording.time[-1] - recording.time[0]) / (2.0 * slowest(plant)), 1.0)
+    data = data_set_of(plant, nominal_effects, thinned, float(torch.median(torch.diff(thinned.time))))
+    blocks = max(float(thinned.time[-1] - thinned.time[0]) / (2.0 * slowest(plant)), 1.0)
     spans = torch.tensor([reading_span(plant, s) for s in plant.sensors], dtype=torch.float64)
-    least = noise**2 * blocks / len(recording) + (EXACT * spans) ** 2
-    return BlockedRecording(plant, recording, data, least, blocks)
+    least = noise**2 * blocks / len(thinned) + (EXACT * spans) ** 2
+    return BlockedRecording(plant, thinned, data, least, blocks)
 
 
 def noise_of(plant: PlantDescription, recording: Recording) -> Tensor:
     """Standard deviation (C,) of each sensor's noise, quantization included, in the units of the readings."""
-    stds = []
-    for sensor in plant.sensors:
-        column = recording.output_names.index(sensor.column)
-        spread = scatter(recording.outputs[recording.mask[:, column], column])
-        stds.append(math.hypot(spread.noise, spread.step / math.sqrt(12.0)))
-    return torch.tensor(stds, dtype=torch.float64)
+    scatters = [scatter(recording.valid_readings(column)) for column in plant.outputs()]
+    return torch.tensor([math.hypot(s.noise, s.step / math.sqrt(12.0)) for s in scatters], dtype=torch.float64)
 
 
 def blockwise_fit(

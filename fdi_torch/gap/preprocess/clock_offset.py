@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 
 import torch
 from torch import Tensor
 
 from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit
-from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Suspicion, WeightedFault
-from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, clock_offset
+from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Correction
+from fdi_torch.gap.preprocess.recording_fault_texts import clock_offset
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.resampling import interpolate
 
@@ -24,31 +23,26 @@ DELAY_TOLERANCE = 0.05
 """Share of a sampling interval; a smaller correction of the clock offset ends the iteration."""
 
 
-def clock_offsets(fits: CorrectedFits) -> Iterator[Suspicion]:
+def clock_offsets(fits: CorrectedFits) -> Iterator[list[Correction]]:
     """Clock offsets of all sensors together and of each sensor alone."""
     sensors = range(len(fits.plant.sensors))
     for late in [list(sensors), *([i] for i in sensors if len(sensors) > 1)]:
         if delay := _initial_delay(fits.as_is, late):
-            weigh = partial(_weighted, fits, late, delay)
-            yield from fits.suspicion(_fault(fits, late, delay), _shifted(fits, late, delay), weigh=weigh)
+            yield [_correction(fits, late, delay, DELAY_CORRECTIONS)]
 
 
-def _weighted(fits: CorrectedFits, late: list[int], delay: float) -> WeightedFault:
-    """A clock offset with the delay (s) by Gauss-Newton from an initial one."""
-    corrected = fits.fit(_shifted(fits, late, delay))
-    for _ in range(DELAY_CORRECTIONS):
-        correction = _remaining_delay(corrected, late)
-        delay += correction
-        corrected = fits.fit(_shifted(fits, late, delay))
-        if abs(correction) < DELAY_TOLERANCE * fits.as_is.blocked.recording.interval:
-            break
-    cost = 0.5 * math.log(float(corrected.means.sum()))
-    return WeightedFault(_fault(fits, late, delay), fits.prior + corrected.log_likelihood - cost)
+def _correction(fits: CorrectedFits, late: list[int], delay: float, steps: int) -> Correction:
+    """A clock offset of `delay` s. steps: Gauss-Newton steps for the delay that are left."""
 
+    def refined(fit: BlockwiseFit) -> Correction | None:
+        further = _remaining_delay(fit, late)
+        small = abs(further) < DELAY_TOLERANCE * fits.as_is.blocked.recording.interval
+        return None if small or not steps else _correction(fits, late, delay + further, steps - 1)
 
-def _fault(fits: CorrectedFits, late: list[int], delay: float) -> RecordingFault:
     columns = tuple(fits.plant.sensors[i].column for i in late)
-    return clock_offset(columns, delay, len(late) == len(fits.plant.sensors))
+    fault = clock_offset(columns, delay, len(late) == len(fits.plant.sensors))
+    cost = 0.5 * math.log(float(fits.as_is.means.sum()))
+    return Correction(fault, _shifted(fits, late, delay), cost, refined=refined)
 
 
 def _shifted(fits: CorrectedFits, late: list[int], delay: float) -> Recording:

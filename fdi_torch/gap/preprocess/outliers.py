@@ -7,10 +7,8 @@ which is smooth whatever else is wrong. Stuck readings are masked before (`acqui
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import islice
 from statistics import median
 
 import torch
@@ -21,9 +19,9 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet, at_recorded_times
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.repeated_readings import resolution
 
 FAR = 5.0  # size of a jump in usual differences of neighbours: seven standard deviations of white noise
-NEARER = 3.5  # the same for a sensor that is known to have outliers
 LATE = 3.0  # samples of timing error; the change that the slope makes of them is no jump
 WING = 5  # samples to either side, whose median is the undisturbed reading
 BACK = 0.3  # share of an outlier's height to within which the reading must return
@@ -74,8 +72,7 @@ def outliers_of(recording: Recording, lay_out: Callable[[Recording], DataSet]) -
         model = at_recorded_times(data, _fitted_readings(data))
         for i, sensor in enumerate(data.plant.sensors):
             c = recording.output_names.index(sensor.column)
-            threshold = NEARER if len(outliers.get(sensor.name, [])) >= EVENTS else FAR
-            new_outliers = _channel_outliers(masked, model[:, i], c, threshold)
+            new_outliers = _channel_outliers(masked, model[:, i], c)
             new_mask = without(mask, new_outliers, c)
             if new_outliers and int((recording.mask & ~new_mask)[:, c].sum()) <= MOST * int(recording.mask[:, c].sum()):
                 outliers.setdefault(sensor.name, []).extend(new_outliers)
@@ -111,46 +108,38 @@ def _fitted_readings(data: DataSet) -> Tensor:
     return Fitter(data, Noise(1e-2 * size, torch.zeros_like(size))).fit(Candidate()).linearised.readings[0]
 
 
-def _channel_outliers(recording: Recording, model: Tensor, channel: int, far: float) -> list[Outlier]:
-    """Outliers of one channel of a recording whose readings a model (S,) predicts. far: as FAR."""
+def _channel_outliers(recording: Recording, model: Tensor, channel: int) -> list[Outlier]:
+    """Outliers of one channel of a recording whose readings a model (S,) predicts."""
     at = recording.mask[:, channel].nonzero().flatten()
     if len(at) < ENOUGH:
         return []
     values, predicted, time = recording.outputs[at, channel], model[at], recording.time[at]
-    spans = jumps_and_returns(values - predicted, torch.diff(predicted).abs(), _resolution(values), far)
+    spans = jumps_and_returns(values - predicted, torch.diff(predicted).abs(), resolution(values))
     return [
         Outlier(slice(int(at[a]), int(at[b - 1]) + 1), (float(time[a]), float(time[b - 1])), jumps)
         for a, b, jumps in spans
     ]
 
 
-def _resolution(values: Tensor) -> float:
-    """Smallest distance between two distinct values (S,)."""
-    distinct = torch.unique(values)
-    return float(torch.diff(distinct).min()) if len(distinct) > 1 else 0.0
-
-
-def jumps_and_returns(x: Tensor, slope: Tensor, least: float, far: float = FAR) -> list[tuple[int, int, float]]:
+def jumps_and_returns(x: Tensor, slope: Tensor, least: float) -> list[tuple[int, int, float]]:
     """Segments in which x (n,) leaves its previous value within one sample and returns within one: first sample, first
     sample after, height in usual differences.
 
-    slope (n - 1,): movement of the level between samples. least: smallest difference that counts. far: as FAR.
+    slope (n - 1,): movement of the level between samples. least: smallest difference that counts.
     """
     change = torch.diff(x)
     usual = max(1.4826 * float((change - change.median()).abs().median()), least)
     movement = torch.nn.functional.max_pool1d(slope.reshape(1, 1, -1), 2 * WING + 1, 1, WING).flatten()
-    limit = far * usual + LATE * movement
+    limit = FAR * usual + LATE * movement
     jumps = (change.abs() > limit).nonzero().flatten().tolist()
     longest, values = int(MOST * len(x)), x.tolist()
     if len(jumps) > 2 * longest:
         return []
     segments: list[tuple[int, int, float]] = []
-    in_segments: set[int] = set()
     for n, last in enumerate(jumps):
         if segments and last < segments[-1][1]:
             continue
-        steady = partial(_steady, values, last, max(last - longest, 0), in_segments)
-        before = median(steady(WING))
+        before = median(values[max(last + 1 - WING, 0) : last + 1])
         for back in jumps[n + 1 : n + 1 + RETURNS]:
             if back - last > longest:
                 break
@@ -160,14 +149,9 @@ def jumps_and_returns(x: Tensor, slope: Tensor, least: float, far: float = FAR) 
             mismatch = max(abs(median(following) - before), abs(following[0] - middle), abs(values[last] - middle))
             if height > float(limit[last]) and mismatch < BACK * height:
                 # The samples before and after, as many as the block has, decide which of the two is the outlier.
-                around = steady(len(block)) + values[back + 1 : back + 1 + len(block)]
+                around = values[max(2 * last + 1 - back, 0) : last + 1] + values[back + 1 : 2 * back + 1 - last]
                 if median(abs(v - median(around)) for v in block) > 0.5 * height:
                     segments.append((last + 1, back + 1, height / usual))
-                    in_segments.update(range(last + 1, back + 1))
+                    values[last + 1 : back + 1] = [before] * len(block)
                     break
     return segments
-
-
-def _steady(values: Sequence[float], last: int, first: int, excluded: Collection[int], count: int) -> list[float]:
-    """The `count` last values from first to last without those at the excluded indices, in reverse order."""
-    return list(islice((values[k] for k in range(last, first - 1, -1) if k not in excluded), count))

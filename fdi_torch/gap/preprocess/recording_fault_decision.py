@@ -3,33 +3,27 @@
     P(fault) = sum of the weights of all faults / (that sum + weights of the unchanged recording)
 
 The unchanged recording is explained without an effect and with one or two effects of the library, so that an unusual
-plant is not mistaken for a wrong recording. A fault is reported if P(fault) exceeds 95 %. Single effects are fitted
-first, because in most recordings one of them explains the gap so well that no fault need be tried.
+plant is not mistaken for a wrong recording (two pumps that lag alike look like a late clock). A fault is reported if
+P(fault) exceeds 95 %. Single effects are fitted first, because in most recordings one of them explains the gap so well
+that no fault need be tried.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from itertools import islice
+from collections.abc import Iterator
+from itertools import chain, islice
+from operator import itemgetter
 
 import torch
 
-from fdi_torch.estimate.evidence import RARE
 from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.library import library_of
 from fdi_torch.gap.marginal_likelihood import log_prior
-from fdi_torch.gap.preprocess.blockwise_likelihood import (
-    BlockwiseFit,
-    blocked_recording,
-    blockwise_fit,
-    noise_of,
-    thinned,
-)
-from fdi_torch.gap.preprocess.channel_assignment import DECADES
-from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Suspicion, WeightedFault
+from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit, blocked_recording, blockwise_fit, noise_of
+from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault
-from fdi_torch.gap.preprocess.recording_faults import suspicions
+from fdi_torch.gap.preprocess.recording_faults import DECADES, suspected
 from fdi_torch.gap.screening import Option, options_of, screen
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.operating_range import operating_range_of_all, with_simulated_levels
@@ -38,8 +32,8 @@ from fdi_torch.recording import Recording
 FAULT_PROBABILITY = 0.02
 """Prior probability that the recording has any fault, shared equally by all faults; as that of an effect that the
 library lacks (`estimate.evidence.Odds`)."""
-SURE = 0.95
-"""Posterior probability above which a fault is reported."""
+SURE = math.log(0.95 / 0.05)
+"""Posterior log odds above which a fault is reported."""
 EVALUATIONS = 30
 """Most evaluations of the fit of a rival effect. It limits computing time: a fit that is stopped early understates the
 evidence for the rival, so that a fault of the recording is reported more easily."""
@@ -55,59 +49,31 @@ def recording_fault(
     constant: columns of sensors that never move although noise should move them. They may also be clipped throughout.
     """
     noise = noise_of(plant, recording)
-    as_is = blockwise_fit(blocked_recording(plant, thinned(recording), noise))
+    as_is = blockwise_fit(blocked_recording(plant, recording, noise))
     count = len(plant.sensors) + len(plant.channels())
     prior = math.log(FAULT_PROBABILITY / (len(DECADES) * count + math.comb(count, 2) + 2 * len(plant.sensors) + 1))
-    most = as_is.most + prior - log_odds(SURE)  # what a perfect fit of a corrected recording allows the others
+    most = as_is.most + prior - SURE  # what a perfect fit of a corrected recording allows the others
     if most < as_is.log_likelihood:
         return None
-    suspected = list(suspicions(CorrectedFits(plant, recording, as_is, noise, prior), constant))
-    if not suspected:
+    fits = CorrectedFits(plant, recording, as_is, prior, noise)
+    corrections = suspected(fits, constant)
+    if not corrections:
         return None
-    silent = {c for s in suspected if s.fault.silent for c in s.fault.channels}
-    target = max(s.log_weight for s in suspected) - log_odds(SURE)
+    silent = {c for _, each in corrections if each.fault.silent for c in each.fault.channels}
+    target = as_is.log_likelihood + corrections[0][0] - SURE
     others = _weights_with_effects(as_is, {s.name for s in plant.sensors if s.column in silent}, target)
     rivals = [as_is.log_likelihood]
     for rival in islice(others, RIVALS):
         rivals.append(rival)
         if most < rival:
             return None
-    faults = _weighed(suspected, as_is.log_likelihood, max(rivals))
-    if not _surely_faulty(faults, rivals):
-        return None
-    for rival in others:
+    faults = [fits.weighed(correction) for _, correction in corrections]
+    total = torch.logsumexp(torch.tensor([weight for weight, _ in faults]), 0)
+    for rival in chain([-math.inf], others):
         rivals.append(rival)
-        if not _surely_faulty(faults, rivals):
+        if float(total - torch.logsumexp(torch.tensor(rivals), 0)) <= SURE:
             return None
-    return max(faults, key=lambda f: f.log_weight).fault
-
-
-def _weighed(suspected: Sequence[Suspicion], base: float, rival: float) -> list[WeightedFault]:
-    """The fitted faults, without those that cannot be relevant against the likeliest fault or the likeliest rival.
-
-    base: log-likelihood of the unchanged recording. A fit may gain more than its first-order estimate, by the largest
-    factor among all faults that were fitted so far.
-    """
-    faults: list[WeightedFault] = []
-    factor = 1.0
-    for s in sorted(suspected, key=lambda s: -s.log_weight):
-        best = max([rival, *(f.log_weight for f in faults)])
-        if faults and base + factor * (s.log_weight - base) < best + math.log(RARE):
-            continue
-        faults.append(s.weigh())
-        if s.log_weight > base:
-            factor = max(factor, (faults[-1].log_weight - base) / (s.log_weight - base))
-    return faults
-
-
-def log_odds(probability: float) -> float:
-    """log(p / (1 - p))."""
-    return math.log(probability / (1.0 - probability))
-
-
-def _surely_faulty(faults: Sequence[WeightedFault], rivals: Sequence[float]) -> bool:
-    total = torch.logsumexp(torch.tensor([f.log_weight for f in faults]), 0)
-    return float(total - torch.logsumexp(torch.tensor(rivals), 0)) > log_odds(SURE)
+    return max(faults, key=itemgetter(0))[1]
 
 
 def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str], target: float) -> Iterator[float]:
@@ -115,17 +81,14 @@ def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str], target: float
 
     excluded: places at which no effect is tried. target: log-likelihood below which an effect changes no decision.
     """
-    blocked, plant = as_is.blocked, as_is.blocked.plant
+    blocked, plant, parent = as_is.blocked, as_is.blocked.plant, as_is
     library = [p for p in library_of(plant) if not p.effect.quantizes and p.location not in excluded]
     known = {p.prefix for p in blocked.data.nominal_effects}
-    placements = [p for p in library if p.prefix not in known]
-    parent = as_is
+    ranges = operating_range_of_all([blocked.recording], plant)
     for _ in range(MOST_EFFECTS):
-        fit = parent.fit
-        ranges = operating_range_of_all([blocked.recording], plant)
+        fit, fitter = parent.fit, parent.fitter
         reach = with_simulated_levels(ranges, plant, fit.linearised.levels[0])
-        fitter = parent.fitter
-        further = [p for p in placements if (p.effect.name, p.location) not in fit.key]
+        further = [p for p in library if p.prefix not in known and (p.effect.name, p.location) not in fit.key]
         screening = screen(fitter, fit, options_of(further, fitter, reach))
         best: dict[tuple[str, str], Option] = {}
         for k in torch.argsort(screening.gain, descending=True).tolist():
@@ -136,9 +99,7 @@ def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str], target: float
             candidate = Candidate((*fit.candidate.placements, option.placement), (start,))
             fits.append(blockwise_fit(blocked, candidate, as_is, EVALUATIONS, target))
             yield _log_weight(fits[-1], len(library))
-        if not fits:
-            return
-        parent = max(fits, key=lambda each: each.log_likelihood)
+        parent = max(fits, key=lambda each: each.log_likelihood, default=as_is)
 
 
 def _log_weight(fitted: BlockwiseFit, choices: int) -> float:

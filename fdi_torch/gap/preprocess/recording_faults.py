@@ -1,37 +1,86 @@
 """Faults of a recording, as opposed to faults of the plant: each is a hypothesis that can be tested.
 
-    wrong unit, swapped channels   `channel_assignment.py`
-    clock offset                   `clock_offset.py`
-    silent sensor                  `silent_sensors.py`
+    wrong unit        y = 10^k y'               k = -3 ... 3, of one sensor or one input
+    swapped channels  y_a = y'_b, y_b = y'_a    two sensors of one calibration, or two inputs of one unit
+    clock offset      `clock_offset.py`
+    silent sensor     `silent_sensors.py`
 
 Another, commands that move faster than their samples, shows in the readings alone (`recordings/input_sampling.py`).
 
-A hypothesis undoes its fault in the recording; only the clock offset has a parameter to fit. Its weight is the
-log-likelihood of the corrected recording (`blockwise_likelihood.py`) plus the log prior. A hypothesis is fitted only if
-its gain in log-likelihood, to first order in the constants, exceeds the cost of its prior.
-`recording_fault_decision.py` compares the weights with those of the unchanged recording.
+A hypothesis undoes its fault in the recording. Its weight is the log-likelihood of the corrected recording
+(`blockwise_likelihood.py`) plus the log prior. Of hypotheses that exclude each other, such as the powers of ten of one
+channel, only the likeliest to first order in the constants is fitted, and only if its gain in log-likelihood exceeds
+the cost of its prior. `recording_fault_decision.py` compares the weights with those of the unchanged recording.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import math
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import chain, combinations
+from operator import itemgetter
 
-from fdi_torch.gap.preprocess.channel_assignment import (
-    swapped_inputs,
-    swapped_sensors,
-    units_of_inputs,
-    units_of_sensors,
-)
+from torch import Tensor
+
 from fdi_torch.gap.preprocess.clock_offset import clock_offsets
-from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Suspicion
+from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Correction
+from fdi_torch.gap.preprocess.recording_fault_texts import swapped, wrong_unit
 from fdi_torch.gap.preprocess.silent_sensors import silent_sensors
 
+DECADES = (-3, -2, -1, 1, 2, 3)
+"""Powers of ten by which a unit can be wrong; millimetres instead of metres at most."""
 
-def suspicions(fits: CorrectedFits, constant: Collection[str]) -> Iterator[Suspicion]:
-    """All hypotheses that are worth a fit. constant: columns of sensors that never move."""
-    yield from units_of_sensors(fits)
-    yield from swapped_sensors(fits)
-    yield from clock_offsets(fits)
-    yield from silent_sensors(fits, constant)
-    yield from units_of_inputs(fits)
-    yield from swapped_inputs(fits)
+
+def suspected(fits: CorrectedFits, constant: Collection[str]) -> list[tuple[float, Correction]]:
+    """All corrections that are worth a fit, with their gain in log posterior weight to first order, the largest first.
+
+    constant: columns of sensors that never move.
+    """
+    alternatives = chain(_units(fits), _swaps(fits), clock_offsets(fits), silent_sensors(fits, constant))
+    likeliest = [max(((fits.first_order_gain(c), c) for c in each), key=itemgetter(0)) for each in alternatives if each]
+    return sorted((item for item in likeliest if item[0] > 0.0), key=itemgetter(0), reverse=True)
+
+
+def _units(fits: CorrectedFits) -> Iterator[list[Correction]]:
+    """The wrong units of each sensor, and of each input."""
+    r = fits.thinned
+    for i, sensor in enumerate(fits.plant.sensors):
+        outputs = {k: _scaled(r.outputs, fits.column(i), k) for k in DECADES}
+        # Jacobian of the change of unit: an error of the level is 10^k times as large in the recorded numbers.
+        cost = float(fits.as_is.means[i]) * math.log(10.0)
+        yield [
+            Correction(wrong_unit(sensor.column, k), replace(r, outputs=x), k * cost, _scaled(fits.noise, i, k))
+            for k, x in outputs.items()
+        ]
+    for channel in fits.plant.channels():
+        column = r.input_names.index(channel)
+        yield [Correction(wrong_unit(channel, k), replace(r, inputs=_scaled(r.inputs, column, k))) for k in DECADES]
+
+
+def _scaled(values: Tensor, column: int, decade: int) -> Tensor:
+    """The values (*, C) with one column divided by 10^decade."""
+    values = values.clone()
+    values[..., column] /= 10.0**decade
+    return values
+
+
+def _swaps(fits: CorrectedFits) -> Iterator[list[Correction]]:
+    """The pairs of sensors, and of inputs, that may be swapped."""
+    r, columns = fits.thinned, fits.plant.outputs()
+    alike = _alike({s.column: (s.unit, s.gain, s.offset) for s in fits.plant.sensors})
+    noise = {p: fits.noise[[columns.index(name) for name in _exchanged(columns, p)]] for p in alike}
+    sensors = {p: replace(r, output_names=_exchanged(r.output_names, p)) for p in alike}
+    yield [Correction(swapped(*p), sensors[p], noise=noise[p]) for p in alike]
+    inputs = _alike(fits.plant.channel_units())
+    yield [Correction(swapped(*p), replace(r, input_names=_exchanged(r.input_names, p))) for p in inputs]
+
+
+def _alike(channels: Mapping[str, Hashable]) -> list[tuple[str, str]]:
+    """The pairs of channels with the same unit or calibration."""
+    return [(a, b) for a, b in combinations(channels, 2) if channels[a] == channels[b]]
+
+
+def _exchanged(names: Sequence[str], pair: tuple[str, str]) -> tuple[str, ...]:
+    a, b = pair
+    return tuple({a: b, b: a}.get(name, name) for name in names)

@@ -31,17 +31,14 @@ AT_REST = 0.05  # share of equal neighbours inside the range above which the lev
 
 def limits_of(values: Tensor) -> dict[str, float]:
     """Limits that values (S,) of one sensor show, by effect name: 'sensor_saturation' and 'sensor_floor'."""
-    equal = torch.diff(values) == 0.0
-    limits = {}
-    ends = dict(zip(LIMITS, (float(values.max()), float(values.min())), strict=True))
-    at_end = (values[1:] == values.max()) | (values[1:] == values.min())
-    inside = equal[~at_end]
+    if len(values) == 0:
+        return {}
+    high, low = float(values.max()), float(values.min())
+    inside = (torch.diff(values) == 0.0)[(values[1:] != high) & (values[1:] != low)]
     if len(inside) == 0 or float(inside.double().mean()) > AT_REST:
         return {}
-    for name, end in ends.items():
-        if _longest_run(values == end) > LONGEST_BY_CHANCE:
-            limits[name] = end
-    return limits
+    ends = zip(LIMITS, (high, low), strict=True)
+    return {name: end for name, end in ends if _longest_run(values == end) > LONGEST_BY_CHANCE}
 
 
 def limits_from_readings(
@@ -54,19 +51,13 @@ def limits_from_readings(
     limits = []
     present, offered = {p.prefix for p in nominal_effects}, {p.prefix for p in library}
     for sensor in plant.sensors:
-        values = [r.outputs[r.mask[:, i], i] for r in recordings for i in _columns(r, sensor.column)]
-        if not values:
-            continue
+        values = torch.cat([r.valid_readings(sensor.column) for r in recordings])
         of_plant = dict(zip(LIMITS, (sensor.high, sensor.low), strict=True))
-        for name, limit in limits_of(torch.cat(values)).items():
+        for name, limit in limits_of(values).items():
             placement = Placement(effect(name), sensor.name, {"limit": limit})
             if of_plant[name] is None and placement.prefix in offered - present:
                 limits.append(placement)
     return limits
-
-
-def _columns(recording: Recording, name: str) -> list[int]:
-    return [i for i, column in enumerate(recording.output_names) if column == name]
 
 
 def noise_before_clipping(noise: Noise, data: DataSet, predicted: Tensor) -> Noise:
@@ -76,28 +67,15 @@ def noise_before_clipping(noise: Noise, data: DataSet, predicted: Tensor) -> Noi
 
     predicted (S, C): about the readings without noise.
     """
-    innovation, residual = noise.innovation.clone(), data.readings - predicted
+    std, residual = noise.std.clone(), data.readings - predicted
     for c, ends in enumerate(_limits_per_sensor(data)):
-        valid = unclipped = data.mask[:, c]
+        unclipped = data.mask[:, c]
         for name, end in ends.items():
             unclipped = unclipped & (_beyond(name, predicted[:, c], end) < -CLEAR * float(noise.std[c]))
-        if ends and int(unclipped.sum()) > FEWEST * int(valid.sum()):
-            innovation[c] *= _rms_difference(residual[:, c], unclipped) / _rms_difference(
-                residual[:, c], valid, data.rows
-            )
-    return replace(noise, innovation=innovation)
-
-
-def _rms_difference(x: Tensor, selected: Tensor, tapered: Sequence[slice] = ()) -> float:
-    """Root mean square difference of neighbouring samples among some (S,).
-
-    tapered: segments weighted by the taper that the noise spectrum uses.
-    """
-    weight = torch.ones_like(x) if not tapered else torch.zeros_like(x)
-    for rows in tapered:
-        weight[rows] = torch.hann_window(len(x[rows]), periodic=False, dtype=x.dtype) ** 2
-    weight = weight[1:] * (selected[1:] & selected[:-1])
-    return float((weight * torch.diff(x) ** 2).sum() / weight.sum()) ** 0.5
+        if ends and int(unclipped.sum()) > FEWEST * int(data.mask[:, c].sum()):
+            differences = torch.diff(residual[:, c])[unclipped[1:] & unclipped[:-1]]
+            std[c] = torch.sqrt(differences.square().mean() / (2.0 * (1.0 - noise.lag_one[c])))
+    return replace(noise, innovation=std / torch.sqrt(noise.energy))
 
 
 def with_noise_limits(data: DataSet, null: Fit, noise: Noise) -> DataSet:
@@ -153,9 +131,5 @@ def _limits_per_sensor(data: DataSet) -> list[dict[str, float]]:
 
 def _longest_run(flags: Tensor) -> int:
     """Length of the longest run of true samples."""
-    edges = torch.diff(flags.to(torch.int64), prepend=flags.new_zeros(1, dtype=torch.int64))
-    starts = (edges == 1).nonzero().flatten()
-    ends = (edges == -1).nonzero().flatten()
-    if len(ends) < len(starts):
-        ends = torch.cat([ends, ends.new_tensor([len(flags)])])
-    return int((ends - starts).max()) if len(starts) else 0
+    same, lengths = torch.unique_consecutive(flags, return_counts=True)
+    return int((lengths * same).max())
