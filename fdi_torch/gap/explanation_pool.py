@@ -18,7 +18,7 @@ from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit, Key
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.extensions import ExpectedGain, best_pairs, extended, log_prior_width
+from fdi_torch.gap.extensions import PRIOR_GAIN, ExpectedGain, best_pairs, extended, gain_ratio, log_prior_width
 from fdi_torch.gap.marginal_likelihood import (
     evidence_under,
     log_evidence,
@@ -38,7 +38,6 @@ FITTED = 8  # effects fitted about each explanation and noise, by first-order ga
 STARTS = 8  # initial values of one effect, by first-order gain
 EVALUATED = 3  # of these fits, the best whose evidence is computed
 CONVERGED = 0.1  # nats; a smaller gain ends the alternation between noise and fit
-PRIOR_GAIN = 3.0  # nats; gain at which an effect with odds of one in twenty becomes likely
 PAIRS = 3  # pairs of effects fitted together
 
 
@@ -271,7 +270,7 @@ class ExplanationPool:
         for key, expected_gains in self._expected_gains.items():
             # The effects of the best explanation, which are true if it is, gain more than others.
             parent, true = self.explanations[key], {key | {cause} for cause in best.key}
-            ratio = _gain_ratio(self._gains(key, true))
+            ratio = gain_ratio(self._gains(key, true))
             behind = best.log_evidence - parent.log_evidence
             for k, expected in expected_gains.items():
                 if k not in self.explanations:
@@ -292,13 +291,3 @@ def _with_fine_onsets(fitter: Fitter, fit: Fit, screening: ScreeningResult) -> S
     promising = screening.promising(FITTED)
     further = fine_onsets(promising, fitter) + likeliest_intervals(promising, fitter, fit)
     return screening + screen(fitter, fit, further) if further else screening
-
-
-def _gain_ratio(gains: Sequence[tuple[float, float]]) -> float:
-    """Actual over first-order gain by least squares, at least one.
-
-    Fits gain more than the first-order estimate because the estimated noise shrinks. One prior observation gained
-    PRIOR_GAIN nats as expected.
-    """
-    covariance = PRIOR_GAIN**2 + sum(actual * expected for actual, expected in gains)
-    return max(1.0, covariance / (PRIOR_GAIN**2 + sum(expected**2 for _, expected in gains)))

@@ -12,6 +12,8 @@ from fdi_torch.gap.candidate import Candidate, Fit, Key
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult
 from fdi_torch.parameters import Parameter
 
+PRIOR_GAIN = 3.0  # nats; gain at which an effect with odds of one in twenty becomes likely
+
 
 @dataclass(frozen=True)
 class ExpectedGain:
@@ -74,3 +76,13 @@ def _joint_start(pairs: Pairs, i: int, j: int) -> dict[str, float]:
     # The last bits of `torch.linalg.lstsq` depend on where its arguments lie in memory.
     sizes = (torch.linalg.pinv(pairs.gram[pick][:, pick], hermitian=True) @ pairs.score[pick]).tolist()
     return sized(pairs.options[i], sizes[0]) | sized(pairs.options[j], sizes[1])
+
+
+def gain_ratio(gains: Sequence[tuple[float, float]]) -> float:
+    """Actual over first-order gain by least squares, at least one.
+
+    Fits gain more than the first-order estimate because the estimated noise shrinks. One prior observation gained
+    PRIOR_GAIN nats as expected.
+    """
+    covariance = PRIOR_GAIN**2 + sum(actual * expected for actual, expected in gains)
+    return max(1.0, covariance / (PRIOR_GAIN**2 + sum(expected**2 for _, expected in gains)))

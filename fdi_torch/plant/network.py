@@ -139,9 +139,7 @@ class TankNetwork(nn.Module):
         return [*levels, *(state for states in self.steady_states(point).values() for state in states)]
 
     def steady_states(self, point: OperatingPoint) -> dict[str, tuple[Tensor, ...]]:
-        """States of each effect, m, by its prefix: those that the operating point has, else the steady ones at its
-        levels and commands.
-        """
+        """States of each effect, m, by its prefix: those of the operating point, or else the steady ones there."""
         return {placement.prefix: local.states for placement, _, local in self._at_states(point)}
 
     def state_rates(self, point: OperatingPoint) -> dict[str, tuple[Tensor, ...]]:
