@@ -128,6 +128,14 @@ def test_a_gap_of_less_than_five_standard_errors_has_no_closed_share() -> None:
         assert closure([held_out(2.0 * errors * 1e-3 / math.sqrt(18000), 0.0)]).closed == closed
 
 
+def test_causes_that_make_a_hold_out_without_a_gap_worse_close_less_than_nothing() -> None:
+    """As where the hold-out is older than the fault."""
+    held = held_out(0.05, 0.0)
+    runs = {"recalibrated": held.runs["augmented"], "augmented": held.runs["recalibrated"]}
+    told = closure([replace(held, runs=runs)])
+    assert told.closed == -9.0 and told.closed_ci95 == (-9.0, -9.0)
+
+
 def test_arrays_of_all_models_are_there_for_the_page(answer: Answer) -> None:
     arrays = answer.arrays
     assert arrays["augmented"].shape == arrays["nominal"].shape == (1000, 3)
@@ -154,10 +162,14 @@ def test_a_hold_out_with_a_further_cause_is_reported() -> None:
     assert any("does not explain other.csv, whatever the constants" in remark for remark in answer.remarks)
 
 
-@pytest.mark.parametrize("same_object", [True, False])
-def test_a_recording_cannot_be_its_own_hold_out(same_object: bool) -> None:
-    recording = replace(recorded(LAMINAR, 3, samples=100), sha256="ab")
-    holdout = recording if same_object else replace(recording, source="copy.csv")
+@pytest.mark.parametrize("source", ["same", "copy", "overlap"])
+def test_a_recording_cannot_be_its_own_hold_out(source: str) -> None:
+    recording = recorded(LAMINAR, 3, samples=100)
+    holdout = (
+        recording if source == "same" else replace(recording, source="copy.csv", outputs=recording.outputs.clone())
+    )
+    if source == "overlap":
+        recording, holdout = replace(recording, sha256="ab"), replace(short(holdout, 80), sha256="ab")
     with pytest.raises(ValueError, match="expected a hold-out other than the recording"):
         diagnose(nominal_plant(), recording, holdout)
 

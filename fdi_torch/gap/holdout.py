@@ -28,6 +28,7 @@ from fdi_torch.simulate.collocation import Collocation
 START_SAMPLES = 120  # for the initial levels
 BLOCKS, DRAWS = 24, 400  # blocks of time, and draws of the bootstrap
 DEFINED = 5.0  # standard errors; a smaller gap is too uncertain to state a share of it
+LEAST = -9.0  # share closed where the causes make a gap many times as large
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,8 @@ def _first(mask: Tensor) -> Tensor:
 
 
 def _closed(holdouts: Sequence[HeldOut]) -> tuple[float | None, tuple[float, float] | None]:
-    """Share closed with its 95 % interval over blocks of time; None if the gap is below 5 standard errors.
+    """Share closed with its 95 % interval over blocks of time, LEAST at least. None if the gap, and what the causes
+    change of it, are below 5 standard errors.
 
     The noise of a hold-out is the same in both runs. The gap is therefore the difference of their squares, plus the
     excess of the augmented run over the noise, as far as it exceeds the uncertainty of the noise.
@@ -156,16 +158,17 @@ def _closed(holdouts: Sequence[HeldOut]) -> tuple[float | None, tuple[float, flo
     difference = torch.cat([_blocks(h.weight * (h.squares["recalibrated"] - h.squares["augmented"])) for h in holdouts])
     excess = sum(float((h.weight * (h.squares["augmented"] - h.squares["noise_floor"])).sum()) for h in holdouts)
     noise_error = math.sqrt(sum(_floor_variance(h) for h in holdouts))
-    remaining = math.copysign(max(abs(excess) - noise_error, 0.0), excess)
-    total, error = float(difference.sum()) + max(remaining, 0.0), float(difference.std()) * math.sqrt(len(difference))
-    if total < DEFINED * min(error, noise_error) or total <= 0.0:
+    remaining = max(excess - noise_error, 0.0)
+    total, error = float(difference.sum()) + remaining, float(difference.std()) * math.sqrt(len(difference))
+    if max(total, -float(difference.sum())) < DEFINED * min(error, noise_error):
         return None, None
     generator = torch.Generator().manual_seed(0)
     picks = torch.randint(len(difference), (DRAWS, len(difference)), generator=generator)
-    drawn_excess = max(remaining, 0.0) + noise_error * torch.randn(DRAWS, generator=generator, dtype=difference.dtype)
-    drawn = 1.0 - drawn_excess / (difference[picks].sum(dim=1) + drawn_excess.clamp(min=0.0)).clamp(min=1e-300)
+    drawn_excess = remaining + noise_error * torch.randn(DRAWS, generator=generator, dtype=difference.dtype)
+    gap = difference[picks].sum(dim=1) + drawn_excess.clamp(min=0.0)
+    drawn = (1.0 - drawn_excess / gap.clamp(min=noise_error)).clamp(LEAST, 1.0)
     low, high = torch.quantile(drawn, torch.tensor([0.025, 0.975], dtype=drawn.dtype)).tolist()
-    return 1.0 - max(remaining, 0.0) / total, (max(low, -9.0), min(high, 1.0))
+    return max(1.0 - remaining / max(total, noise_error), LEAST), (low, high)
 
 
 def _floor_variance(held: HeldOut) -> float:

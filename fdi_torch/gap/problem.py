@@ -193,8 +193,7 @@ def _as_outliers(stuck: Sequence[StuckSegment]) -> list[SensorOutliers]:
 
 def check_holdout_differs(holdout: Recording, recordings: Sequence[Recording]) -> None:
     """Raises ValueError if a hold-out is one of the recordings that are diagnosed."""
-    same_file = bool(holdout.sha256) and any(_overlap(holdout, r) for r in recordings)
-    if same_file or any(holdout is r for r in recordings):
+    if any(_overlap(holdout, r) for r in recordings):
         raise ValueError(
             f"{holdout.source}: expected a hold-out other than the recording, got the same data; what was used for the "
             "fits says nothing of how far the gap closes"
@@ -202,8 +201,10 @@ def check_holdout_differs(holdout: Recording, recordings: Sequence[Recording]) -
 
 
 def _overlap(a: Recording, b: Recording) -> bool:
-    """Whether both are cut from one file and overlap in time."""
-    return a.sha256 == b.sha256 and bool(a.time[0] < b.time[-1]) and bool(b.time[0] < a.time[-1])
+    """Whether both have the same readings, or are cut from one file and overlap in time."""
+    overlap = bool(a.time[0] < b.time[-1]) and bool(b.time[0] < a.time[-1])
+    readings = (x.outputs.nan_to_num() for x in (a, b))
+    return (overlap and a.sha256 == b.sha256 != "") or (torch.equal(a.time, b.time) and torch.equal(*readings))
 
 
 def checked_data_set(
