@@ -59,6 +59,7 @@ DOORS = {
         "blind/statistics.py",
         "estimate/state_noise.py",
         "gap/free_runs/between_runs.py",
+        "gap/localization/fine_positions.py",
         "logbook/compare.py",
         "monitor/false_alarm_rate.py",
         "monitor/monte_carlo/false_alarm_plan.py",

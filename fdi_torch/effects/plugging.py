@@ -36,7 +36,7 @@ class Plugging(Effect):
     def equivalents(
         self, place: str, plant: PlantDescription, values: Mapping[str, float]
     ) -> tuple[tuple[str, str], ...]:
-        source = next(p.source for p in plant.pipes if p.name == place)
+        source = next((p.source for p in plant.pipes if p.name == place), "")
         outlets = plant.floor_outlets(source)
         if place not in outlets or values.get("size", 0.0) > 0.0:
             return ()

@@ -17,7 +17,6 @@ from dataclasses import replace
 from functools import cached_property
 
 import torch
-from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from fdi_torch.estimate.linear_parameters import without
@@ -162,6 +161,9 @@ class Positions:
         unit = 1.0 / self.under.data.longest_duration
         around = (first + unit * torch.linspace(-1.0, 1.0, FREQUENCIES, dtype=first.dtype)).clamp(min=unit)
         near, spacing = float(around[estimated(around, whole).argmax()]), 2.0 * unit / (FREQUENCIES - 1)
+
+        from scipy.optimize import minimize_scalar  # it takes 0.3 s to load
+
         best = minimize_scalar(
             lambda frequency: -float(exact(first.new_tensor([frequency]), whole)),
             bounds=(max(near - spacing, unit), near + spacing),
