@@ -14,7 +14,6 @@ from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.channel_noise import low_frequency_excess
-from fdi_torch.gap.dataset import RecordingPart
 from fdi_torch.gap.diagnosis_result import DiagnosisResult, unexplained_chi_square
 from fdi_torch.gap.free_form import discrepancy_tables
 from fdi_torch.gap.holdout import HeldOut
@@ -34,7 +33,6 @@ def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
     data = result.fitter.data
     remarks: list[str] = []
     remarks += dict.fromkeys(s for part in data.parts for s in data_warnings(part.recording, data.plant))
-    remarks += [_averaged(part) for part in data.parts if len(part.readings) < len(part.recording)]
     inputs = [column for part in data.parts for column in part.recording.inputs.T]
     if all(float(torch.diff(column).abs().max()) == 0.0 for column in inputs):
         remarks.append(
@@ -56,16 +54,6 @@ def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
     remarks += [*_nominal_values_out_of_range(data.plant), *_values_at_bounds(result), *_periods(result)]
     on_holdouts = [remark(result, h) for remark in (_free_form_fails, rig_difference) for h in held]
     return remarks + [sentence for sentence in on_holdouts if sentence]
-
-
-def _averaged(part: RecordingPart) -> str:
-    """How many readings were averaged, and why."""
-    step = float(part.experiment.steps.median())
-    return (
-        f"{Path(part.recording.source).name or 'the recording'}: its {len(part.recording)} samples are averaged over "
-        f"integration steps of {step:.3g} s, because the level is a straight line within a step, of which single "
-        "samples say no more than their mean"
-    )
 
 
 def _masked_outliers(outliers: SensorOutliers) -> str:
