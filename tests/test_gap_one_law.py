@@ -15,5 +15,5 @@ def test_two_laws_at_one_place_are_told_next_to_one_law_that_no_library_has() ->
     library = ("laminar_flow", "flow_exponent", "pump_gain", "sensor_bias", "leak")
     answer = diagnose(nominal_plant(), recorded(values, 81), settings=Settings(library))
     first, second = answer.posterior[:2]
-    assert not first.causes and first.unknown_at == "P13"
+    assert first.causes == (("unknown", "P13"),)
     assert set(second.causes) == {("laminar_flow", "P13"), ("flow_exponent", "P13")}
