@@ -97,9 +97,9 @@ def add_leave_out(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--leave-out", metavar="EFFECT,...", default="", help="effects to leave out of the library")
 
 
-def add_step(parser: argparse.ArgumentParser) -> None:
-    help_text = "integration step (default: as sampled, <= 5 s, less where levels move fast)"
-    parser.add_argument("--step", metavar="TIME", type=seconds, help=help_text)
+def add_step(parser: argparse.ArgumentParser, default: str) -> None:
+    """default: the step that is taken without this option, in words."""
+    parser.add_argument("--step", metavar="TIME", type=seconds, help=f"integration step (default: {default})")
 
 
 def names(text: str | None) -> tuple[str, ...]:

@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_holdout(parser)
     add_library(parser)
     add_leave_out(parser)
-    add_step(parser)
+    add_step(parser, "for about 1500 steps, not below that of the samples; shorter where levels move fast")
     parser.add_argument(
         "--most", metavar="N", type=int, default=MOST_CAUSES, help=f"largest number of effects ({MOST_CAUSES})"
     )

@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_plant_and_recording(parser)
     add_holdout(parser)
     add_leave_out(parser)
-    add_step(parser)
+    add_step(parser, "half the sampling interval")
     parser.add_argument("--hold", metavar="NAME,...", default="", help="do not fit these (* matches any name)")
     parser.add_argument(
         "--vary",
