@@ -193,14 +193,14 @@ def _as_outliers(stuck: Sequence[StuckSegment]) -> list[SensorOutliers]:
 
 def check_holdout_differs(holdout: Recording, recordings: Sequence[Recording]) -> None:
     """Raises ValueError if a hold-out is one of the recordings that are diagnosed."""
-    if any(_overlap(holdout, r) for r in recordings):
+    if any(_same_data(holdout, r) for r in recordings):
         raise ValueError(
             f"{holdout.source}: expected a hold-out other than the recording, got the same data; what was used for the "
             "fits says nothing of how far the gap closes"
         )
 
 
-def _overlap(a: Recording, b: Recording) -> bool:
+def _same_data(a: Recording, b: Recording) -> bool:
     """Whether both have the same readings, or are cut from one file and overlap in time."""
     overlap = bool(a.time[0] < b.time[-1]) and bool(b.time[0] < a.time[-1])
     readings = (x.outputs.nan_to_num() for x in (a, b))

@@ -161,7 +161,7 @@ def _commanded(component: FlowComponent, plant: PlantDescription) -> Discrepancy
     def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
         kinks = [ends.kinks(s, "command", 9), ends.kinks(s, "level", 6, s["flow"])]
         jumps = ends.jumps(s, "below", 9, s["flow"])
-        return [*kinks, jumps, *_fine_of_actuator(s["flow"], step, ends("flow"), scale)]
+        return [*kinks, jumps, *_fine_of_actuator(s, "flow", step, ends, scale)]
 
     return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
 
@@ -176,14 +176,11 @@ def _of_actuator(x: Tensor, step: Tensor, ends: tuple[float, float], scale: floa
     ]
 
 
-def _fine_of_actuator(x: Tensor, step: Tensor, ends: tuple[float, float], scale: float) -> list[Curves]:
-    """The rate limits, stictions and plays among `_of_actuator` on finer grids."""
-    families = (
-        rate_limits(x, step, ends, scale, finer(TRAVEL_TIMES, FINER)),
-        stictions(x, ends, FINE_STICTION_BANDS),
-        backlashes(x, ends, finer(BACKLASH_BANDS, FINER)),
-    )
-    return [Curves(torch.stack(family)) for family in families]
+def _fine_of_actuator(s: Signals, name: str, step: Tensor, ends: SignalRanges, scale: float) -> list[Curves]:
+    """The rate limits, stictions and plays among `_of_actuator` on finer grids. name: of the flow or the opening."""
+    slow = rate_limits(s[name], step, ends(name), scale, finer(TRAVEL_TIMES, FINER))
+    sticking = stictions(s[name], ends(name), FINE_STICTION_BANDS)
+    return [Curves(torch.stack(slow)), Curves(torch.stack(sticking)), ends.fine_backlashes(s, name)]
 
 
 def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyModel:
@@ -208,7 +205,7 @@ def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyMo
     def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
         of_valve: FineRegressors = []
         if has_valve:
-            past = _fine_of_actuator(s["opening"], step, ends("opening"), scale)
+            past = _fine_of_actuator(s, "opening", step, ends, scale)
             of_valve = [ends.kinks(s, "opening", 9, s["root"]), *(Curves(s["root"] * c.values) for c in past)]
         jumps, relays = ends.jumps(s, "root", 24, s["flow"]), ends.fine_relays(s, "root", s["flow"])
         kinks = [ends.kinks(s, "root", 16), ends.kinks(s, "head", 12)]

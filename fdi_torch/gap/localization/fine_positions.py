@@ -77,6 +77,11 @@ class Positions:
     def _choices(self) -> int:
         return sum(map(len, self._strengths))
 
+    @cached_property
+    def _cost(self) -> float:
+        """Cost of one more regressor, nats."""
+        return float(column_costs(torch.tensor([float(self._choices)]), largest_influence(self.under)))
+
     def best(self, discrepancy: Discrepancy, used: Tensor) -> Discrepancy | None:
         """The discrepancy with the regressor that explains most in addition to those used, or None if none is worth
         its selection."""
@@ -85,8 +90,7 @@ class Positions:
         gains = [gains_of(p[:, 0], strength) for p, strength in zip(products, self._strengths, strict=True)]
         highest = [(float(g[i]), family, i) for family, g in enumerate(gains) for i in _local_maxima(g)]
         tried = sorted(highest, reverse=True)[:TRIED]
-        (cost,) = column_costs(torch.tensor([float(self._choices)]), largest_influence(self.under)).tolist()
-        if not tried or tried[0][0] < cost:
+        if not tried or tried[0][0] < self._cost:
             return None
         positions = [Position(family, index, self._choices) for _, family, index in tried]
         columns = torch.stack([self.regression.column(self.place, p) for p in positions], dim=-1)
@@ -134,7 +138,7 @@ class Positions:
 
     def with_best_frequency(self, discrepancy: Discrepancy, used: Tensor) -> Discrepancy:
         """The discrepancy with the frequency at which its sinusoids explain most beside the other regressors that it
-        uses. used (M,): as at the beginning, and no sinusoids; the same discrepancy if it has none.
+        uses; the same if it has no sinusoids. used (M,): as given at the construction, without sinusoids.
         """
         if discrepancy.frequency is None:
             return discrepancy
