@@ -127,16 +127,14 @@ def _between_samples(engine: Collocation, theta: Tensor, linearised: Linearised,
     experiment, n = engine.experiment, engine.network.order
     areas = torch.cat([areas, areas.new_full((n - len(areas),), torch.inf)])  # no random flow acts on other states
     node = experiment.sample_step + experiment.sample_share.round().to(torch.int64)
-    next_node = torch.cat([node[1:], node[-1:]])
+    steps = torch.cat([torch.diff(node), node.new_zeros(1)])
     identity = torch.eye(n, dtype=torch.float64)
     transition, forcing = identity.repeat(len(node), 1, 1), torch.zeros(len(node), n, n, dtype=torch.float64)
-    for offset in range(int((next_node - node).max())):
-        step = node + offset
-        before_next = (step < next_node)[:, None, None]
-        step = step.clamp(max=len(experiment.steps) - 1)
-        a, b = linearised.transition[0, step], linearised.gain[0, step] / areas
-        moved, pushed = (a @ transition, a @ forcing + b) if offset else (a, b)
-        transition, forcing = torch.where(before_next, moved, transition), torch.where(before_next, pushed, forcing)
+    for offset in range(int(steps.max())):
+        rows = torch.nonzero(steps > offset).squeeze(1)  # few samples are more than one or two steps apart
+        step = node[rows] + offset
+        a, b = linearised.transition[0].index_select(0, step), linearised.gain[0].index_select(0, step) / areas
+        transition[rows], forcing[rows] = a @ transition[rows], a @ forcing[rows] + b
     paths = identity.reshape(1, n, n, 1).expand(1, n, n, len(experiment.nodes)).contiguous()
     output = engine.look(linearised.levels, theta).along(paths, [-1] * n)[0]
     return transition, forcing, output.permute(2, 0, 1)
