@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from fdi_torch.effects import EFFECTS
+
 ROOT = Path(__file__).parents[1] / "fdi_torch"
 
 # Lowest first. A room imports from rooms further down, and sideways only where that closes no circle.
@@ -151,6 +153,18 @@ def test_only_the_command_line_prints() -> None:
     calls = [(path, n.func) for path, tree in modules().items() for n in ast.walk(tree) if isinstance(n, ast.Call)]
     printing = {path for path, f in calls if isinstance(f, ast.Name) and f.id == "print" and room_of(path) != "cli"}
     assert not printing, "modules print; return a value instead"
+
+
+@pytest.mark.parametrize("room", ["gap", "monitor"])
+def test_diagnosis_asks_effects_what_they_are_and_knows_none_by_name(room: str) -> None:
+    names = {e.name for e in EFFECTS}
+    written = {
+        (path, n.value)
+        for path, tree in modules().items()
+        for n in ast.walk(tree)
+        if room_of(path) == room and isinstance(n, ast.Constant) and n.value in names
+    }
+    assert not written, "give the effect an attribute that says what it shares with others"
 
 
 @cache

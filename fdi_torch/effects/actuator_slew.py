@@ -23,6 +23,7 @@ class ActuatorSlew(Effect):
     stage = Stage.COMMAND
     places = ("pump", "valve")
     memory = 1
+    searched = False
     mistaken_for = ("pump_lag", "pump_delay", "valve_lag", "actuator_stuck")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

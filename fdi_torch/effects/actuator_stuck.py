@@ -19,6 +19,7 @@ class ActuatorStuck(Stuck):
     name = "actuator_stuck"
     stage = Stage.COMMAND
     places = ("pump", "valve")
+    searched = False
     mistaken_for = ("pump_gain", "pump_saturation", "valve_dead_zone", "valve_leak", "actuator_slew")
 
     def command(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:

@@ -23,6 +23,7 @@ class CrossFlow(Effect):
     name = "cross_flow"
     stage = Stage.BALANCE
     places = ("tank_pair",)
+    capacity_share = True
     mistaken_for = ("plugging", "laminar_flow", "leak", "valve_leak", "openness")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

@@ -18,6 +18,7 @@ class Evaporation(Effect):
     name = "evaporation"
     stage = Stage.BALANCE
     places = ("tank",)
+    searched = False
     mistaken_for = (
         "pump_offset",
         "pump_dead_zone",

@@ -21,6 +21,7 @@ class Leak(Effect):
     name = "leak"
     stage = Stage.BALANCE
     places = ("tank",)
+    capacity_share = True
     mistaken_for = ("plugging", "net_outlet", "valve_leak", "unmetered_flow", "cross_flow", "overflow", "evaporation")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

@@ -18,6 +18,7 @@ class NetOutlet(Effect):
     name = "net_outlet"
     stage = Stage.FLOW
     places = ("outlet",)
+    searched = False
     mistaken_for = ("plugging", "leak")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

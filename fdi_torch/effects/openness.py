@@ -16,6 +16,7 @@ class Openness(Effect):
     name = "openness"
     stage = Stage.FLOW
     places = ("pipe",)
+    searched = False
     mistaken_for = ("plugging", "cross_flow")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

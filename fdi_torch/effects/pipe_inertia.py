@@ -31,6 +31,7 @@ class PipeInertia(Effect):
     stage = Stage.FLOW
     places = ("pipe", "outlet")
     states = 1
+    searched = False
     mistaken_for = ("plugging", "coefficient_drift", "sensor_lag", "sensor_delay", "valve_lag")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

@@ -17,6 +17,7 @@ class PumpCurve(Effect):
     name = "pump_curve"
     stage = Stage.FLOW
     places = ("pump",)
+    searched = False
     mistaken_for = ("pump_offset", "pump_dead_zone", "pump_gain", "pump_saturation")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

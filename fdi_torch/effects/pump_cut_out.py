@@ -21,6 +21,7 @@ class PumpCutOut(Effect):
     stage = Stage.FLOW
     places = ("pump",)
     smooth = False
+    searched = False
     mistaken_for = ("overflow", "pump_saturation", "sensor_saturation", "pump_back_pressure")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

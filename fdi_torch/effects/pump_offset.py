@@ -17,6 +17,7 @@ class PumpOffset(Effect):
     name = "pump_offset"
     stage = Stage.FLOW
     places = ("pump",)
+    searched = False
     mistaken_for = ("pump_dead_zone", "evaporation", "unmetered_flow", "pump_gain", "pump_curve", "flow_exponent")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

@@ -19,6 +19,7 @@ class PumpOscillation(Effect):
     name = "pump_oscillation"
     stage = Stage.FLOW
     places = ("pump",)
+    searched = False
     mistaken_for = ("sensor_oscillation", "pump_gain")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

@@ -31,6 +31,7 @@ class PumpPriming(Effect):
     places = ("pump",)
     memory = 1
     startup_only = True
+    searched = False
     mistaken_for = ("pump_delay", "unmetered_flow", "pump_dead_zone")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

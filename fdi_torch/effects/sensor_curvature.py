@@ -18,6 +18,7 @@ class SensorCurvature(Effect):
     name = "sensor_curvature"
     stage = Stage.READING
     places = ("sensor",)
+    searched = False
     mistaken_for = ("sensor_gain", "sensor_stuck", "sensor_bias", "sensor_saturation")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

@@ -18,6 +18,7 @@ class SensorFloor(ReadingLimit):
 
     name = "sensor_floor"
     upper = False
+    searched = False
     mistaken_for = ("sensor_bias", "outlet_drop", "sensor_curvature")
 
     def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:

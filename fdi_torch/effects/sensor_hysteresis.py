@@ -19,6 +19,7 @@ class SensorHysteresis(Effect):
     stage = Stage.READING
     places = ("sensor",)
     memory = 1
+    searched = False
     mistaken_for = ("sensor_lag", "sensor_delay", "sensor_quantization")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

@@ -21,6 +21,7 @@ class SensorOscillation(Effect):
     name = "sensor_oscillation"
     stage = Stage.READING
     places = ("sensor",)
+    searched = False
     mistaken_for = ("pump_oscillation", "sensor_bias")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

@@ -21,8 +21,6 @@ CERTAIN = 0.95  # marginal probability
 TOLERANCE_SHARE, TOLERANCE_ERRORS = 0.2, 3.0
 Verdict = Literal["no_gap", "named", "ambiguous", "unknown"]
 CauseName = tuple[str, str]
-# Effects of a tank whose size is a share of the capacity of its reference pipe.
-SHARES_OF_CAPACITY = ("leak", "cross_flow")
 
 
 @dataclass(frozen=True)
@@ -149,7 +147,7 @@ def _same_shape(placed: PlacedEffect, before: PlantDescription, after: PlantDesc
 
 def _same_flow(placed: PlacedEffect, before: PlantDescription, after: PlantDescription) -> PlacedEffect:
     """The effect with an unchanged flow if its size is a share of a pipe's capacity that has changed."""
-    if placed.effect not in SHARES_OF_CAPACITY:
+    if not effect(placed.effect).capacity_share:
         return placed
     tank = before.tanks_at(placed.location)[0]
     old, new = (nominal_capacity(p, leak_pipe(p, tank)) for p in (before, after))

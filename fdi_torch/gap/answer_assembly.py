@@ -8,7 +8,6 @@ from typing import Any
 
 from torch import Tensor
 
-from fdi_torch.effects import effect
 from fdi_torch.gap.answer import UNKNOWN, Amount, Answer, Cause, CauseName, ProbableExplanation, names
 from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.cause_hypothesis import CauseHypothesis
@@ -155,8 +154,8 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
         causes.append(Cause(*cause, amounts, tuple(sorted(others))))
     if result.posterior.best.unknown_at:
         causes.append(Cause(UNKNOWN, result.posterior.best.unknown_at))
-    steps = zip(plant.sensors, result.quantization_steps, strict=True)
-    rounded = [Placement(effect("sensor_quantization"), s.name, {"step": step}) for s, step in steps]
+    steps = dict(zip((s.name for s in plant.sensors), result.quantization_steps, strict=True))
+    rounded = [replace(p, values={"step": steps[p.location]}) for p in result.library if p.effect.quantizes]
     shown = {(p.effect.name, p.location): _amounts_from_readings(p, plant) for p in (*result.limits, *rounded)}
     return (*causes, *(Cause(*name, shown.get(name, {})) for name in result.from_readings))
 

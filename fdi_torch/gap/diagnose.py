@@ -66,10 +66,8 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     progress(0.6, "where")
     posterior = posterior_of(pool, result, options, plant, possible_places(plant), problem.named_only)
     credible_set = posterior.credible_set(CONTENT)
-    from_readings = [
-        ("sensor_quantization", s.name) for s, step in zip(plant.sensors, quantization_steps, strict=True) if step > 0.0
-    ]
-    from_readings = [c for c in from_readings if any((p.effect.name, p.location) == c for p in library)]
+    rounded = {s.name for s, step in zip(plant.sensors, quantization_steps, strict=True) if step > 0.0}
+    from_readings = [(p.effect.name, p.location) for p in library if p.effect.quantizes and p.location in rounded]
     from_readings += [(p.effect.name, p.location) for p in problem.known_effects]
     if not problem.named_only and (sensor := sensor_with_outliers(problem.outliers[0])):
         from_readings.append((UNKNOWN, sensor))

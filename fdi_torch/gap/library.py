@@ -10,39 +10,7 @@ from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement, fits, place_kinds_of
 
-# Effects searched by default. All others are searched if they are named.
-STANDARD = (
-    "pump_gain",
-    "pump_dead_zone",
-    "pump_saturation",
-    "pump_lag",
-    "pump_delay",
-    "pump_back_pressure",
-    "laminar_flow",
-    "flow_exponent",
-    "outlet_drop",
-    "coefficient_drift",
-    "plugging",
-    "cross_flow",
-    "leak",
-    "unmetered_flow",
-    "area_taper",
-    "internal_body",
-    "overflow",
-    "sensor_bias",
-    "sensor_gain",
-    "sensor_lag",
-    "sensor_drift",
-    "sensor_quantization",
-    "sensor_delay",
-    "sensor_saturation",
-    "sensor_stuck",
-    "valve_dead_zone",
-    "valve_characteristic",
-    "valve_authority",
-    "valve_lag",
-    "valve_leak",
-)
+STANDARD = tuple(e.name for e in EFFECTS if e.searched)
 
 
 def library_of(

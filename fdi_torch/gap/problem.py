@@ -10,6 +10,7 @@ from functools import partial
 import torch
 
 from fdi_torch.effects import effect
+from fdi_torch.effects.stuck import Stuck
 from fdi_torch.gap.accurate_steps import with_accurate_steps
 from fdi_torch.gap.dataset import DataSet, data_set_of
 from fdi_torch.gap.library import library_of
@@ -91,8 +92,8 @@ def problem_of(
     holdouts, _ = _examined(plant, holdouts, settings.trusted)
     rims = [rim.text for r in (*recordings, *holdouts) if not r.trusted for rim in denied_rims(plant, r)]
     plant = with_rims_unknown(plant, [*recordings, *holdouts])
-    offered = {p.prefix for p in library}
-    stuck_for_good = {s.sensor.name: s for s in stuck if s.for_good and f"{s.sensor.name}.sensor_stuck" in offered}
+    freezing = {p.location: p for p in library if isinstance(p.effect, Stuck)}
+    stuck_for_good = {s.sensor.name: s for s in stuck if s.for_good and s.sensor.name in freezing}
     plant = _without_stuck_sensors(plant, recordings, stuck)
     _check_readings(plant, recordings)
     library = tuple(p for p in library if p.location in plant.locations())
@@ -101,9 +102,7 @@ def problem_of(
     holdouts, holdout_outliers = _without_outliers(plant, nominal_effects, holdouts, settings.step)
     known_effects = limits_from_readings(plant, recordings, nominal_effects, library)
     nominal_effects += known_effects
-    known_effects += [
-        Placement(effect("sensor_stuck"), n, {"size": 1.0, "onset": s.start}) for n, s in stuck_for_good.items()
-    ]
+    known_effects += [replace(freezing[n], values={"size": 1.0, "onset": s.start}) for n, s in stuck_for_good.items()]
     outliers = _as_outliers([s for s in stuck if s.sensor.name not in stuck_for_good]) + outliers
     data, *holdout_data = (
         checked_data_set(plant, nominal_effects, r, settings.step) for r in (recordings, *((h,) for h in holdouts))

@@ -13,16 +13,17 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from fdi_torch.effects import effect
+from fdi_torch.effects import EFFECTS
+from fdi_torch.effects.clipping import ReadingLimit
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet
-from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.description import PlantDescription, Sensor
 from fdi_torch.plant.effect import Placement
 from fdi_torch.recording import Recording
 
-LIMITS = ("sensor_saturation", "sensor_floor")
+LIMITS = {e.name: e for e in EFFECTS if isinstance(e, ReadingLimit)}
 LONGEST_BY_CHANCE = 5  # equal samples in a row that chance explains
 CLEAR = 4.0  # standard deviations from a limit beyond which noise is not clipped
 FEWEST = 0.1  # smallest share of a sensor's samples from which its noise is estimated
@@ -30,15 +31,15 @@ AT_REST = 0.05  # share of equal neighbours inside the range above which the lev
 
 
 def limits_of(values: Tensor) -> dict[str, float]:
-    """Limits that values (S,) of one sensor show, by effect name: 'sensor_saturation' and 'sensor_floor'."""
+    """Limits that values (S,) of one sensor show, by the name of the effect."""
     if len(values) == 0:
         return {}
     high, low = float(values.max()), float(values.min())
     inside = (torch.diff(values) == 0.0)[(values[1:] != high) & (values[1:] != low)]
     if len(inside) == 0 or float(inside.double().mean()) > AT_REST:
         return {}
-    ends = zip(LIMITS, (high, low), strict=True)
-    return {name: end for name, end in ends if _longest_run(values == end) > LONGEST_BY_CHANCE}
+    ends = {name: high if limit.upper else low for name, limit in LIMITS.items()}
+    return {name: end for name, end in ends.items() if _longest_run(values == end) > LONGEST_BY_CHANCE}
 
 
 def limits_from_readings(
@@ -52,10 +53,9 @@ def limits_from_readings(
     present, offered = {p.prefix for p in nominal_effects}, {p.prefix for p in library}
     for sensor in plant.sensors:
         values = torch.cat([r.valid_readings(sensor.column) for r in recordings])
-        of_plant = dict(zip(LIMITS, (sensor.high, sensor.low), strict=True))
         for name, limit in limits_of(values).items():
-            placement = Placement(effect(name), sensor.name, {"limit": limit})
-            if of_plant[name] is None and placement.prefix in offered - present:
+            placement = Placement(LIMITS[name], sensor.name, {"limit": limit})
+            if _of_plant(sensor, name) is None and placement.prefix in offered - present:
                 limits.append(placement)
     return limits
 
@@ -92,11 +92,10 @@ def with_noise_limits(data: DataSet, null: Fit, noise: Noise) -> DataSet:
     effects = {p.prefix: p for p in data.nominal_effects}
     for c, (sensor, ends) in enumerate(zip(data.plant.sensors, _limits_per_sensor(data), strict=True)):
         std = min(float(noise.std[c]), float(rms[c]))
-        of_plant = dict(zip(LIMITS, (sensor.high, sensor.low), strict=True))
         for name, end in ends.items():
-            placement = effects.get(f"{sensor.name}.{name}", Placement(effect(name), sensor.name))
+            placement = effects.get(f"{sensor.name}.{name}", Placement(LIMITS[name], sensor.name))
             values = dict(placement.values or {})
-            stated = [limit for limit in (values.get("limit"), of_plant[name]) if limit is not None]
+            stated = [limit for limit in (values.get("limit"), _of_plant(sensor, name)) if limit is not None]
             if stated and all(abs(limit - end) < std for limit in stated):
                 beyond = data.mask[:, c] & (_beyond(name, levels[:, c], end) > CLEAR * std)
                 behind = _share_after_limit(data.readings[beyond, c] == end)
@@ -115,7 +114,12 @@ def _unlimited(data: DataSet, null: Fit, noise: Noise) -> Tensor:
 
 def _beyond(name: str, values: Tensor, end: float) -> Tensor:
     """Distance outside a limit, in the readings' unit."""
-    return values - end if name == LIMITS[0] else end - values
+    return values - end if LIMITS[name].upper else end - values
+
+
+def _of_plant(sensor: Sensor, name: str) -> float | None:
+    """The limit of a sensor in the plant file."""
+    return sensor.high if LIMITS[name].upper else sensor.low
 
 
 def _share_after_limit(at_end: Tensor) -> float:
