@@ -15,10 +15,11 @@ from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.experiment_design import HIGH, discriminating_input, planned_recording
-from fdi_torch.gap.identifiability import DRAWS, identifiability, simulated_confusions
+from fdi_torch.gap.identifiability import DRAWS, identifiability, simulated_confusions, unsearched_twins
 from fdi_torch.gap.problem import checked_data_set
-from fdi_torch.gap.screening import Option, Pairs, screen
+from fdi_torch.gap.screening import Option, Pairs, options_of, screen
 from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.operating_range import operating_range_of
 from tests.rigs import three_tank
 from tests.test_gap import nominal_plant, recorded
 
@@ -106,6 +107,21 @@ def test_the_designed_input_separates_what_the_recording_cannot(rivals: Fitter) 
     assert bool((wanted.inputs > 0.0).all()) and bool((wanted.inputs <= HIGH * full).all())
     held = torch.diff(wanted.inputs[:, 0]).abs()
     assert int((held > 0).sum()) == len(found["input"]["Q1"]["at"]) - 1
+
+
+@pytest.mark.parametrize(("dead_zone", "twins"), [(8e-6, (("pump_offset", "Q1"),)), (30e-6, ())])
+def test_a_dead_zone_below_all_commands_has_an_offset_as_twin(
+    dead_zone: float, twins: tuple[tuple[str, str], ...]
+) -> None:
+    """All commands are above 15 cm3/s."""
+    name = "Q1.pump_dead_zone.dead_zone"
+    white = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    fitter = Fitter(checked_data_set(nominal_plant(), (), [recorded({name: dead_zone}, 9)], None), white)
+    placed = Placement(effect("pump_dead_zone"), "Q1")
+    fit = fitter.fit(Candidate((placed,), ({name: dead_zone},)))
+    offsets = [Placement(effect("pump_offset"), pump) for pump in ("Q1", "Q2")]
+    reach = operating_range_of(fitter.data.recording, nominal_plant())
+    assert unsearched_twins(fitter, fit, placed, options_of(offsets, fitter, reach), 0.95) == twins
 
 
 def test_explanations_with_the_same_prediction_are_not_separated(rivals: Fitter) -> None:

@@ -14,6 +14,7 @@ a simpler search than the real one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,13 +24,13 @@ from torch import Tensor
 
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.candidate import Candidate
+from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.extensions import size_of
 from fdi_torch.gap.library import equivalence_class, library_of
-from fdi_torch.gap.screening import Option, Pairs, options_of, pairs_of, screen
+from fdi_torch.gap.screening import Option, Pairs, options_of, pairs_of, products, screen
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of
@@ -114,6 +115,24 @@ def _noise_free(
     theta = engine.space.nominal().unsqueeze(0)
     readings = engine.converge(theta).readings[0]
     return Fitter(replace(data, readings=readings, recording=replace(planned, outputs=readings)), white)
+
+
+def unsearched_twins(
+    fitter: Fitter, fit: Fit, placed: Placement, options: Sequence[Option], level: float
+) -> tuple[CauseName, ...]:
+    """Causes outside the library that would explain the readings about as well as a cause of the fit, to first order.
+
+    With equal prior odds each would have more than the share 1 - level of the probability of the two. All columns are
+    about the trajectory of the fit, along which effects with the same equations differ by nothing. options: starts of
+    these causes.
+    """
+    own = Option(placed, fit.values_of([placed]))
+    _, gram = products(fitter, fit, [own, *options], besides=tuple(own.start))
+    shared, strength = gram[0, 1:], torch.diagonal(gram)[1:]
+    explained = torch.where(shared > 0.0, shared**2 / strength.clamp(min=VISIBLE), 0.0)
+    near = float(gram[0, 0]) - explained < 2.0 * math.log(level / (1.0 - level))
+    each = zip(options, near, strength, explained, strict=True)
+    return tuple(dict.fromkeys(o.cause for o, is_near, s, gap in each if is_near and _possible(o, s, float(gap))))
 
 
 DRAWS, SEED = 40, 0

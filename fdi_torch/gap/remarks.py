@@ -9,15 +9,18 @@ from typing import Any
 
 import torch
 
-from fdi_torch.effects import effect
+from fdi_torch.effects import EFFECTS, all_placements, effect
 from fdi_torch.estimate.uncertainty import end_reached
+from fdi_torch.gap.answer import CERTAIN
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.channel_noise import low_frequency_excess
 from fdi_torch.gap.diagnosis_result import DiagnosisResult, unexplained_chi_square
 from fdi_torch.gap.free_form import discrepancy_tables
 from fdi_torch.gap.holdout import HeldOut
+from fdi_torch.gap.identifiability import unsearched_twins
 from fdi_torch.gap.preprocess.outliers import SensorOutliers
+from fdi_torch.gap.screening import options_of
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text
@@ -52,6 +55,7 @@ def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
         )
     remarks += [_masked_outliers(s) for group in result.outliers for s in group]
     remarks += [*_nominal_values_out_of_range(data.plant), *_values_at_bounds(result), *_periods(result)]
+    remarks += _twins_outside_library(result)
     on_holdouts = [remark(result, h) for remark in (_free_form_fails, rig_difference) for h in held]
     return remarks + [sentence for sentence in on_holdouts if sentence]
 
@@ -87,6 +91,27 @@ def _periods(result: DiagnosisResult) -> list[str]:
         "its phase differs between recordings, so that it explains nothing of a hold-out"
         for period, share in waves
         if share > SWINGS
+    ]
+
+
+def _twins_outside_library(result: DiagnosisResult) -> list[str]:
+    """Effects that were not searched and would explain the readings about as well as a cause of the answer."""
+    best, fitter = result.posterior.best, result.fitter
+    excluded = {p.effect.name for p in result.library} | {e.name for e in EFFECTS if e.quantizes}
+    present = {p.prefix for p in fitter.data.nominal_effects}
+    further = all_placements(fitter.data.plant, [e for e in EFFECTS if e.name not in excluded])
+    options = options_of([p for p in further if p.prefix not in present], fitter, result.reach)
+    if best.unknown or not options:
+        return []
+    twins = {
+        f"{p.effect.name} at {p.location}": unsearched_twins(fitter, best.fit, p, options, CERTAIN)
+        for p in best.fit.candidate.placements
+    }
+    return [
+        f"{' or '.join(f'{name} at {place}' for name, place in others)}, not in the library, would explain the "
+        f"recording about as well as {cause}; search all effects by --library all"
+        for cause, others in twins.items()
+        if others
     ]
 
 

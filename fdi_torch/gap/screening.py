@@ -127,9 +127,12 @@ def screen_under_each(fitters: Sequence[Fitter], fit: Fit, options: Sequence[Opt
     return [ScreeningResult(tuple(options), score, strength) for score, strength in sums]
 
 
-def products(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> tuple[Tensor, Tensor]:
-    """Score (M,) and gram (M, M) of options in addition to a fit, as in `ScreeningResult` and `Pairs`."""
-    return _ProjectedRegression.of(fitter, fit).products(options)
+def products(fitter: Fitter, fit: Fit, options: Sequence[Option], besides: Sequence[str] = ()) -> tuple[Tensor, Tensor]:
+    """Score (M,) and gram (M, M) of options in addition to a fit, as in `ScreeningResult` and `Pairs`.
+
+    besides: parameters of the fit that are not projected out.
+    """
+    return _ProjectedRegression.of(fitter, fit, besides).products(options)
 
 
 def pairs_of(fitter: Fitter, fit: Fit, screening: ScreeningResult) -> Pairs:
@@ -151,10 +154,12 @@ class _ProjectedRegression:
     basis: Tensor
 
     @staticmethod
-    def of(fitter: Fitter, fit: Fit) -> _ProjectedRegression:
+    def of(fitter: Fitter, fit: Fit, besides: Sequence[str] = ()) -> _ProjectedRegression:
+        """besides: parameters that are not projected out."""
         residual, jacobian = (x[0] for x in fitter.white(fit.linearised))
-        scale, weight, deviation = fitter.priors(fit.space, fit.theta)
-        basis, _ = decomposed((jacobian * scale).flatten(0, 1), weight)
+        kept = [i for i, name in enumerate(fit.space.names) if name not in besides]
+        scale, weight, deviation = (x[kept] for x in fitter.priors(fit.space, fit.theta))
+        basis, _ = decomposed((jacobian[..., kept] * scale).flatten(0, 1), weight)
         remaining = without(basis, torch.cat([residual.flatten(), -deviation]).unsqueeze(1))
         remaining, basis = (x[: residual.numel()].reshape(*residual.shape, -1) for x in (remaining, basis))
         return _ProjectedRegression(fitter, fit, remaining[..., 0], basis)
