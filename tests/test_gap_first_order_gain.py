@@ -14,9 +14,9 @@ from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.diagnose import Settings, recalibrate
 from fdi_torch.gap.localization import single_regressor_gain as promise
-from fdi_torch.gap.localization.breakpoints import Breakpoints, Relays
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
-from fdi_torch.gap.localization.fine_positions import HALVINGS, best_thresholds, pairs_around
+from fdi_torch.gap.localization.fine_positions import HALVINGS, around, best_parameters
+from fdi_torch.gap.localization.regressor_families import Breakpoints, Pulses, Relays
 from fdi_torch.gap.localization.regressors import relay_thresholds
 from fdi_torch.gap.marginal_likelihood import with_estimated_noise
 from fdi_torch.gap.problem import problem_of
@@ -140,11 +140,33 @@ def test_products_of_relays_are_those_of_each_function() -> None:
     torch.testing.assert_close(family.functions_at(family.thresholds), functions)
 
 
-def test_thresholds_are_moved_to_the_largest_gain_and_not_along_a_plateau() -> None:
+def test_products_of_pulses_are_those_of_each_function() -> None:
+    generator = torch.Generator().manual_seed(2)
+    time = 100.0 * torch.rand(60, generator=generator, dtype=torch.float64).sort().values
+    factor, weights = (torch.randn(n, 60, generator=generator, dtype=torch.float64) for n in (1, 3))
+    family = Pulses(time, factor[0], torch.tensor([0.03, 0.11], dtype=torch.float64))
+    functions = torch.stack([family.function(i) for i in range(len(family))])
+    torch.testing.assert_close(family.products(weights), functions @ weights.T)
+    one = family.functions_at(torch.tensor([[0.05, 0.25, 0.5]], dtype=torch.float64))[0]
+    assert one.equal(torch.where((time % 20.0 >= 5.0) & (time % 20.0 < 15.0), factor[0], 0.0))
+    assert family.products(weights).shape == (len(family), 3)
+    assert Pulses(time, factor[0], time[:0]).products(weights).shape == (0, 3)
+
+
+def test_parameters_are_moved_to_the_largest_gain_and_not_along_a_plateau() -> None:
     start, peak = torch.tensor([0.2, 0.5], dtype=torch.float64), torch.tensor([0.51, 0.94], dtype=torch.float64)
-    found = best_thresholds(lambda pairs: -1e5 * (pairs - peak).square().sum(dim=1), start, 0.1)
-    assert found.tolist() == pytest.approx(peak.tolist(), abs=0.1 / 2.0**HALVINGS)
-    assert best_thresholds(lambda pairs: pairs.new_ones(len(pairs)), start, 0.1).equal(start)
-    around = pairs_around(torch.tensor([-0.8, -0.4], dtype=torch.float64), 0.5)
-    expected = [[-1.3, -0.9], [-1.3, -0.4], [-1.3, 0.1], [-0.8, -0.4], [-0.8, 0.1], [-0.3, 0.1]]
-    torch.testing.assert_close(around, around.new_tensor(expected))
+    spacing = torch.tensor([0.1, 0.2], dtype=torch.float64)
+
+    def anything(tried: Tensor) -> Tensor:
+        return tried[:, 0] > -torch.inf
+
+    found = best_parameters(lambda tried: -1e5 * (tried - peak).square().sum(dim=1), start, spacing, anything)
+    assert ((found - peak).abs() <= spacing / 2.0**HALVINGS).all()
+    assert best_parameters(lambda tried: tried.new_ones(len(tried)), start, spacing, anything).equal(start)
+    below = best_parameters(lambda tried: 1e4 * tried[:, 1], start, spacing, lambda tried: tried[:, 1] < 0.95)
+    assert 0.93 < float(below[1]) < 0.95
+    relays = Relays(start, start, relay_thresholds((-1.0, 1.0), 5))
+    assert (
+        relays.possible(around(torch.tensor([-0.8, -0.4], dtype=torch.float64), 0.5 * torch.ones(2).double())).sum()
+        == 6
+    )

@@ -18,11 +18,11 @@ from fdi_torch.estimate.linear_parameters import without
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
-from fdi_torch.gap.localization.breakpoints import Relays
 from fdi_torch.gap.localization.discrepancy_ascent import Ascent
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.fine_positions import Positions
 from fdi_torch.gap.localization.localize import localize
+from fdi_torch.gap.localization.regressor_families import Relays
 from fdi_torch.gap.localization.regressors import (
     backlash,
     decayed,
@@ -349,6 +349,19 @@ def test_a_slow_periodic_draw_is_a_sinusoid_and_no_random_flow(periods: float) -
     found = localize(fitter, fit, noise, ("T1", "P13", "h1")).discrepancies
     assert found[0].location == "T1" and found[0].parameters <= 2
     assert found[0].periods[0] == pytest.approx(len(command) / periods, rel=0.02)
+
+
+def test_a_draw_with_a_timer_is_one_regressor_although_random_flows_explain_each_draw() -> None:
+    """40 s of every 300 s, so that the third harmonic has three fifths of the fundamental's amplitude."""
+    command = random_steps(40e-6, 60e-6, 24, 100, 7)
+    time, generator = torch.arange(len(command), dtype=torch.float64), torch.Generator().manual_seed(8)
+    shocks = torch.randn(len(command), generator=generator, dtype=torch.float64)
+    random_flow = 1e-6 * decayed(math.sqrt(0.1) * shocks, torch.ones_like(time), 20.0)
+    draw = torch.where((time - 55.0) % 300.0 < 40.0, 6e-6, 0.0)
+    fitter, fit, noise = delivering(command, command + random_flow - draw, 7)
+    found = localize(fitter, fit, noise, ("T1", "P13", "h1")).discrepancies
+    assert found[0].location == "T1" and found[0].parameters == 1
+    assert found[0].periods[0] == pytest.approx(300.0, rel=5e-3)
 
 
 def test_constants_stay_within_their_tolerances_beside_an_effect_and_the_error_of_its_law() -> None:

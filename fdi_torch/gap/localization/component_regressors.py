@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.gap.forcing import Forcing
-from fdi_torch.gap.localization.breakpoints import Breakpoints, Curves, Relays
+from fdi_torch.gap.localization.regressor_families import Breakpoints, Curves, Pulses, Relays
 from fdi_torch.gap.localization.regressors import (
     BACKLASH_BANDS,
     FINE_STICTION_BANDS,
@@ -92,7 +92,8 @@ class SignalRanges:
 
 # Local signals (K,), step lengths (K,) s -> regressors (K,) each
 RegressorFunction = Callable[[Signals, Tensor, SignalRanges], list[Tensor]]
-FineRegressors = list[Breakpoints | Relays | Curves]
+FineRegressor = Breakpoints | Relays | Curves | Pulses
+FineRegressors = list[FineRegressor]
 FineFunction = Callable[[Signals, Tensor, SignalRanges], FineRegressors]
 
 

@@ -29,14 +29,15 @@ class Columns:
 class Position:
     """A regressor that lies between two of the grid.
 
-    family, index: which of `Regressors.fine`, or of the steps in time that follow them, and its number there. choices:
-    number of regressors among which it was selected. thresholds: lower and upper one of a relay that was moved.
+    family, index: which of `DiscrepancyRegression.families`, and its number there. choices: number of regressors among
+    which it was selected. parameters: of a relay or pulse that was moved. frequency: of a pulse, Hz.
     """
 
     family: int
     index: int
     choices: int
-    thresholds: tuple[float, float] | None = None
+    parameters: tuple[float, ...] | None = None
+    frequency: float | None = None
 
 
 @dataclass(frozen=True)

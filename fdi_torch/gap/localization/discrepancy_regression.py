@@ -16,9 +16,9 @@ from torch import Tensor
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.forcing import Forcing
-from fdi_torch.gap.localization.breakpoints import Breakpoints, Relays
 from fdi_torch.gap.localization.component_regressors import (
     DiscrepancyModel,
+    FineRegressor,
     FineRegressors,
     SignalRanges,
     Signals,
@@ -27,6 +27,7 @@ from fdi_torch.gap.localization.component_regressors import (
     reading_regressors,
 )
 from fdi_torch.gap.localization.discrepancy_columns import Columns, Discrepancy, Position
+from fdi_torch.gap.localization.regressor_families import Breakpoints, Pulses, Relays
 from fdi_torch.gap.localization.regressors import harmonics, step_functions, time_functions
 from fdi_torch.gap.marginal_likelihood import predicted_levels
 from fdi_torch.plant.description import OUTSIDE, Sensor
@@ -46,8 +47,8 @@ class Regressors:
     """Regressors of one component along one recording of K steps; of a sensor, along its K samples.
 
     functions (M, K): of local variables, in m^3/s, or in the sensor's unit. fine: kinks, jumps and relays on finer
-    grids. in_time (T, K): functions of the time (K,) times `factor` (K,). areas (A, K): of a tank, changes of its
-    level rate, m/s; otherwise None.
+    grids. in_time (T, K): functions of the time (K,) times `factor` (K,). frequencies (F,): of sinusoids and pulses,
+    Hz. areas (A, K): of a tank, changes of its level rate, m/s; otherwise None.
     """
 
     functions: Tensor
@@ -55,23 +56,30 @@ class Regressors:
     in_time: Tensor
     time: Tensor
     factor: Tensor
+    frequencies: Tensor
     areas: Tensor | None = None
 
     @property
-    def steps_in_time(self) -> Breakpoints:
-        """Steps at all times."""
-        return Breakpoints(self.time, self.factor, self.time, jump=True)
+    def fine_in_time(self) -> FineRegressors:
+        """Steps at all times, and pulses."""
+        steps = Breakpoints(self.time, self.factor, self.time, jump=True)
+        return [steps, Pulses(self.time, self.factor, self.frequencies)]
+
+    def family(self, position: Position, recording: int) -> FineRegressor | None:
+        """The family of a position along this recording; None for functions of the time of another one."""
+        if position.family < len(self.fine):
+            return self.fine[position.family]
+        of_recording, kind = divmod(position.family - len(self.fine), len(self.fine_in_time))
+        return self.fine_in_time[kind] if of_recording == recording else None
 
     def at(self, position: Position, recording: int) -> Tensor:
         """The regressor (K,) at a position, along this recording."""
-        if position.family < len(self.fine):
-            family = self.fine[position.family]
-            if position.thresholds and isinstance(family, Relays):
-                return family.functions_at(self.time.new_tensor([position.thresholds]))[0]
-            return family.function(position.index)
-        if position.family == len(self.fine) + recording:
-            return self.steps_in_time.function(position.index)
-        return torch.zeros_like(self.factor)  # a step in time of another recording
+        family = self.family(position, recording)
+        if family is None:
+            return torch.zeros_like(self.factor)
+        if position.parameters and isinstance(family, Relays | Pulses):
+            return family.functions_at(self.time.new_tensor([position.parameters]))[0]
+        return family.function(position.index)
 
     def sinusoids(self, frequency: Tensor) -> Tensor:
         """Harmonics of each frequency (F,), Hz, times the factor: (F, W, K)."""
@@ -177,6 +185,11 @@ class DiscrepancyRegression:
                 self._last = place, *self._of_sensor(plant.sensors[channel])
         return self._last[1:]
 
+    def families(self, place: str) -> FineRegressors:
+        """The families of finer regressors at a place: of local variables, and of the time of each recording."""
+        regressors = self.at(place)[0]
+        return [*regressors[0].fine, *(family for r in regressors for family in r.fine_in_time)]
+
     def sensor(self, place: str) -> int | None:
         """The channel of a sensor; None if the place is no sensor."""
         names = [s.name for s in self.fitter.data.plant.sensors]
@@ -225,7 +238,7 @@ class DiscrepancyRegression:
             functions, fine = torch.stack(component.flows(s, step, ends)), component.fine(s, step, ends)
             areas = torch.stack(component.areas(s, step, ends)) if component.areas else None
             in_time = factor * self._functions_of_time(piece, piece.middle)
-            regressors.append(Regressors(functions, fine, in_time, piece.middle, factor, areas))
+            regressors.append(Regressors(functions, fine, in_time, piece.middle, factor, self.frequencies, areas))
         return regressors
 
     def _of_sensor(self, sensor: Sensor) -> tuple[list[Regressors], Linearised]:
@@ -244,8 +257,8 @@ class DiscrepancyRegression:
         for piece, s in zip(self.pieces, signals, strict=True):
             functions = reading_regressors(s, piece.engine.experiment.sample_intervals, ends, scale)
             fine, in_time = fine_reading_regressors(s, ends), self._functions_of_time(piece, s["time"])
-            one = torch.ones_like(s["time"])
-            regressors.append(Regressors(torch.stack(functions), fine, in_time, s["time"], one))
+            one, columns = torch.ones_like(s["time"]), torch.stack(functions)
+            regressors.append(Regressors(columns, fine, in_time, s["time"], one, self.frequencies))
         return regressors, self.engine.linearise(self.theta, levels)
 
     def _rate_changes(self, piece: RecordingLinearisation, component: DiscrepancyModel, flows: Tensor) -> Tensor:

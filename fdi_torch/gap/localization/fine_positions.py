@@ -21,13 +21,14 @@ from torch import Tensor
 
 from fdi_torch.estimate.linear_parameters import without
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.localization.breakpoints import Relays
 from fdi_torch.gap.localization.discrepancy_columns import Discrepancy, Position
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
+from fdi_torch.gap.localization.regressor_families import Pulses, Relays
 from fdi_torch.gap.localization.regressors import HARMONICS
 from fdi_torch.gap.localization.single_regressor_gain import (
     SIGNS,
     adjoints_of,
+    choices_of,
     gains_of,
     inflow_weights,
     largest_influence,
@@ -74,13 +75,13 @@ class Positions:
         return [strengths_of(p) for p in position_products(self.regression, self.place, self._signs)]
 
     @cached_property
-    def _choices(self) -> int:
-        return sum(map(len, self._strengths))
+    def _choices(self) -> list[int]:
+        return choices_of(self.regression, self.place)
 
     @cached_property
-    def _cost(self) -> float:
-        """Cost of one more regressor, nats."""
-        return float(column_costs(torch.tensor([float(self._choices)]), largest_influence(self.under)))
+    def _costs(self) -> list[float]:
+        """Cost of one more regressor of each family, nats."""
+        return column_costs(torch.tensor(self._choices, dtype=torch.float64), largest_influence(self.under)).tolist()
 
     def best(self, discrepancy: Discrepancy, used: Tensor) -> Discrepancy | None:
         """The discrepancy with the regressor that explains most in addition to those used, or None if none is worth
@@ -88,40 +89,48 @@ class Positions:
         basis = parameter_basis(self.under, self.fit, discrepancy.linearised, discrepancy.columns[used])
         products = position_products(self.regression, self.place, self._weights(self._residual, basis))
         gains = [gains_of(p[:, 0], strength) for p, strength in zip(products, self._strengths, strict=True)]
-        highest = [(float(g[i]), family, i) for family, g in enumerate(gains) for i in _local_maxima(g)]
+        highest = [
+            (float(g[i]) - cost, family, i)
+            for family, (g, cost) in enumerate(zip(gains, self._costs, strict=True))
+            if len(g)
+            for i in _local_maxima(g)
+        ]
         tried = sorted(highest, reverse=True)[:TRIED]
-        if not tried or tried[0][0] < self._cost:
+        if not tried or tried[0][0] < 0.0:
             return None
-        positions = [Position(family, index, self._choices) for _, family, index in tried]
+        positions = [Position(family, index, self._choices[family]) for _, family, index in tried]
         columns = torch.stack([self.regression.column(self.place, p) for p in positions], dim=-1)
-        best = int(self._exact_gains(columns, basis).argmax())
-        if self._relays(positions[best].family):
-            return self._with_best_thresholds(discrepancy, basis, positions[best])
+        costs = torch.tensor([self._costs[p.family] for p in positions], dtype=columns.dtype)
+        best = int((self._exact_gains(columns, basis) - costs).argmax())
+        family = self.regression.families(self.place)[positions[best].family]
+        if isinstance(family, Relays | Pulses):
+            return self._moved(discrepancy, basis, positions[best], family)
         return discrepancy.with_column(columns[..., best], positions[best])
 
-    def _with_best_thresholds(self, discrepancy: Discrepancy, basis: Tensor, position: Position) -> Discrepancy:
-        """The discrepancy with a relay, its thresholds moved to where it explains most."""
-        relays = self._relays(position.family)
-        first = relays[0].thresholds
-        spacing = float(first[0, 1] - first[0, 0])
+    def _moved(
+        self, discrepancy: Discrepancy, basis: Tensor, position: Position, family: Relays | Pulses
+    ) -> Discrepancy:
+        """The discrepancy with a relay or pulse whose parameters are moved to where it explains most."""
+        each = list(enumerate(self.regression.at(self.place)[0]))
 
-        def columns(thresholds: Tensor) -> Tensor:
-            functions = [r.functions_at(thresholds) for r in relays]
-            influences = [self.regression.influence(self.place, k, f) for k, f in enumerate(functions)]
-            return with_blanks(influences, dim=0)
+        def at(parameters: Tensor) -> list[Position]:
+            return [replace(position, parameters=tuple(p)) for p in parameters.tolist()]
 
-        def gains(thresholds: Tensor) -> Tensor:
-            return self._exact_gains(columns(thresholds), basis)
+        def columns(parameters: Tensor) -> Tensor:
+            functions = [torch.stack([r.at(p, k) for p in at(parameters)]) for k, r in each]
+            return with_blanks([self.regression.influence(self.place, k, f) for k, f in enumerate(functions)], dim=0)
 
-        best = best_thresholds(gains, first[position.index], spacing)
-        low, high = best.tolist()
-        moved = replace(position, choices=self._choices + len(first) * 4**HALVINGS, thresholds=(low, high))
+        start = family.parameters(position.index)
+        best = best_parameters(
+            lambda tried: self._exact_gains(columns(tried), basis), start, family.spacing, family.possible
+        )
+        (moved,) = at(best.unsqueeze(0))
+        moved = replace(
+            moved,
+            choices=position.choices * 2 ** (HALVINGS * len(best)),
+            frequency=float(best[0]) if isinstance(family, Pulses) else None,
+        )
         return discrepancy.with_column(columns(best.unsqueeze(0))[..., 0], moved)
-
-    def _relays(self, family: int) -> list[Relays]:
-        """The relays of a family along each recording; none if it is no family of relays."""
-        each = [r.fine[family] for r in self.regression.at(self.place)[0] if family < len(r.fine)]
-        return [r for r in each if isinstance(r, Relays)]
 
     def _exact_gains(self, columns: Tensor, basis: Tensor) -> Tensor:
         """Gains (M,) of influences (S, C, M) in addition to those in the basis."""
@@ -184,15 +193,19 @@ def _reductions(score: Tensor, gram: Tensor) -> Tensor:
     return (score * torch.linalg.solve(gram, score)).sum(dim=(1, 2))
 
 
-def best_thresholds(gains: Callable[[Tensor], Tensor], start: Tensor, spacing: float) -> Tensor:
-    """The pair of thresholds (2,) with the largest gain near a first one, by pattern search (Hooke and Jeeves, 1961).
+def best_parameters(
+    gains: Callable[[Tensor], Tensor], start: Tensor, spacing: Tensor, possible: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """The parameters (P,) with the largest gain near the first ones, by pattern search (Hooke and Jeeves, 1961).
 
-    gains: of pairs (M, 2), nats. spacing: of the first moves; it is halved HALVINGS times.
+    gains: of parameters (M, P), nats. spacing (P,): of the first moves; it is halved HALVINGS times. possible: whether
+    parameters (M, P) may be tried, (M,) bool.
     """
     best, largest = start, float(gains(start.unsqueeze(0)))
     for halving in range(HALVINGS + 1):
         while True:
-            tried = pairs_around(best, spacing / 2.0**halving)
+            tried = around(best, spacing / 2.0**halving)
+            tried = tried[possible(tried)]
             gained = gains(tried)
             k = int(gained.argmax())
             if not float(gained[k]) > largest + CONVERGED:
@@ -201,11 +214,9 @@ def best_thresholds(gains: Callable[[Tensor], Tensor], start: Tensor, spacing: f
     return best
 
 
-def pairs_around(thresholds: Tensor, spacing: float) -> Tensor:
-    """Pairs (M, 2) of thresholds that differ from one pair (2,) by a spacing at most, the lower one first."""
-    moves = torch.tensor([-spacing, 0.0, spacing], dtype=thresholds.dtype)
-    pairs = thresholds + torch.cartesian_prod(moves, moves)
-    return pairs[pairs[:, 0] < pairs[:, 1]]
+def around(parameters: Tensor, spacing: Tensor) -> Tensor:
+    """Parameters (M, P) each of which differs from the first ones (P,) by its spacing at most."""
+    return parameters + torch.cartesian_prod(*(s * s.new_tensor([-1.0, 0.0, 1.0]) for s in spacing))
 
 
 def _local_maxima(gains: Tensor) -> list[int]:

@@ -78,8 +78,11 @@ class LocalizedDiscrepancy:
 
     @property
     def periods(self) -> tuple[float, ...]:
-        """Periods of the sinusoids, s."""
-        frequencies = self.selection.frequencies if self.selection else ()
+        """Periods of the sinusoids and pulses, s."""
+        if self.selection is None:
+            return ()
+        of_pulses = (p.frequency for p in self.selection.positions if p.frequency is not None)
+        frequencies = dict.fromkeys((*self.selection.frequencies, *of_pulses))
         return tuple(1.0 / (k * frequency) for frequency in frequencies for k in range(1, HARMONICS + 1))
 
 

@@ -2,7 +2,7 @@
 
 - Functions of a local variable: hinges (piecewise linear) and steps.
 - Functions with memory: lags, delays, backlash, stiction, rate limits, relays, decays after a change.
-- Functions of time: steps, ramps, and sinusoids.
+- Functions of time: steps, ramps, sinusoids, and periodic pulses (`regressor_families.py`).
 
 None looks ahead: a predicted level depends on all earlier readings, and their noise would explain itself.
 
@@ -202,10 +202,14 @@ SURROUNDINGS = 15  # frequencies of the recording to each side, for the median
 
 
 def likely_frequencies(white: Tensor, spacing: float, duration: float) -> list[float]:
-    """Frequencies (Hz) of sinusoids that a whitened residual (S, C) may contain: of its dominant line, and slower ones,
-    which random flows hide in its spectrum. spacing: of the samples, s. duration: of the longest recording, s."""
+    """Frequencies (Hz) of sinusoids and pulses that a whitened residual (S, C) may contain: of its dominant line, which
+    may be a harmonic, and slower ones, which random flows hide in its spectrum.
+
+    spacing: of the samples, s. duration: of the longest recording, s.
+    """
     dominant = dominant_frequency(white, spacing)
-    return [*([] if dominant is None else [dominant]), *(cycles / duration for cycles in SLOW_CYCLES)]
+    lines = [] if dominant is None else [dominant / harmonic for harmonic in range(1, HARMONICS + 1)]
+    return [*lines, *(cycles / duration for cycles in SLOW_CYCLES)]
 
 
 def dominant_frequency(white: Tensor, spacing: float) -> float | None:

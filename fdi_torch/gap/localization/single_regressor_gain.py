@@ -24,6 +24,7 @@ from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.component_regressors import discrepancy_model_at
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
+from fdi_torch.gap.localization.regressor_families import Pulses
 from fdi_torch.gap.localization.sparse_regression import column_costs
 from fdi_torch.plant.description import OUTSIDE
 from fdi_torch.simulate.linearised import Linearised
@@ -69,8 +70,10 @@ class SingleRegressorGains:
     def at(self, place: str) -> SingleRegressorGain:
         channel = self.regression.sensor(place)
         weights = self._inflow_weights(place) if channel is None else self._reading_weights(place, channel)
-        groups = self._products(place, weights), torch.cat(position_products(self.regression, place, weights))
-        return max((_largest_gain(group, self._largest) for group in groups), key=lambda g: g.net)
+        grid, families = self._products(place, weights), position_products(self.regression, place, weights)
+        groups = [(grid, len(grid)), *zip(families, choices_of(self.regression, place), strict=True)]
+        gains = (_largest_gain(group, choices, self._largest) for group, choices in groups if len(group))
+        return max(gains, key=lambda g: g.net)
 
     def _inflow_weights(self, place: str) -> list[Tensor]:
         return inflow_weights(self.regression, place, self._adjoints)
@@ -97,19 +100,29 @@ class SingleRegressorGains:
         return torch.cat([torch.stack(shared).sum(dim=0), *per_recording])
 
 
-def _largest_gain(products: Tensor, largest: float) -> SingleRegressorGain:
-    """Largest gain among regressors. products (M, 1 + SIGNS): with the residual and random signs."""
-    (cost,) = column_costs(torch.tensor([float(len(products))]), largest).tolist()
+def _largest_gain(products: Tensor, choices: int, largest: float) -> SingleRegressorGain:
+    """Largest gain among regressors. products (M, 1 + SIGNS): with the residual and random signs. choices: number of
+    regressors among which one is selected."""
+    (cost,) = column_costs(torch.tensor([float(choices)]), largest).tolist()
     return SingleRegressorGain(float(gains_of(products[:, 0], strengths_of(products[:, 1:])).max()), cost)
 
 
 def position_products(regression: DiscrepancyRegression, place: str, weights: Sequence[Tensor]) -> list[Tensor]:
-    """Products of the regressors at all positions with weights (W, K) per recording: kinks and jumps by their families,
-    (N, W) each, and the steps in time of each recording, (K, W)."""
+    """Products (N, W) of the regressors at all positions with weights (W, K) per recording, by `families`."""
     pairs = list(zip(regression.at(place)[0], weights, strict=True))
     fine = [[b.products(w) for b in r.fine] for r, w in pairs]
-    families = [torch.stack(of_family).sum(dim=0) for of_family in zip(*fine, strict=True)]
-    return [*families, *(r.steps_in_time.products(w) for r, w in pairs)]
+    shared = [torch.stack(of_family).sum(dim=0) for of_family in zip(*fine, strict=True)]
+    return [*shared, *(b.products(w) for r, w in pairs for b in r.fine_in_time)]
+
+
+def choices_of(regression: DiscrepancyRegression, place: str) -> list[int]:
+    """Number of regressors among which one of each of the `families` is selected.
+
+    A pulse is as likely as all other regressors together, of which there are far fewer.
+    """
+    families = regression.families(place)
+    total = {pulses: sum(len(f) for f in families if isinstance(f, Pulses) is pulses) for pulses in (True, False)}
+    return [len(total) * total[isinstance(f, Pulses)] for f in families]
 
 
 def largest_influence(fitter: Fitter) -> float:
