@@ -21,9 +21,8 @@ from fdi_torch.blind.inputs import (
     pumps_of_channels,
     with_standstills,
 )
-from fdi_torch.blind.plants import Rig
+from fdi_torch.blind.plants import BENCH, Rig, Scales, on_bench
 from fdi_torch.blind.random_flows import Disturbance
-from fdi_torch.blind.scaling import BENCH, Scales, on_bench
 from fdi_torch.blind.sensor_noise import WHITE, NoiseCorrelation, draw_correlation
 from fdi_torch.blind.simulator import Drive, HiddenRigs, SimulatedRun, simulate
 from fdi_torch.parameters import ParameterName

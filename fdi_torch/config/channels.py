@@ -12,8 +12,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text, si_unit_of
 from fdi_torch.recordings.csv_files import first_row, read_header
 from fdi_torch.recordings.csv_tags import tag_columns
-from fdi_torch.recordings.csv_text import HeaderlessError
-from fdi_torch.recordings.header import header_unit, names_in
+from fdi_torch.recordings.csv_text import HeaderlessError, header_unit, names_in
 from fdi_torch.recordings.source import ChannelSource, ClockSource
 
 

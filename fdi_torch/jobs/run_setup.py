@@ -15,8 +15,8 @@ from fdi_torch.config.simulation import noise_std, planned_recording
 from fdi_torch.device import usable_device
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.fitting import Fitting, set_up, start_levels
-from fdi_torch.estimate.hybrid_settings import HybridSettings
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings
+from fdi_torch.estimate.refinement import HybridSettings
 from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.operating_range import bounded_by_recording

@@ -20,11 +20,11 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import Header, Metadata, Schema
 
 from fdi_torch.logbook import scan
-from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.payload import decode
 from fdi_torch.logbook.schemas import conforming
 from fdi_torch.logbook.sink import EPOCH_NS
+from fdi_torch.logbook.topic_definitions import Channel
 from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_UNPACKED
 
 # Outside chunks these records have no CRC. Logs of this program have none there; one found there is a damaged record.

@@ -12,8 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import orjson
 
-from fdi_torch.logbook.compare import AXES
-from fdi_torch.logbook.fingerprint import canonical
+from fdi_torch.logbook.compare import AXES, canonical
 from fdi_torch.logbook.payload import NON_FINITE, WALL, unpack
 from fdi_torch.logbook.provenance import environment
 from fdi_torch.logbook.reader import Message, Run, read_run

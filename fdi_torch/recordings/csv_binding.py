@@ -14,8 +14,7 @@ from pathlib import Path
 from fdi_torch.names import nearest, shortened
 from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_cells import BAD, GOOD_WORDS, Columns, Rule
-from fdi_torch.recordings.csv_text import Heading
-from fdi_torch.recordings.header import header_unit
+from fdi_torch.recordings.csv_text import Heading, header_unit
 from fdi_torch.recordings.source import ChannelSource, ClockSource
 from fdi_torch.recordings.time_stamps import StampReader
 from fdi_torch.units import spelled

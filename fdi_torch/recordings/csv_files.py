@@ -23,8 +23,7 @@ from fdi_torch.recording import Hold, Recording
 from fdi_torch.recordings.csv_binding import Bound, bind, bind_clock, columns_of, unit_notes
 from fdi_torch.recordings.csv_cells import Columns, parse_carefully, parse_fast
 from fdi_torch.recordings.csv_tags import read_tags
-from fdi_torch.recordings.csv_text import heading_of, open_csv
-from fdi_torch.recordings.header import names_in
+from fdi_torch.recordings.csv_text import heading_of, names_in, open_csv
 from fdi_torch.recordings.sheets import Sheet, in_order, informative_rows, merge_sheets
 from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource, file_sha256
 from fdi_torch.recordings.time_stamps import StampReader, from_zone, offset_of_zone

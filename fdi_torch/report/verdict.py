@@ -16,7 +16,7 @@ from fdi_torch.names import counted, listed
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number, sentence
-from fdi_torch.report.sections.rehearsal import rehearsal_tables
+from fdi_torch.report.sections.monitor import rehearsal_tables
 from fdi_torch.report.sections.study import ESTIMATORS
 from fdi_torch.report.sections.windows import logged_windows
 

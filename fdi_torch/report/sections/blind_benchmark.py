@@ -12,8 +12,7 @@ from matplotlib.patches import Rectangle
 
 from fdi_torch.blind.kind_meanings import KIND_MEANINGS
 from fdi_torch.blind.score import Row
-from fdi_torch.blind.score_tables import OWN, Sheet, misses, sheets
-from fdi_torch.blind.scored_rows import Scores, group_of, tables
+from fdi_torch.blind.scored_rows import OWN, Scores, Sheet, group_of, misses, sheets, tables
 from fdi_torch.report.html import Markup, folded, join, short, table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.section import Picture, Section

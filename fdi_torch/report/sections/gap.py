@@ -19,8 +19,7 @@ from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, number, percent, probability_text, shown_unit, with_error
 from fdi_torch.report.panels import BAR_NAME, bar_panel
-from fdi_torch.report.random_flows import flows_that_matter
-from fdi_torch.report.reference_models import has_causes
+from fdi_torch.report.reference_models import flows_that_matter, has_causes
 from fdi_torch.report.section import Picture, Section
 
 MOST_BARS = 10
