@@ -122,9 +122,7 @@ def answer_all(
     code: str,
     tell: Tell,
 ) -> None:
-    """Diagnose the cases without an answer, and append one JSON line each, until the time `stop`. The
-    key stays sealed.
-    """
+    """Diagnose the cases without an answer, one JSON line each, until the time `stop`. The key stays sealed."""
     lines = list(manifest(out).values())[:cases]
     answered = {(name, line["case"]) for name in diagnoses for line in lines_of(answers(out, name))}
     todo = [(name, line) for line in lines for name in diagnoses if (name, line["case"]) not in answered]

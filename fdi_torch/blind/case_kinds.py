@@ -88,9 +88,7 @@ STANDARD = tuple(name for name in KINDS if name not in _EXTRA)
 
 @dataclass(frozen=True)
 class Chosen:
-    """The causes of a case: the first `full` have full size, the others are faint. `unknown`: a law outside the
-    library.
-    """
+    """The causes of a case: the first `full` have full size, others are faint. `unknown`: a law outside the library."""
 
     causes: tuple[Cause, ...] = ()
     full: int = 0

@@ -120,9 +120,7 @@ def _case(draft: CaseDraft, runs: Sequence[SimulatedRun]) -> Case:
 
 
 def _truth(draft: CaseDraft, invisible: Collection[int]) -> dict[str, Any]:
-    """The key of a case. invisible: full causes masked by the others, such as a weir above a level that
-    a leak lowers.
-    """
+    """The key of a case. invisible: full causes masked by others, such as a weir above a level that a leak lowers."""
     full = [draft.deviations[k] for k in draft.full if k not in invisible]
     return {
         "case": draft.plan.name,

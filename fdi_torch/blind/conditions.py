@@ -75,9 +75,7 @@ class Conditions:
 
 
 def as_built(plant: PlantDescription, rng: np.random.Generator) -> PlantDescription:
-    """The rig as built, with constants drawn within their tolerances: x (1 + s z), or x + s z for an offset, with z
-    standard normal and clipped.
-    """
+    """The rig as built: constants x (1 + s z), offsets x + s z, with tolerance s and z standard normal, clipped."""
     drawn: dict[str, dict[str, Any]] = {}
     for constant, tolerance in plant.tolerances.items():
         name = ParameterName.parse(constant)

@@ -35,9 +35,7 @@ def conductance(plant: PlantDescription) -> Array:
 
 @dataclass
 class Group:
-    """The places where one law is at work. spot, other (n,): index of the component and of the tank at the other end
-    among those of all rigs.
-    """
+    """The places of one law. spot, other (n,): index of the component, and of the tank at its other end."""
 
     law: Callable[..., Any]
     spot: Index

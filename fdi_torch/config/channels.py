@@ -17,9 +17,7 @@ from fdi_torch.recordings.source import ChannelSource, ClockSource
 
 
 def channel_mapping(config: FileConfig, plant: PlantDescription) -> dict[str, ChannelSource]:
-    """The source of each channel that the configuration mentions; time is `t`. Raises ValueError for unknown channels
-    and keys.
-    """
+    """The source of each channel mentioned; time is `t`. Raises ValueError for unknown channels and keys."""
     units = _units(plant)
     mapping: dict[str, ChannelSource] = {}
     for name, column in config.columns.items():

@@ -187,9 +187,7 @@ def _set(node: Any, keys: Sequence[str], value: Any, override: str) -> None:
 
 
 def find_file(name: str, base: Path, also: Sequence[Path] = ()) -> Path:
-    """A file named in a configuration: as given, relative to the configuration's folder, the current folder, or
-    `also`.
-    """
+    """A file named in a configuration: as given, relative to its folder, the current folder, or `also`."""
     folders = [base, Path.cwd(), *also]
     for folder in folders:
         if (folder / name).is_file():

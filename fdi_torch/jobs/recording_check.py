@@ -15,9 +15,7 @@ from fdi_torch.recordings.check import RecordingCheck, check_recording
 
 
 def checked(config: RecordingConfig, plant: PlantDescription, base: Path) -> tuple[Recording, RecordingCheck]:
-    """A recording and its check: readings beyond the tanks first, as they make the rest meaningless, then refused or
-    masked channels.
-    """
+    """A recording and its check: readings beyond the tanks, which make the rest meaningless, come first."""
     whole = read_recording(config, plant, base)
     check = check_recording(whole, plant)
     examinations = [examined(plant, part) for part in whole.known_segments()]

@@ -18,9 +18,7 @@ from fdi_torch.monitor.monte_carlo.tasks import ResultTable
 
 @dataclass(frozen=True)
 class RehearsalResult:
-    """tables: one per plan. tasks: number of all tasks; computed: those of this run, which took
-    `seconds` s. log: path.
-    """
+    """tables: one per plan. tasks: all; computed: those of this run, in `seconds` s. log: path."""
 
     tables: tuple[ResultTable, ...]
     tasks: int

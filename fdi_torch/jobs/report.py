@@ -107,9 +107,7 @@ def page_path(logs: list[Path], out: str | None) -> Path:
 
 
 def plant_of(log: Run, notes: list[str]) -> PlantDescription | None:
-    """The logged plant. None, with a note, if it cannot be read, and None for a blind benchmark, which
-    has many rigs.
-    """
+    """The logged plant; None if it cannot be read, with a note, and for a blind benchmark, which has many rigs."""
     if log.about("run").get("kind") == "challenge":
         return None
     try:

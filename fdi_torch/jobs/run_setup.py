@@ -54,9 +54,7 @@ def _usable_readings(run: Run, recording: Recording) -> Recording:
 
 
 def simulate_recording(run: Run) -> Recording:
-    """Simulate the recording described by `simulate:` of a run file, with faults and noise.
-    Deterministic for a seed.
-    """
+    """Simulate what `simulate:` of a run file describes, with faults and noise. Deterministic for a seed."""
     config = run.config.simulate
     if config is None:
         raise ValueError(f"{run.source}: expected simulate, got none; fdi new run writes a file that shows its keys")

@@ -28,9 +28,7 @@ _ENVELOPE = ("t", "trial", "group", "seed", "status")
 
 @dataclass(frozen=True, repr=False)
 class StudyResult(Shown):
-    """summaries: one per setting. isolation: if faults are drawn by mode. computed, seconds: trials of this run and
-    their computing time.
-    """
+    """summaries: one per setting. isolation: of drawn modes. computed, seconds: trials of this run, and their time."""
 
     summaries: tuple[Summary, ...]
     isolation: Isolation | None

@@ -184,9 +184,7 @@ class SearchLogger:
 
 
 def state_is_due(generation: int) -> bool:
-    """Whether the complete search state is logged: a resumed run repeats at most 32 generations, or an
-    eighth of all.
-    """
+    """Whether the complete search state is logged: a resumed run repeats at most 32 generations, or an eighth."""
     return generation % (1 << max(5, generation.bit_length() - 4)) == 0
 
 

@@ -53,9 +53,7 @@ class Health:
 
 @dataclass(frozen=True)
 class Inspection:
-    """about: metadata records of this program by short name ("run", "config", "status", "result" ...); {} for other
-    logs.
-    """
+    """about: this program's metadata by short name ("run", "config", "status", "result" ...); {} for other logs."""
 
     path: Path
     size: int

@@ -238,9 +238,7 @@ def open_part(
     max_chunk_bytes: int = scan.MAX_CHUNK_BYTES,
     require_crc: bool = False,
 ) -> list[Message]:
-    """All messages of a chunk, or of a record outside chunks. Raises ChunkError; a chunk is read completely or not at
-    all.
-    """
+    """All messages of a chunk, read completely or not at all, or of a record outside chunks. Raises ChunkError."""
     if part.opcode == Opcode.CHUNK:
         body = scan.chunk_body(data, part, max_chunk_bytes, require_crc)
     else:

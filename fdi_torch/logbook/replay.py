@@ -26,9 +26,7 @@ ABSOLUTE, RELATIVE = 1e-12, 1e-9
 
 @dataclass(frozen=True)
 class Difference:
-    """The first differing field of an event: its number among those compared (from 1), its place, both values
-    as text.
-    """
+    """The first differing field of an event: its number among those compared (from 1), its place, both values."""
 
     event: int
     topic: str

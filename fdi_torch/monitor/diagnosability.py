@@ -136,9 +136,7 @@ def without_gain_and_offset(slopes: Tensor, readings: Tensor) -> Tensor:
 
 
 def without_constants(scaled: Tensor, faults: int, std: Tensor) -> Tensor:
-    """Signatures (K, F) of the faults in noise standard deviations, without the part that uncertain
-    constants explain.
-    """
+    """Signatures (K, F) of faults, in noise standard deviations, less the part that uncertain constants explain."""
     flat = scaled.flatten(0, 1)
     signatures, constants = flat[:, :faults], flat[:, faults:]
     if not constants.shape[1]:

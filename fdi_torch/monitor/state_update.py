@@ -197,9 +197,7 @@ class ResidualTest:
 
 
 def residuals_to_test(state: MonitorState, count: int, reach: int) -> Tensor:
-    """The last white residuals (count, sensors) for the detector. reach: samples over which those beside known faults
-    are normalized.
-    """
+    """The last white residuals (count, sensors); those beside known faults are normalized over `reach` samples."""
     return normalized(state.tested, count, reach) if bool(state.off_nominal.any()) else state.tested[-count:]
 
 

@@ -73,9 +73,7 @@ def _words(name: str) -> list[str]:
 
 
 def bind(path: Path, header: Sequence[str], name: str, source: ChannelSource | None, want: str | None = None) -> Bound:
-    """The binding of one channel; want: the SI unit that it must have. Raises ValueError for a missing column or a
-    wrong unit.
-    """
+    """The binding of one channel; want: its SI unit. Raises ValueError for a missing column or a wrong unit."""
     source = source or ChannelSource()
     if source.constant is not None:
         unit = source.unit or "1"
@@ -103,9 +101,7 @@ def unit_notes(bounds: Sequence[Bound]) -> list[str]:
 
 
 def column_of(path: Path, header: Sequence[str], column: str) -> str:
-    """The header `column` of a column that is no channel. Raises ValueError, with the nearest header, if there
-    is none.
-    """
+    """The header `column` of a column that is no channel. Raises ValueError, with the nearest, if there is none."""
     if column in header:
         return column
     raise ValueError(f"{path}: expected a column '{column}', got {', '.join(header)}{nearest(column, header)}")

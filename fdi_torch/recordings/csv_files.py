@@ -107,9 +107,7 @@ def read_csv_files(
 
 
 def _assign_to_files(files: Sequence[FileSource], names: Sequence[str]) -> list[list[str]]:
-    """The channels to take from each file; channels that no file has are assigned to the first, whose reader reports
-    them.
-    """
+    """The channels to take from each file; those that none has are for the first, whose reader reports them."""
     names_by_file: list[list[str]] = [[] for _ in files]
     headers = [names_in(read_header(file.path, file.header, file.sheet)) if len(files) > 1 else set() for file in files]
     for name in names:
@@ -210,9 +208,7 @@ def first_row(path: Path) -> list[str]:
 
 
 def _read_table(lines: Iterator[str], columns: Columns) -> tuple[np.ndarray, list[str]]:
-    """The columns as (rows, columns) float64, with non-finite cells where there is no number; and notes on omitted
-    lines.
-    """
+    """The columns (rows, columns) float64, non-finite where there is no number, and notes on omitted lines."""
     blocks, above, notes = [], columns.heading.lines, []
     for block in _blocks(columns.path, lines):
         if cut := cut_off(block[-1], columns):

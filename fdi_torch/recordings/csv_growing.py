@@ -86,9 +86,7 @@ class GrowingCsv:
         return seconds, self._filled_inputs(seconds, inputs), outputs, troubles
 
     def _filled_inputs(self, seconds: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-        """Inputs (R, M) with empty cells filled by the last logged value while it is held, also from before
-        these rows.
-        """
+        """Inputs (R, M) with empty cells filled by the last logged value while it is held, also from earlier rows."""
         rows = np.concatenate([self._logged, np.column_stack([seconds, inputs])])
         before = len(self._logged)
         if self._held and len(rows):

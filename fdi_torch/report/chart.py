@@ -64,9 +64,7 @@ ONE_ROW = 44  # letters of title and names of lines that fit one row above the p
 
 
 class Line(NamedTuple):
-    """A signal: y (T,) over x (T,). steps: the value holds until the next sample. wide: broad and pale,
-    so that it is visible below other lines.
-    """
+    """y (T,) over x (T,). steps: a value holds until the next sample. wide: broad and pale, for lines below others."""
 
     name: str
     x: np.ndarray

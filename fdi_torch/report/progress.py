@@ -53,9 +53,7 @@ def _share(done: Any, total: str) -> float | None:
 
 @dataclass(frozen=True)
 class SensorResidual:
-    """Root mean square of a sensor's residuals over all recordings but hold-outs, its SI unit, and the number of
-    readings.
-    """
+    """Root mean square of residuals over all recordings but hold-outs, its SI unit, the number of readings."""
 
     rms: float
     unit: str

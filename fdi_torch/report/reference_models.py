@@ -27,9 +27,7 @@ def has_causes(answer: Mapping[str, Any]) -> bool:
 
 
 def reference_models(answer: Mapping[str, Any]) -> dict[str, str]:
-    """Names of the models by their key in the closure, and of the noise. The free form of an unknown cause is the best
-    that free functions can reach.
-    """
+    """Names of models and noise by their key in the closure; free functions are the best of an unknown cause."""
     if not has_causes(answer):
         return {key: _NAMES[key] for key in ("nominal", "recalibrated", "noise_floor")}
     if answer.get("verdict") == "unknown":

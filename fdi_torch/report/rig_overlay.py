@@ -59,9 +59,7 @@ def text_width(text: str, weight: str = "normal") -> float:
 
 
 def separated(blocks: Iterable[TextBlock], obstacles: Iterable[Box] = ()) -> list[TextBlock]:
-    """The blocks in their order, each moved down (or up, if not `down`) as far as needed to be free of the obstacles
-    and of the blocks before it.
-    """
+    """The blocks in order, each moved down (or up, if not `down`) until it is free of obstacles and earlier blocks."""
     taken, placed = list(obstacles), []
     for block in blocks:
         while hit := [box for box in taken if _overlap(box, block.box)]:

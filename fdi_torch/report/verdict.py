@@ -58,9 +58,7 @@ def headline(material: Material) -> str:
 
 
 def unreliable_words(material: Material) -> str:
-    """The warning of an estimate that has not converged or whose model does not explain its recording; logs before
-    2026-11 lack its ratio.
-    """
+    """The warning of a model that has not converged or does not explain its recording; old logs lack the ratio."""
     result = material.about("result")
     warnings = [convergence_warning(result.get("status", "")) if material.kind == "train" else ""]
     if material.unexplained:

@@ -62,9 +62,7 @@ class IsolationPlan:
 
     @cached_property
     def _designed(self) -> tuple[NoiseModel, Monitor, list[FaultScenario], list[float]]:
-        """Noise model from a fault-free run, the monitor, and the simulated faults with their smallest
-        isolable sizes.
-        """
+        """Noise model from a fault-free run, the monitor, the simulated faults, their smallest isolable sizes."""
         rig = self.rig
         nominal = rig.space.nominal()
         training = rig.run(fault_free_schedule(rig.space, 1), 3600, seeded_generator(self.seed, 6)).member(0)
@@ -231,9 +229,7 @@ class IsolationResult:
 
 
 def isolate_run(monitor: Monitor, samples: Samples, believed: Tensor, levels: Tensor, onset: float) -> IsolationResult:
-    """Run the monitor along one run. believed (P,) and levels (tanks,) m: at the first sample;
-    onset of the fault, s.
-    """
+    """Run the monitor along one run. believed (P,), levels (tanks,) m: at the first sample; onset: of the fault, s."""
     state = monitor.start(samples, believed, levels)
     _, events = monitor.advance(state, samples.segment(1, len(samples)))
     alarms = [e.time for e in events if e.kind == "alarm"]

@@ -188,9 +188,7 @@ def moving_set_points(
 
 
 def moving_commands(plant: PlantDescription, steady: Tensor, share: float) -> Callable[[], Controller]:
-    """Open loop: commands (channels,) that change by up to `share` of themselves every minute, on a plant whose time
-    scale is 1 s.
-    """
+    """Open loop: commands (channels,) that change by up to `share` of themselves every 60 time scales of the plant."""
     pace = time_scale(plant)
 
     def make() -> Controller:

@@ -104,9 +104,7 @@ def _unit_of(material: Material, name: str) -> tuple[str, float]:
 
 
 def _parameters(material: Material, estimator: str, count: int) -> list[str]:
-    """Names of the parameters, from the summary's ESTIMATOR.PARAMETER.rmse or, in an unfinished study, from its
-    configuration; numbers if neither has them.
-    """
+    """Names from the summary's ESTIMATOR.PARAMETER.rmse, else from the configuration, else numbers."""
     keys = [k for m in material.of(SUMMARY)[:1] for k in m if k.startswith(f"{estimator}.") and k.endswith(".rmse")]
     names = [key.removeprefix(f"{estimator}.").removesuffix(".rmse") for key in keys] or _configured(material)
     return names if len(names) == count else [f"parameter {i + 1}" for i in range(count)]
