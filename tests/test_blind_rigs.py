@@ -23,8 +23,7 @@ from fdi_torch.blind.inputs import SIGNALS, commanded, with_standstills
 from fdi_torch.blind.laws_pipe import HEAD_LAWS, PIPE_LAWS
 from fdi_torch.blind.laws_pump import PUMP_LAWS
 from fdi_torch.blind.laws_tank import STORAGE_LAWS, TANK_LAWS
-from fdi_torch.blind.named_effects import NAMED
-from fdi_torch.blind.nominal_run import NominalRun
+from fdi_torch.blind.named_effects import NAMED, NominalRun
 from fdi_torch.blind.places import EFFECTS, canonical, effect_places
 from fdi_torch.blind.plants import Rig, Scales, cascaded_tanks, on_bench, quadruple_tank, three_tank
 from fdi_torch.blind.sensor_noise import NoiseCorrelation, autoregressive, rippling, smoothed

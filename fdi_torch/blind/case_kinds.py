@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdi_torch.blind.deviation import Deviation
-from fdi_torch.blind.nominal_run import NominalRun
+from fdi_torch.blind.named_effects import NominalRun
 from fdi_torch.blind.places import (
     EFFECTS,
     OUTLET,

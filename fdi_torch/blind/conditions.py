@@ -8,15 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.blind.control import LevelControl, draw_control
 from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.inputs import (
     DECIMALS,
     FACTORS,
+    LevelControl,
     as_printed,
     channel_limits,
     command_unit,
     commanded,
+    draw_control,
     drawn,
     pumps_of_channels,
     with_standstills,

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.blind.control import LevelControl
 from fdi_torch.blind.deviation import Array, Deviation, Index, Moment
+from fdi_torch.blind.inputs import LevelControl
 from fdi_torch.blind.laws_pipe import HEAD_LAWS, PIPE_LAWS
 from fdi_torch.blind.laws_pump import PUMP_LAWS
 from fdi_torch.blind.laws_tank import STORAGE_LAWS, TANK_LAWS

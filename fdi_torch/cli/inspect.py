@@ -1,6 +1,6 @@
 """`fdi inspect`: what it does and prints. Its options: `options/inspect.py`.
 
-Path: cli.inspect.run → logbook.inspect.inspect_log → logbook.export.export
+Path: cli.inspect.run → logbook.export.inspect_log → logbook.export.export
 """
 
 from __future__ import annotations

@@ -102,8 +102,8 @@ def _metrics(wish: str, screen: Screen) -> Iterator[Listener]:
 
 @contextmanager
 def _publisher(url: str) -> Iterator[Publish]:
-    from fdi_torch.live.address import address_of
     from fdi_torch.live.mqtt import EventPublisher
+    from fdi_torch.live.values import address_of
 
     try:
         publisher = EventPublisher(address_of(url, ("mqtt", "mqtts")))

@@ -12,8 +12,8 @@ from pydantic import BeforeValidator, Field
 
 from fdi_torch.capacity import expect_room
 from fdi_torch.config.monitor_file import WindowConfig
-from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
+from fdi_torch.config.simulation import reading_noise
 from fdi_torch.config.strict import ScaledSeconds, Share, Strict, quantity
 from fdi_torch.effects import build_network, full_name, placements_for
 from fdi_torch.monitor.monitor_setup import with_shapes

@@ -10,8 +10,8 @@ from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.gap.preprocess.acquisition import examined
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.channel_finding import ChannelFinding
 from fdi_torch.recordings.check import RecordingCheck, check_recording
+from fdi_torch.recordings.plant_limits import ChannelFinding
 
 
 def checked(config: RecordingConfig, plant: PlantDescription, base: Path) -> tuple[Recording, RecordingCheck]:

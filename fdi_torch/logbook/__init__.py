@@ -5,9 +5,8 @@ mcap.
 from fdi_torch.logbook.compare import Comparison, align, compare, content_hash, labels_of
 from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.exclusive_file import being_written
-from fdi_torch.logbook.export import export, export_attachment
+from fdi_torch.logbook.export import Inspection, export, export_attachment, inspect_log
 from fdi_torch.logbook.follow import follow
-from fdi_torch.logbook.inspect import Inspection, inspect_log
 from fdi_torch.logbook.layout import foxglove_layout
 from fdi_torch.logbook.live import Live, serve
 from fdi_torch.logbook.payload import as_array, unpack

@@ -26,8 +26,8 @@ _NORMAL_95 = 1.96  # half width of the central 95 % of a normal distribution, st
 _BLOCK = 4096
 
 
-class Messages:
-    """Encodes messages and passes them to `put`, with their log time in ns."""
+class Topics:
+    """Encodes messages, each on a channel that describes its fields, and passes them to `put`. One method per topic."""
 
     def __init__(self) -> None:
         self._lock = SteadyLock()
@@ -168,50 +168,6 @@ class Messages:
         self.register.follow_on(channel, sequence)
         self._latest = max(self._latest, t)
 
-
-def _interleaved(
-    channels: Sequence[Channel],
-    sequences: Sequence[int],
-    log_times: Sequence[int],
-    encoded: Sequence[Sequence[bytes]],
-) -> Iterator[Timed]:
-    """One message of each channel per sample."""
-    streams = [
-        zip(repeat(channel), log_times, log_times, count(first), payloads, strict=False)
-        for channel, first, payloads in zip(channels, sequences, encoded, strict=True)
-    ]
-    return chain.from_iterable(zip(*streams, strict=True))
-
-
-def _rows(names: Sequence[str], block: np.ndarray, hidden: np.ndarray, clock: list[float]) -> list[bytes]:
-    """Payloads of samples (B, N), with readings masked by hidden (B, N)."""
-    keys = ("t", *names)
-    rows = zip(clock, *block.T.tolist(), strict=True)
-    if np.isfinite(block).all() and not hidden.any():
-        return [orjson.dumps(dict(zip(keys, row, strict=True))) for row in rows]
-    return [orjson.dumps(_row(keys, row, hidden[i : i + 1])) for i, row in enumerate(rows)]
-
-
-def _row(keys: Sequence[str], row: Sequence[float], hidden_row: np.ndarray) -> dict[str, Any]:
-    hidden = zip(keys[1:], hidden_row.ravel(), strict=True) if hidden_row.size else ()
-    masked = [name for name, is_hidden in hidden if is_hidden]
-    return plain({**dict(zip(keys, row, strict=True)), "masked": masked or None})
-
-
-def _check_signal(topic: str, values: np.ndarray, names: Sequence[str], samples: int) -> None:
-    if values.shape != (samples, len(names)):
-        raise ValueError(f"{topic}: expected values of shape {(samples, len(names))}, got {values.shape}")
-    for name in names:
-        if name in _RESERVED:
-            raise ValueError(f"{topic}: expected a name other than {', '.join(_RESERVED)}, got {name}; rename it")
-
-
-_INFO = 2  # of the levels debug (1) to fatal (5) of foxglove.Log
-
-
-class Topics(Messages):
-    """One method per topic."""
-
     def alarm(self, t: float, event: str, channel: str, message: str = "", **numbers: Any) -> None:
         """An event of the detection; numbers: value, threshold, onset (s) and others by name."""
         fields = {"event": event, "channel": channel, "message": message, **numbers}
@@ -301,6 +257,46 @@ class Topics(Messages):
         sec, nsec = divmod(log_time_of(self._latest), 10**9)
         fields = {"timestamp": {"sec": sec, "nsec": nsec}, "level": _INFO, "message": message, "name": "fdi"}
         self.write("/log", {**fields, "file": "", "line": 0})
+
+
+def _interleaved(
+    channels: Sequence[Channel],
+    sequences: Sequence[int],
+    log_times: Sequence[int],
+    encoded: Sequence[Sequence[bytes]],
+) -> Iterator[Timed]:
+    """One message of each channel per sample."""
+    streams = [
+        zip(repeat(channel), log_times, log_times, count(first), payloads, strict=False)
+        for channel, first, payloads in zip(channels, sequences, encoded, strict=True)
+    ]
+    return chain.from_iterable(zip(*streams, strict=True))
+
+
+def _rows(names: Sequence[str], block: np.ndarray, hidden: np.ndarray, clock: list[float]) -> list[bytes]:
+    """Payloads of samples (B, N), with readings masked by hidden (B, N)."""
+    keys = ("t", *names)
+    rows = zip(clock, *block.T.tolist(), strict=True)
+    if np.isfinite(block).all() and not hidden.any():
+        return [orjson.dumps(dict(zip(keys, row, strict=True))) for row in rows]
+    return [orjson.dumps(_row(keys, row, hidden[i : i + 1])) for i, row in enumerate(rows)]
+
+
+def _row(keys: Sequence[str], row: Sequence[float], hidden_row: np.ndarray) -> dict[str, Any]:
+    hidden = zip(keys[1:], hidden_row.ravel(), strict=True) if hidden_row.size else ()
+    masked = [name for name, is_hidden in hidden if is_hidden]
+    return plain({**dict(zip(keys, row, strict=True)), "masked": masked or None})
+
+
+def _check_signal(topic: str, values: np.ndarray, names: Sequence[str], samples: int) -> None:
+    if values.shape != (samples, len(names)):
+        raise ValueError(f"{topic}: expected values of shape {(samples, len(names))}, got {values.shape}")
+    for name in names:
+        if name in _RESERVED:
+            raise ValueError(f"{topic}: expected a name other than {', '.join(_RESERVED)}, got {name}; rename it")
+
+
+_INFO = 2  # of the levels debug (1) to fatal (5) of foxglove.Log
 
 
 def _cause(cause: Named) -> str:

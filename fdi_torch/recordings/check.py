@@ -15,9 +15,8 @@ from fdi_torch.names import counted
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.channel_finding import ChannelFinding
 from fdi_torch.recordings.input_sampling import undersampled_inputs
-from fdi_torch.recordings.plant_limits import plant_limit_findings
+from fdi_torch.recordings.plant_limits import ChannelFinding, plant_limit_findings
 from fdi_torch.recordings.repeated_readings import resolution
 
 MANY_RUNS = 5

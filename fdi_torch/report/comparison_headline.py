@@ -18,7 +18,7 @@ from fdi_torch.quantities import quantity_text
 from fdi_torch.report.html import short
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import percent
-from fdi_torch.report.progress import SensorResidual, sensor_residuals
+from fdi_torch.report.predictions import SensorResidual, sensor_residuals
 from fdi_torch.report.verdict import headline, kind_words
 from fdi_torch.units import UnitError, in_unit, number_and_unit
 

@@ -18,7 +18,7 @@ from fdi_torch.report.html import Markup, join, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.section import Maker, Picture, Section, section_html
 from fdi_torch.report.sections import SECTIONS
-from fdi_torch.report.sections.rig import RIG
+from fdi_torch.report.sections.origin import RIG
 from fdi_torch.report.style import save
 from fdi_torch.report.verdict import headline, how_it_ended, kind_words
 

@@ -18,8 +18,16 @@ from fdi_torch.monitor.detection import CHARTS, Detector, make_detector
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monte_carlo.isolation_plan import confusions, isolate_run
-from fdi_torch.monitor.monte_carlo.simulated_runs import FaultSchedule, SimulatedRig, fault_free_schedule
-from fdi_torch.monitor.monte_carlo.tasks import Numbers, ResultTable, Task, quantiles, seeded_generator
+from fdi_torch.monitor.monte_carlo.simulated_runs import (
+    FaultSchedule,
+    Numbers,
+    ResultTable,
+    SimulatedRig,
+    Task,
+    fault_free_schedule,
+    quantiles,
+    seeded_generator,
+)
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.samples import Samples

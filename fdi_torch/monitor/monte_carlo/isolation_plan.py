@@ -21,10 +21,14 @@ from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monte_carlo.simulated_runs import (
     FaultSchedule,
+    Numbers,
+    ResultTable,
     SimulatedRig,
+    Task,
     fault_free_schedule,
+    quantiles,
+    seeded_generator,
 )
-from fdi_torch.monitor.monte_carlo.tasks import Numbers, ResultTable, Task, quantiles, seeded_generator
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
 from fdi_torch.monitor.samples import Samples

@@ -8,15 +8,21 @@ from fdi_torch.report.sections.gap import causes_section, disturbances_section, 
 from fdi_torch.report.sections.gap_closure import (
     closure_section,
     constants_section,
+    curves_section,
     errors_section,
     limits_section,
     next_input_section,
+    shape_section,
 )
-from fdi_torch.report.sections.gap_curves import curves_section, shape_section
 from fdi_torch.report.sections.intervals import intervals_section
 from fdi_torch.report.sections.monitor import event_section, rehearsal_section, residual_section, statistic_section
-from fdi_torch.report.sections.origin import configuration_section, health_section, provenance_section
-from fdi_torch.report.sections.rig import plain_rig_section, rig_section
+from fdi_torch.report.sections.origin import (
+    configuration_section,
+    health_section,
+    plain_rig_section,
+    provenance_section,
+    rig_section,
+)
 from fdi_torch.report.sections.signals import fit_section, inputs_section
 from fdi_torch.report.sections.study import error_section, isolation_section, summary_section, trials_section
 from fdi_torch.report.sections.windows import windows_section

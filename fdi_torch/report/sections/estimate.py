@@ -18,9 +18,8 @@ from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effect
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import HEADER, amount, axis, correlation_table, estimate_cells, number, shown_unit, signed
-from fdi_torch.report.panels import ellipse_panel
 from fdi_torch.report.section import Picture, Section, signals
-from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT
+from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT, ellipse_panel
 
 MOST_ELLIPSES = 6
 

@@ -18,9 +18,9 @@ from fdi_torch.gap.verdict_words import (
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, number, percent, probability_text, shown_unit, with_error
-from fdi_torch.report.panels import BAR_NAME, bar_panel
 from fdi_torch.report.reference_models import flows_that_matter, has_causes
 from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.style import BAR_NAME, bar_panel
 
 MOST_BARS = 10
 LEAST_SHOWN = 1e-3  # of a probability that gets a bar
