@@ -24,6 +24,7 @@ from fdi_torch.recordings.csv_files import read_csv, read_header
 from fdi_torch.recordings.csv_text import HeaderlessError, header_unit
 from fdi_torch.recordings.csv_writing import header_of
 from fdi_torch.recordings.database import is_query
+from fdi_torch.recordings.source import ClockSource
 from fdi_torch.units import spelled
 
 
@@ -124,7 +125,7 @@ def plant_from_recording(path: Path, name: str) -> str:
             f"{path}: expected a header with names and units, got numbers; describe the plant with fdi new plant, then "
             f"let fdi new run --plant FILE --recording {path} number the columns"
         ) from error
-    clock = bind_clock(path, header, None).header
+    clock = bind_clock(path, header, ClockSource()).header
     named = [column for column in header if column != clock]
     columns = _columns(path, [column for column in named if header_unit(column)])
     sensors = [column for column in columns if column.is_reading] or [c for c in columns if c.may_be_reading]

@@ -99,16 +99,6 @@ class Observation:
         """The residual with its first samples scaled to the steady variance."""
         return self.residual / self.inflation
 
-    def last(self, count: int) -> Observation:
-        """Its last samples."""
-        return Observation(
-            self.time[-count:],
-            self.state[..., -count:, :],
-            self.residual[..., -count:, :],
-            self.inflation[..., -count:, :],
-            self.tanks,
-        )
-
 
 class Observer:
     """x_hat' = f(x_hat, u; theta) + K (y - y_hat): predict over each interval, then correct by L (y - y_hat).

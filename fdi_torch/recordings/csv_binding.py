@@ -45,13 +45,12 @@ class Bound:
     unit: str = ""
 
 
-def bind_clock(path: Path, header: Sequence[str], source: ChannelSource | None) -> Bound:
+def bind_clock(path: Path, header: Sequence[str], source: ClockSource) -> Bound:
     """The column of time: the mapped one, or else one with such a name, if possible with a unit, or of time stamps.
 
     Without a column, time is the number of rows above times the period, which is the factor.
     """
-    source = source or ClockSource()
-    if isinstance(source, ClockSource) and source.period is not None:
+    if source.period is not None:
         return Bound("t", "t", None, source.period, "s")
     if source.column is None:
         units = {h: header_unit(h) for h in header}
@@ -157,9 +156,7 @@ def _unit_in(path: Path, column: str, name: str) -> str:
     return name_and_unit[1]
 
 
-def columns_of(
-    path: Path, heading: Heading, bounds: Sequence[Bound], clock: ChannelSource | None = None, sparse: bool = False
-) -> Columns:
+def columns_of(path: Path, heading: Heading, bounds: Sequence[Bound], clock: ClockSource, sparse: bool) -> Columns:
     """The columns of the file to read, each once, in the order of their first use: time comes first.
 
     clock: the format of its time stamps. sparse: whether empty cells differ from cells that report a bad value.
@@ -168,5 +165,4 @@ def columns_of(
     positions = list(dict.fromkeys(b.position for b in bounds if b.position is not None))
     rules = {b.position: b.rule for b in bounds if b.position is not None and b.rule is not None}
     stamps = next((b.position for b in bounds if b.stamps), None)
-    read = StampReader(clock.stamps, clock.zone) if isinstance(clock, ClockSource) else StampReader()
-    return Columns(path, heading, positions, stamps, read, rules, sparse)
+    return Columns(path, heading, positions, stamps, StampReader(clock.stamps, clock.zone), rules, sparse)

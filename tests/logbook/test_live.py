@@ -106,7 +106,7 @@ def test_an_address_that_is_none(asked: str, capsys: pytest.CaptureFixture[str])
 
 
 def test_an_address_that_is_taken(live: Live, capsys: pytest.CaptureFixture[str]) -> None:
-    port = live.values.rpartition(":")[2]
+    port = live.address.rpartition(":")[2]
     assert main(["train", "--live", port]) == MISUSE
     assert f"--live: expected a free address, got 127.0.0.1:{port}" in capsys.readouterr().err
 
