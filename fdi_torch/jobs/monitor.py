@@ -12,7 +12,7 @@ import queue
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise
 from pathlib import Path
@@ -28,10 +28,11 @@ from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.monitor_rows import (
     ALARM,
     event_key,
+    fault_free_recording,
     logged_items,
     logged_origin,
-    recording_of_rows,
     resumed_items,
+    rows_in,
     rows_until,
 )
 from fdi_torch.logbook import Run as LoggedRun
@@ -74,7 +75,7 @@ def run_monitor(
     reported = Counter(event_key(message.payload) for message in messages)
     zeros: list[float] = []
     try:  # before the log begins, so that a source that cannot be reached leaves none
-        source = _source(run, idle, origin, _rows(earlier), zeros) if follow else iter(())
+        source = _source(run, idle, origin, rows_in(earlier), zeros) if follow else iter(())
     except BaseException:
         if unfinished is not None:
             os.replace(unfinished.path, partial_path(path))  # for the next attempt to resume
@@ -120,18 +121,17 @@ def _follow(
 ) -> None:
     """Process samples as they come, after waiting for the end of the fault-free part."""
     run = monitor.run
-    batches = LiveBatches(resumed_items(earlier, source) if _rows(earlier) else source)
+    batches = LiveBatches(resumed_items(earlier, source) if rows_in(earlier) else source)
     callbacks.tell(None, "waiting for samples")
     first = _until_fault_free_part_ends(run, callbacks, batches)
     zero = source.origin if isinstance(source, LiveRows) else next(iter(zeros), None)
     show_clock([zero])
-    rows = _rows(first)
-    monitor.learn(recording_of_rows(rows_until(rows, run.config.fault_free[1]) or rows, run))
+    monitor.learn(fault_free_recording(rows_in(first), run))
     if zero is not None:
         monitor.log_origin(zero)
     delay_watch = DelayWatch(time.monotonic)
     for batch in chain([first], batches):
-        rows = _rows(batch)
+        rows = rows_in(batch)
         notices = delay_watch.received([row[0] for row in rows]) if rows else []
         if monitor.process_items([*notices, *batch]):
             delay_watch.clock_jumped()
@@ -150,7 +150,7 @@ def _until_fault_free_part_ends(
     end = run.config.fault_free[1]
     for batch in batches:
         items += batch
-        rows = _rows(items)
+        rows = rows_in(items)
         callbacks.tell(None, f"{_last_sample(rows)}, learning until {end:g} s" if rows else "waiting for samples")
         if rows_until(rows, end):
             break
@@ -161,10 +161,6 @@ def _last_sample(rows: Sequence[Row]) -> str:
     """The time of the last sample, and the moment if the clock has dates."""
     moment = clock_text(rows[-1][0])
     return f"last sample at {rows[-1][0]:g} s" + (f" ({moment})" if moment else "")
-
-
-def _rows(items: Iterable[Row | str]) -> list[Row]:
-    return [item for item in items if not isinstance(item, str)]
 
 
 T = TypeVar("T")

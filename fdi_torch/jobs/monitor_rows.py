@@ -32,6 +32,11 @@ def samples_of_rows(rows: Sequence[Row], run: MonitorRun) -> Samples:
     return Samples(time, inputs.reshape(len(time), -1), readings.reshape(-1, sensors), run.config.recording.hold)
 
 
+def rows_in(items: Iterable[Row | str]) -> list[Row]:
+    """The rows among rows and notices."""
+    return [item for item in items if not isinstance(item, str)]
+
+
 def rows_until(rows: Sequence[Row], until: float) -> list[Row]:
     """The first segment of rows without a backward jump of the clock that reaches a time (s); empty if none does yet.
 
@@ -57,8 +62,9 @@ def rows_until(rows: Sequence[Row], until: float) -> list[Row]:
     return []
 
 
-def recording_of_rows(rows: Sequence[Row], run: MonitorRun) -> Recording:
-    """The rows after the last jump of the clock, as a recording."""
+def fault_free_recording(rows: Sequence[Row], run: MonitorRun) -> Recording:
+    """The first rows up to the end of the fault-free part, or else all after the last jump of the clock."""
+    rows = rows_until(rows, run.config.fault_free[1]) or rows
     if len(rows) < 2:
         raise ValueError(
             f"{run.config.recording.file}: expected samples to follow, got {len(rows)}; check that the plant delivers "
@@ -106,7 +112,7 @@ def resumed_items(earlier: Sequence[Row | str], source: Iterable[Row | str]) -> 
     A growing file begins with the rows that the log has, unless it was rotated.
     """
     yield from earlier
-    rows = [item for item in earlier if not isinstance(item, str)]
+    rows = rows_in(earlier)
     later, head = iter(source), list[Row | str]()
     for item in later:
         head.append(item)
@@ -142,7 +148,7 @@ def event_key(payload: dict[str, Any]) -> tuple[Any, ...]:
 
 def event_fields(event: Event) -> dict[str, Any]:
     """An event's fields for the log: numbers, texts and flat lists, and the whole event as JSON in `details`."""
-    fields: dict[str, Any] = {
+    return {
         "alarm": event.alarm or None,
         "state": str(event.state),
         "headline": event.headline if event.explanations else None,
@@ -166,4 +172,3 @@ def event_fields(event: Event) -> dict[str, Any]:
         "format": FORMAT,
         "details": orjson.dumps(event.to_dict()).decode(),
     }
-    return fields

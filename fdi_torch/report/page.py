@@ -100,7 +100,7 @@ def write_pictures(report: RunReport, folder: Path) -> list[Path]:
 def _article(report: RunReport, prefix: str) -> Markup:
     material = report.material
     top = [tag("h1", f"{kind_words(material)} · {material.run.path.stem}"), tag("h2", unbroken(headline(material)))]
-    top += [tag("p", sentence, class_="meta") for sentence in how_it_ended(material)]
+    top.append(tag("p", how_it_ended(material), class_="meta"))
     named = [(f"{prefix}s{k}", section) for k, section in enumerate(report.sections)]
     lead = [section_html(section, prefix, name) for name, section in named if section.lead]
     others = [section_html(section, prefix, name) for name, section in named if not section.lead]

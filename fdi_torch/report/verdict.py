@@ -188,8 +188,8 @@ def windows_words(material: Material) -> str:
     return text[:1].upper() + text[1:]
 
 
-def how_it_ended(material: Material) -> list[str]:
-    """Start, duration and status of the run, one sentence each."""
+def how_it_ended(material: Material) -> str:
+    """Status, start and duration of the run."""
     status, run = material.about("status"), material.about("run")
     ended = status.get("status", "no end in the log").replace("_", " ")
     reason = f" ({status['reason']})" if status.get("reason") else ""
@@ -197,8 +197,7 @@ def how_it_ended(material: Material) -> list[str]:
     seconds = status.get("wall_seconds")  # of a blind benchmark: of writing its log, after all diagnoses
     parts += [f"started {run['started'][:19].replace('T', ' ')} UTC"] if run.get("started") else []
     parts += [f"took {_rounded(seconds)} s"] if seconds and material.kind != "challenge" else []
-    sentences = [" · ".join(parts)]
-    return sentences
+    return " · ".join(parts)
 
 
 def _rounded(seconds: str) -> str:

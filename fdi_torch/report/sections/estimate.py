@@ -15,7 +15,7 @@ from fdi_torch.estimate.misfit import NOT_ESTABLISHED
 from fdi_torch.names import counted
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
-from fdi_torch.report.html import table, tag
+from fdi_torch.report.html import bullets, table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import HEADER, amount, axis, correlation_table, estimate_cells, number, shown_unit, signed
 from fdi_torch.report.section import Picture, Section, signals
@@ -36,9 +36,8 @@ def estimate_section(material: Material) -> Section | None:
     header += ["simulated"] if material.truth else []
     notes = [str(note) for note in final.get("unidentifiable") or ()]
     notes += [f"{name} lies at the edge of its range" for name in final.get("at_bound") or ()]
-    listed = [tag("ul", *(tag("li", note) for note in notes))] if notes else []
     return Section(
-        "Estimate", [table(header, rows, left=header.index("unit") + 1), *_water(material), *listed], lead=True
+        "Estimate", [table(header, rows, left=header.index("unit") + 1), *_water(material), *bullets(notes)], lead=True
     )
 
 
@@ -126,8 +125,8 @@ def _water(material: Material) -> list[Any]:
             text = f"{finding.words} {change} the flow by {amount(finding.flow, 'm^3/s', 3)}"
             if np.isfinite(finding.hole):
                 text += f", as a sharp-edged hole of {number(1e3 * finding.hole, 3)} mm would"
-            lines.append(tag("li", text))
-    return [tag("ul", *lines)] if lines else []
+            lines.append(text)
+    return bullets(lines)
 
 
 def _ellipse(material: Material, final: Payload, covariance: np.ndarray, pair: tuple[int, int], k: int) -> Picture:

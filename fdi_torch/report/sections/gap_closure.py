@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from fdi_torch.gap.verdict_words import closed_sentence, explanation_words
 from fdi_torch.report.chart import Chart, Line
-from fdi_torch.report.html import folded, short, table, tag
+from fdi_torch.report.html import bullets, folded, short, table
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, as_vector, axis, number, percent, shown_unit, with_error
 from fdi_torch.report.reference_models import has_causes, reference_models
@@ -149,8 +149,7 @@ def limits_section(material: Material) -> Section | None:
     small = "Effects that these inputs do not show at their typical size"
     for title, items in ((small, hidden), ("Pairs of effects with the same signature under these inputs", pairs)):
         if items:
-            listed = tag("ul", *(tag("li", item) for item in items[:MOST_LISTED]))
-            blocks.append(folded(f"{title}: {len(items)}", listed))
+            blocks.append(folded(f"{title}: {len(items)}", *bullets(items[:MOST_LISTED])))
     return Section("Limits of these inputs", blocks) if blocks else None
 
 

@@ -15,7 +15,7 @@ from fdi_torch.names import counted
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
-from fdi_torch.report.html import folded, pairs, table, tag
+from fdi_torch.report.html import bullets, folded, pairs, table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number, shown_unit
 from fdi_torch.report.schematic import Overlay, schematic
@@ -127,7 +127,7 @@ def health_section(material: Material) -> Section | None:
         "Integrity of the log",
         [
             tag("p", "The file is ", state, f": {content}, {inspection.size} bytes."),
-            *([tag("ul", *(tag("li", problem) for problem in problems))] if problems else []),
+            *bullets(problems),
             *([inspection.advice] if inspection.advice else []),
             *([folded(f"Log messages ({len(messages)})", tag("ul", *messages))] if messages else []),
             folded("Topics", table(("topic", "messages", "from, s", "to, s"), rows)),
