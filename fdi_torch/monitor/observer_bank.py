@@ -13,7 +13,7 @@ from fdi_torch.monitor.observer import ObserverRun, initial_levels, run_observer
 from fdi_torch.monitor.observer_gain import Gain
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import Stepper
-from fdi_torch.monitor.switched_plant import ONSET, RAMP, SwitchedNetwork
+from fdi_torch.monitor.switched_plant import ONSET, RAMP, SwitchedNetwork, own_onsets
 from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.network import TankNetwork
@@ -102,9 +102,8 @@ class ObserverBank:
         self.stepper = Stepper(network, longest_step)
         self.network, self.space, self.gain, self.whitening = network, space, gain, whitening
         self.changing = SwitchedNetwork(network, space.names)
-        self._held = _with_own_onset(network, space)
-        onsets = [str(ParameterName.parse(name).sibling("onset")) for name in self._held]
-        names = [*space.names, *(f"after {name}" for name in space.names), ONSET, RAMP, *onsets]
+        self._held = own_onsets(network, space)
+        names = [*space.names, *(f"after {name}" for name in space.names), ONSET, RAMP, *self._held.values()]
         groups: dict[str, list[int]] = {}
         for column, name in enumerate(space.names):
             groups.setdefault(ParameterName.parse(name).prefix, []).append(column)
@@ -203,14 +202,3 @@ class ObserverBank:
             already = before[:, self.space.index(name)] != p.nominal
             onsets.append(torch.where(already, LONG_AGO, changes.onset))
         return torch.cat([before, changes.theta, timing, *(column.unsqueeze(1) for column in onsets)], dim=1)
-
-
-def _with_own_onset(network: TankNetwork, space: ParameterSpace) -> list[str]:
-    """Parameters of `space` that are sizes of effects with a memory and an onset parameter."""
-    named = []
-    for placement in network.placements:
-        size, *shape = placement.effect.parameters(placement.location, network.description)
-        name = placement.full_name(size.name)
-        if placement.effect.memory and any(p.name == "onset" for p in shape) and name in space:
-            named.append(name)
-    return named

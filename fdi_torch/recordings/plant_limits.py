@@ -86,8 +86,7 @@ def expect_no_denied_rim(plant: PlantDescription, recording: Recording) -> None:
 
 
 def _denied(plant: PlantDescription, sensor: Sensor, recording: Recording) -> DeniedRim | None:
-    column = recording.output_names.index(sensor.column)
-    values = recording.outputs[recording.mask[:, column], column]
+    values = recording.valid_readings(sensor.column)
     tank, share = plant.tank(sensor.tank), plant.tolerances.get
     levels = (values - sensor.offset) / sensor.gain
     noise = float(sample_noise(values.unsqueeze(1))) / abs(sensor.gain)

@@ -14,8 +14,8 @@ from torch import Tensor
 from fdi_torch.capacity import expect_room
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import PlantState, Stepper, usual_step
-from fdi_torch.monitor.switched_plant import ONSET, RAMP, SwitchedNetwork
-from fdi_torch.parameters import ParameterName, ParameterSpace
+from fdi_torch.monitor.switched_plant import ONSET, RAMP, SwitchedNetwork, own_onsets
+from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.scales import time_scale
@@ -66,9 +66,7 @@ class SimulatedRig:
         self.sampling, self.wander, self.colour, self.controller = sampling, wander, colour, controller
         step = commensurate_step(usual_step(network.description), sampling)
         self._stepper = Stepper(self.switched, min(sampling, step))
-        onsets = [str(ParameterName.parse(name).sibling("onset")) for name in space.names]
-        known = [name for name in dict.fromkeys(onsets) if name in self.switched.constants]
-        self._onsets = [name for name in known if self._has_memory(name)]
+        self._onsets = own_onsets(network, space).values()
         names = [*(f"after {name}" for name in space.names), ONSET, RAMP, *self._onsets]
         self._columns = ParameterSpace(self.switched.constants[name] for name in names)
 
@@ -110,10 +108,6 @@ class SimulatedRig:
         shift = torch.randn(levels.shape, generator=generator, dtype=levels.dtype)
         wandered = torch.cat([(levels + self.wander * shift).clamp(min=0.0), effects], dim=-1)
         return PlantState(wandered, moved.commands, moved.readings)
-
-    def _has_memory(self, onset: str) -> bool:
-        prefix = ParameterName.parse(onset).prefix
-        return any(p.prefix == prefix and p.effect.memory for p in self.switched.placements)
 
 
 # Closed-loop rate of a level control (flow per level error, over the tank's area) and its reset rate, 1/s, on a plant
