@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from scipy.signal import lfilter
 
-from fdi_torch.blind.control import Controller, LevelControl
 from fdi_torch.blind.deviation import Array
+from fdi_torch.blind.inputs import Controller, LevelControl
 from fdi_torch.blind.random_flows import Disturbance
 from fdi_torch.blind.simulator import Drive, Group, HiddenRigs, simulate
 from fdi_torch.config.plant_file import load_plant

@@ -15,9 +15,8 @@ import numpy as np
 from benchmarks import simulators
 from benchmarks.physics import START, make_rates, make_step, widths
 from fdi_torch.config.study_file import load_study
-from fdi_torch.study.monte_carlo import run_block
+from fdi_torch.study.monte_carlo import make_trials, run_block
 from fdi_torch.study.study_plan import Block, Plan
-from fdi_torch.study.trial_readings import make_trials
 
 TRIALS, SCIPY_TRIALS, ITERATIONS, STEP = 200, 2, 25, 1.0
 NOMINAL = np.array([0.0, 1.0, 0.0, 1.0, 1.0])

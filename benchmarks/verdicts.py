@@ -22,10 +22,9 @@ import numpy as np
 import torch
 
 from fdi_torch.blind.benchmark import blind_benchmark
-from fdi_torch.blind.plants import RIGS
-from fdi_torch.blind.scaling import Scales
+from fdi_torch.blind.cases import lines_of, manifest, open_key, read_plant, read_recording
+from fdi_torch.blind.plants import RIGS, Scales
 from fdi_torch.blind.scored_rows import scores_of
-from fdi_torch.blind.sealed_files import lines_of, manifest, open_key, read_plant, read_recording
 from fdi_torch.blind.sizes import COMPARABLE
 from fdi_torch.blind.statistics import clopper_pearson
 from fdi_torch.gap.candidate import Candidate

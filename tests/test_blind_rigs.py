@@ -14,24 +14,20 @@ import torch
 
 from fdi_torch.blind import case_drafts, cases, conditions
 from fdi_torch.blind.case_drafts import plans
-from fdi_torch.blind.case_kinds import KINDS, STANDARD, choose
-from fdi_torch.blind.cases import Case, make
+from fdi_torch.blind.case_kinds import KINDS, STANDARD, UNKNOWN, choose, unknown_to
+from fdi_torch.blind.case_readings import READOUT_LAWS, SENSOR_LAWS
+from fdi_torch.blind.cases import Case, as_csv, make
 from fdi_torch.blind.conditions import WIDEST, as_built, asked_of_pumps, exercised
 from fdi_torch.blind.deviation import Array, Deviation
 from fdi_torch.blind.inputs import SIGNALS, commanded, with_standstills
 from fdi_torch.blind.laws_pipe import HEAD_LAWS, PIPE_LAWS
 from fdi_torch.blind.laws_pump import PUMP_LAWS
-from fdi_torch.blind.laws_sensor import READOUT_LAWS, SENSOR_LAWS
 from fdi_torch.blind.laws_tank import STORAGE_LAWS, TANK_LAWS
-from fdi_torch.blind.named_effects import NAMED
-from fdi_torch.blind.nominal_run import NominalRun
+from fdi_torch.blind.named_effects import NAMED, NominalRun
 from fdi_torch.blind.places import EFFECTS, canonical, effect_places
-from fdi_torch.blind.plants import Rig, cascaded_tanks, quadruple_tank, three_tank
-from fdi_torch.blind.scaling import Scales, on_bench
-from fdi_torch.blind.sealed_files import as_csv
+from fdi_torch.blind.plants import Rig, Scales, cascaded_tanks, on_bench, quadruple_tank, three_tank
 from fdi_torch.blind.sensor_noise import NoiseCorrelation, autoregressive, rippling, smoothed
 from fdi_torch.blind.simulator import Drive, HiddenRigs, simulate
-from fdi_torch.blind.unseen_laws import UNKNOWN, unknown_to
 from fdi_torch.effects import build_network
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank

@@ -17,12 +17,10 @@ import pytest
 from fdi_torch.blind import cases
 from fdi_torch.blind.benchmark import always_null, blind_benchmark
 from fdi_torch.blind.case_drafts import plans
-from fdi_torch.blind.cases import Case
+from fdi_torch.blind.cases import Case, manifest, open_key, read_plant, read_recording, write_cases
 from fdi_torch.blind.plants import three_tank
 from fdi_torch.blind.score import by_effect, judge, summary, utility
-from fdi_torch.blind.score_tables import OWN, misses
-from fdi_torch.blind.scored_rows import joined, reliability, tables, write_rows
-from fdi_torch.blind.sealed_files import manifest, open_key, read_plant, read_recording, write_cases
+from fdi_torch.blind.scored_rows import OWN, joined, misses, reliability, tables, write_rows
 from fdi_torch.blind.sizes import size_errors, sizes
 from fdi_torch.blind.statistics import clopper_pearson, mean_interval, median_interval, root_mean_square_interval
 from fdi_torch.jobs.blind_results import LOG, write_results

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.bounds import halfway, reflected
+from fdi_torch.estimate.strategy import halfway, reflected
 
 LOW = torch.tensor([0.0, -1.0, 5.0], dtype=torch.float64)
 HIGH = torch.tensor([1.0, 1.0, 5.0], dtype=torch.float64)

@@ -16,15 +16,13 @@ from fdi_torch.monitor.detection import (
     CHARTS,
     NO_ALARM,
     Chart,
-    Detector,
-    cusum,
-    make_detector,
-)
-from fdi_torch.monitor.false_alarm_rate import (
     ChartRate,
+    Detector,
     FalseAlarmDesign,
+    cusum,
     cusum_rate,
     fixed_rate,
+    make_detector,
 )
 from fdi_torch.monitor.whitening import score_whitenings
 

@@ -11,7 +11,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.gap.answer import Amount, Answer, Cause, ProbableExplanation, adopted
 from fdi_torch.gap.verdict_words import causes_of, probability_words, verdict_sentence
 from fdi_torch.quantities import displayed_in
-from fdi_torch.report.random_flows import flows_that_matter
+from fdi_torch.report.reference_models import flows_that_matter
 from tests.test_gap import nominal_plant
 
 LEAK = Cause("leak", "T1", {"size": Amount(0.2, 0.01, "1")})

@@ -42,10 +42,9 @@ from fdi_torch.jobs.logged_recordings import logged_recording
 from fdi_torch.jobs.replay import logged_run
 from fdi_torch.jobs.run_setup import requested_space
 from fdi_torch.logbook import inspect_log, read_run
-from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.schemas import json_schema
 from fdi_torch.logbook.sink import EPOCH_NS, Sink
-from fdi_torch.logbook.topic_definitions import topic_definition
+from fdi_torch.logbook.topic_definitions import Channel, topic_definition
 from fdi_torch.recordings.check import check_recording
 from fdi_torch.report.material import gather
 

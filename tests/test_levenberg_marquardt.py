@@ -13,8 +13,7 @@ from torch import Tensor
 from fdi_torch.estimate.batch_algebra import apply, row_sum, solve_positive
 from fdi_torch.estimate.damped_step import Quadratic, damped_step, newton_decrement
 from fdi_torch.estimate.levenberg_marquardt import Competition, Progress, RefineSettings, levenberg_marquardt
-from fdi_torch.estimate.linearisation import Linearisation
-from fdi_torch.estimate.refined import Refined, held_back
+from fdi_torch.estimate.linearisation import Linearisation, Refined, held_back
 
 DOUBLE = torch.float64
 INF = math.inf

@@ -14,8 +14,8 @@ from live_servers import Broker, broker, free_port
 from test_monitor_follow import config, growing, logged_events, monitored, readings, texts, written
 
 from fdi_torch.cli import INTERRUPTED, MISUSE, main
-from fdi_torch.live.address import PASSWORD, USER, address_of
 from fdi_torch.live.mqtt import MqttClient
+from fdi_torch.live.values import PASSWORD, USER, address_of
 
 paho = pytest.importorskip("paho.mqtt.client")
 
@@ -248,7 +248,7 @@ def test_a_source_that_cannot_be_used_is_refused_in_a_sentence(
 
 
 def test_credentials_come_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    from fdi_torch.live.address import credentials
+    from fdi_torch.live.values import credentials
 
     assert credentials() is None
     monkeypatch.setenv(USER, "rig")

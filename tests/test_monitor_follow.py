@@ -23,9 +23,8 @@ from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import ConfigError
-from fdi_torch.jobs.live_batches import LARGEST_BATCH, DelayWatch, LiveBatches
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
-from fdi_torch.jobs.monitor import run_monitor
+from fdi_torch.jobs.monitor import LARGEST_BATCH, DelayWatch, LiveBatches, run_monitor
 from fdi_torch.jobs.monitor_rows import resumed_items, rows_until
 from fdi_torch.jobs.replay import repeat_run
 from fdi_torch.logbook import RunLog, content_hash, follow, read_run, series

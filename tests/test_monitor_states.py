@@ -17,8 +17,8 @@ from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.monitor import Monitor, ResidualTrace
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
-from fdi_torch.monitor.residual_test import residuals_to_test
 from fdi_torch.monitor.samples import ABSENT, ClockState, Samples, samples_of_recording, split_at_gaps
+from fdi_torch.monitor.state_update import residuals_to_test
 from fdi_torch.monitor.window_monitor import WindowMonitor
 from fdi_torch.recording import Recording
 from tests.test_monitor import SPACE, monitor, recorded

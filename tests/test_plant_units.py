@@ -15,8 +15,7 @@ from fdi_torch.cli import MISUSE, NOT_EXPLAINED, main
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_in
-from fdi_torch.recordings.plant_units import wrong_units
-from fdi_torch.recordings.volume_balance import volumes_along
+from fdi_torch.recordings.plant_units import volumes_along, wrong_units
 
 PLANT = """
 tanks:

@@ -15,7 +15,7 @@ import torch
 from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_csv
-from fdi_torch.recordings.header import header_unit
+from fdi_torch.recordings.csv_text import header_unit
 from fdi_torch.recordings.source import ChannelSource
 
 GOOD = "t_s,Q1_cm3_s,h1_cm\n0,50,10\n1,50,11\n2,60,12\n"

@@ -16,10 +16,15 @@ from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import with_shapes
-from fdi_torch.monitor.monte_carlo.detector_trials import delays, detectors, white_residuals
-from fdi_torch.monitor.monte_carlo.isolation_trials import FaultScenario, confusions, isolate_run, smallest_isolable
-from fdi_torch.monitor.monte_carlo.level_control import LevelControl, moving_set_points
-from fdi_torch.monitor.monte_carlo.simulated_runs import FaultSchedule, SimulatedRig, fault_free_schedule
+from fdi_torch.monitor.monte_carlo.detection_plan import delays, detectors, white_residuals
+from fdi_torch.monitor.monte_carlo.isolation_plan import FaultScenario, confusions, isolate_run, smallest_isolable
+from fdi_torch.monitor.monte_carlo.simulated_runs import (
+    FaultSchedule,
+    LevelControl,
+    SimulatedRig,
+    fault_free_schedule,
+    moving_set_points,
+)
 from fdi_torch.monitor.noise_model import learn_noise
 from fdi_torch.monitor.state_update import advance_observer
 from fdi_torch.parameters import ParameterSpace

@@ -9,9 +9,9 @@ import pytest
 
 from fdi_torch.cli import MISUSE, main
 from fdi_torch.config.rehearsal_file import load_rehearsal
-from fdi_torch.jobs.rehearsal import rehearse
+from fdi_torch.jobs.study import rehearse
 from fdi_torch.logbook import read_run
-from fdi_torch.monitor.monte_carlo.false_alarm_plan import mean_time
+from fdi_torch.monitor.monte_carlo.detection_plan import mean_time
 
 FALSE_ALARMS = """
 inputs: [50 cm^3/s, 50 cm^3/s]

@@ -11,7 +11,7 @@ from fdi_torch.cli.options import seconds
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant_file import build_plant
 from fdi_torch.config.plant_writer import dump_plant
-from fdi_torch.config.reading_noise import reading_noise
+from fdi_torch.config.simulation import reading_noise
 from fdi_torch.plant.description import PlantDescription, Sensor
 
 

@@ -27,7 +27,7 @@ from fdi_torch.estimate.hybrid import HybridResult, estimate_parameters
 from fdi_torch.jobs.run_setup import fitting_of, recordings_of, requested_space
 from fdi_torch.monitor.monitor_settings import MonitorSettings, usual_settings
 from fdi_torch.monitor.monitor_setup import prepare_monitor
-from fdi_torch.monitor.monte_carlo.level_control import moving_commands
+from fdi_torch.monitor.monte_carlo.simulated_runs import moving_commands
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.parameters import ParameterSpace

@@ -13,8 +13,7 @@ from torch import Tensor
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import EFFECTS, all_placements
 from fdi_torch.estimate.fitting import set_up
-from fdi_torch.estimate.hybrid_settings import HybridSettings
-from fdi_torch.estimate.refinement import information_std, refine_to_convergence
+from fdi_torch.estimate.refinement import HybridSettings, information_std, refine_to_convergence
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording

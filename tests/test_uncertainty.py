@@ -18,7 +18,7 @@ from fdi_torch.estimate.information import (
     determined_combinations,
     fisher_information,
 )
-from fdi_torch.estimate.refined import STALLED, unfinished
+from fdi_torch.estimate.linearisation import STALLED, unfinished
 from fdi_torch.estimate.refinement import status_of
 from fdi_torch.estimate.uncertainty import make_estimate, parameters_at_bounds
 from fdi_torch.parameters import Parameter, ParameterSpace

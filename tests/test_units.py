@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from fdi_torch.quantities import parse_level_deviation, parse_quantity, si_unit_of, unit_factor
-from fdi_torch.recordings.header import header_unit
+from fdi_torch.recordings.csv_text import header_unit
 
 GOOD = [
     ("160 cm^2", "m^2", 0.016),
@@ -63,7 +63,7 @@ def test_no_unit_text_takes_long() -> None:
     """In a process of its own: what hangs, hangs in C, where no signal ends it."""
     texts = ["h1 [9**9**9]", "h_" + "_" * 3000, "h_" + "m_" * 3000, "h (" + "m*" * 10**6 + "m)", "_" * 10**6]
     code = (
-        f"from fdi_torch.recordings.header import header_unit\nfor t in {texts!r}:\n    assert header_unit(t) is None"
+        f"from fdi_torch.recordings.csv_text import header_unit\nfor t in {texts!r}:\n    assert header_unit(t) is None"
     )
     subprocess.run([sys.executable, "-"], input=code, text=True, timeout=60, check=True)
 

@@ -21,8 +21,8 @@ from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.yaml_files import SHIPPED
 from fdi_torch.disk import replacing
 from fdi_torch.logbook import LogError, arrays, read_run
-from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.sink import Sink
+from fdi_torch.logbook.topic_definitions import Channel
 from fdi_torch.untrusted_input import MOST_LINE, MOST_UNPACKED, printable, printable_json
 
 HEADER = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm\n"

@@ -18,7 +18,7 @@ from benchmarks.paper.published import PARAMETERS
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.estimate.information import certainty, fisher_information
-from fdi_torch.monitor.monte_carlo.tasks import quantiles
+from fdi_torch.monitor.monte_carlo.simulated_runs import quantiles
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.window_estimators import ESTIMATORS, WindowData
 from fdi_torch.parameters import ParameterSpace

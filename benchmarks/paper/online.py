@@ -20,7 +20,7 @@ from fdi_torch.estimate.hybrid import HybridResult, estimate_parameters
 from fdi_torch.jobs.run_setup import hybrid_settings, requested_space
 from fdi_torch.monitor.detection import NO_ALARM, Detector, make_detector
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
-from fdi_torch.monitor.observer import Observation, Observer
+from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.observer_gain import hand_gain
 from fdi_torch.monitor.samples import samples_of_recording
 from fdi_torch.parameters import ParameterSpace
@@ -81,14 +81,15 @@ def follow(runs: Sequence[Run]) -> OnLine:
         part = recording.window(begin, end)
         # The observer runs on until its parameters change.
         observed = samples_of_recording(recording.window(since, end), network.description)
-        seen = Observer(network, gain, space, believed).run(observed, levels).last(len(part))
-        alarm = first_alarm(seen, noise, detector)
+        seen = Observer(network, gain, space, believed).run(observed, levels)
+        residual = seen.residual[-len(part) :]
+        alarm = first_alarm(part.time, noise.whitening(seen.steady_residual[-len(part) :]), detector)
         result = sized(part, space, runs[-1]) if varies(part) else None
         windows.append(Window(begin, end, space.vector(faults_of(run, network)), alarm, result))
-        own = part.outputs - seen.residual if result is None else result.predicted[0]
+        own = part.outputs - residual if result is None else result.predicted[0]
         # Two windows share the sample between them; it belongs to the first.
         predicted.append(own if begin == 0.0 else own[1:])
-        adaptive.append(seen.residual if begin == 0.0 else seen.residual[1:])
+        adaptive.append(residual if begin == 0.0 else residual[1:])
         if result is not None:
             (believed, levels), since = fed_back(result, len(space)), end
         begin = end
@@ -158,10 +159,10 @@ def learnt(network: TankNetwork, fault_free: Recording, seed: int) -> tuple[Nois
     return noise, make_detector("cusum", TIME_BETWEEN_FALSE_ALARMS, sampling, channels, generator)
 
 
-def first_alarm(seen: Observation, noise: NoiseModel, detector: Detector) -> float | None:
+def first_alarm(time: Tensor, white: Tensor, detector: Detector) -> float | None:
     """Time of the first alarm of the white residual, s."""
-    index = int(detector.first_alarm(noise.whitening(seen.steady_residual)))
-    return None if index == NO_ALARM else float(seen.time[index])
+    index = int(detector.first_alarm(white))
+    return None if index == NO_ALARM else float(time[index])
 
 
 def varies(recording: Recording) -> bool:

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from fdi_torch.report.downsampling import thinned
+from fdi_torch.report.chart import thinned
 from fdi_torch.report.style import FAINT, INK, MARK, MODEL, OTHER, SOFT, label_lines, panel, styled
 
 _FIVE = (MODEL, MARK, OTHER, INK, SOFT)

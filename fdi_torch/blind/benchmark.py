@@ -16,20 +16,20 @@ import numpy as np
 
 from fdi_torch.blind.case_drafts import plans
 from fdi_torch.blind.case_kinds import ON_NETWORKS, STANDARD
-from fdi_torch.blind.cases import make
-from fdi_torch.blind.networks import Networks
-from fdi_torch.blind.places import effect_places
-from fdi_torch.blind.plants import Rig, three_tank
-from fdi_torch.blind.scored_rows import Row, judged
-from fdi_torch.blind.sealed_files import (
+from fdi_torch.blind.cases import (
     answers,
     append,
     lines_of,
+    make,
     manifest,
     read_plant,
     read_recording,
     write_cases,
 )
+from fdi_torch.blind.networks import Networks
+from fdi_torch.blind.places import effect_places
+from fdi_torch.blind.plants import Rig, three_tank
+from fdi_torch.blind.scored_rows import Row, judged
 from fdi_torch.estimate.uncertainty import plain_value
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -122,9 +122,7 @@ def answer_all(
     code: str,
     tell: Tell,
 ) -> None:
-    """Diagnose the cases without an answer, and append one JSON line each, until the time `stop`. The
-    key stays sealed.
-    """
+    """Diagnose the cases without an answer, one JSON line each, until the time `stop`. The key stays sealed."""
     lines = list(manifest(out).values())[:cases]
     answered = {(name, line["case"]) for name in diagnoses for line in lines_of(answers(out, name))}
     todo = [(name, line) for line in lines for name in diagnoses if (name, line["case"]) not in answered]

@@ -21,9 +21,8 @@ from fdi_torch.blind.conditions import (
 )
 from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.inputs import channel_to_rest
-from fdi_torch.blind.named_effects import NAMED
+from fdi_torch.blind.named_effects import NAMED, NominalRun
 from fdi_torch.blind.networks import Networks, with_unmeasured
-from fdi_torch.blind.nominal_run import NominalRun
 from fdi_torch.blind.plants import Rig
 from fdi_torch.blind.random_flows import draw_disturbance
 from fdi_torch.blind.simulator import SimulatedRun

@@ -1,4 +1,9 @@
-"""Simulation of cases and the readings of their sensors."""
+"""Simulation of cases and the readings of their sensors, with the laws of deviations at these.
+
+A law maps a signal sampled at `time` (T,) s, one column per lane. A sensor law acts on the true level (T, n) m, before
+noise; a readout law on the noisy reading. Between samples a level is taken to run straight: inputs switch at samples
+only.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.blind.conditions import HELD_OUT, RECORDED, Conditions
-from fdi_torch.blind.deviation import Array, Deviation
-from fdi_torch.blind.laws_sensor import READOUT_LAWS, SENSOR_LAWS
+from fdi_torch.blind.deviation import Array, Deviation, Numbers
 from fdi_torch.blind.plants import Rig
 from fdi_torch.blind.simulator import HiddenRigs, SimulatedRun, grouped, simulate
 from fdi_torch.plant.description import PlantDescription
@@ -47,3 +51,127 @@ def _with_laws(laws: Any, rig: Rig, signal: Array, deviations: Sequence[Deviatio
     for group in grouped(laws, [[s.name for s in rig.plant.sensors]], [tuple(deviations)]):
         result[:, group.spot] = group.law(result[:, group.spot], time, group.numbers)
     return result
+
+
+_SUBSTEPS = 20
+
+
+def offset(x: Array, time: Array, p: Numbers) -> Array:
+    return x + p["offset"]
+
+
+def stretched(x: Array, time: Array, p: Numbers) -> Array:
+    return p["gain"] * x
+
+
+def creeping(x: Array, time: Array, p: Numbers) -> Array:
+    """Drift at a constant rate."""
+    return x + p["rate"] * time[:, None]
+
+
+def late_reading(x: Array, time: Array, p: Numbers) -> Array:
+    """Pure delay; before the start, the first level."""
+    columns = [np.interp(time - d, time, column) for d, column in zip(p["delay"], x.T, strict=True)]
+    return np.stack(columns, axis=1)
+
+
+def damped(x: Array, time: Array, p: Numbers) -> Array:
+    """First-order lag (stilling pipe), by backward Euler with twenty steps per sample."""
+    return _chain(x, time, (p["tau"],))
+
+
+def damped_twice(x: Array, time: Array, p: Numbers) -> Array:
+    """Second-order lag (stilling pipe and filter): poles at 94 % and 6 % of the time constant."""
+    return _chain(x, time, (0.94 * p["tau"], 0.06 * p["tau"]))
+
+
+def _chain(x: Array, time: Array, taus: tuple[Array, ...]) -> Array:
+    states, out = [x[0].copy() for _ in taus], np.empty_like(x)
+    out[0] = x[0]
+    for i in range(1, len(time)):
+        shares = [(time[i] - time[i - 1]) / _SUBSTEPS / tau for tau in taus]
+        for j in range(1, _SUBSTEPS + 1):
+            drive = x[i - 1] + (x[i] - x[i - 1]) * (j / _SUBSTEPS)
+            for k, a in enumerate(shares):
+                states[k] = (states[k] + a * drive) / (1 + a)
+                drive = states[k]
+        out[i] = states[-1]
+    return out
+
+
+def clipped(x: Array, time: Array, p: Numbers) -> Array:
+    return np.minimum(x, p["ceiling"])
+
+
+def bowed(x: Array, time: Array, p: Numbers) -> Array:
+    """Curvature: error `bow` halfway between two levels without error."""
+    s = (x - p["low"]) / (p["high"] - p["low"])
+    return x + p["bow"] * 4 * s * (1 - s)
+
+
+def sticking_float(x: Array, time: Array, p: Numbers) -> Array:
+    """Hysteresis of a float with friction: the play operator."""
+    out = np.empty_like(x)
+    held = x[0] - p["slack"]
+    for i, level in enumerate(x):
+        held = np.minimum(np.maximum(held, level - p["slack"]), level + p["slack"])
+        out[i] = held
+    return out
+
+
+def humming(x: Array, time: Array, p: Numbers) -> Array:
+    """Slow beat between a disturbance and the sampling."""
+    return x + p["height"] * np.sin(2 * np.pi * time[:, None] / p["period"])
+
+
+def freezing(x: Array, time: Array, p: Numbers) -> Array:
+    """A transmitter that sometimes repeats its last value for a while."""
+    phase = np.mod(time[:, None] / p["period"], 1.0)
+    frozen = ((phase > 0.13) & (phase < 0.38)) | ((phase > 0.60) & (phase < 0.93))
+    out = x.copy()
+    for i in range(1, len(time)):
+        out[i] = np.where(frozen[i], out[i - 1], x[i])
+    return out
+
+
+def jumped(x: Array, time: Array, p: Numbers) -> Array:
+    """A zero shift at some time."""
+    return x + p["offset"] * (time[:, None] > p["onset"])
+
+
+def kinked(x: Array, time: Array, p: Numbers) -> Array:
+    """A different gain above some level."""
+    return x + p["extra"] * np.maximum(x - p["knee"], 0.0)
+
+
+def leading(x: Array, time: Array, p: Numbers) -> Array:
+    """Foam: positive error while the level rises, negative while it falls."""
+    return x + p["ahead"] * np.gradient(x, time, axis=0)
+
+
+def wandering(x: Array, time: Array, p: Numbers) -> Array:
+    """Zero that varies with the temperature: two slow sines of incommensurate periods."""
+    t = 2 * np.pi * time[:, None] / p["period"]
+    return x + 0.5 * p["height"] * (np.sin(t) + np.sin(t / 0.618 + 1.0))
+
+
+def rounded(x: Array, time: Array, p: Numbers) -> Array:
+    return p["step"] * np.round(x / p["step"])
+
+
+def bursting(x: Array, time: Array, p: Numbers) -> Array:
+    """Short bursts of outliers: each starts with this probability, lasts up to four samples, and has one height."""
+    out = x.copy()
+    for column, (seed, chance, height) in enumerate(zip(p["seed"], p["chance"], p["height"], strict=True)):
+        rng = np.random.default_rng(int(seed))
+        for start in np.flatnonzero(rng.random(len(x)) < chance):
+            out[start : start + rng.integers(1, 5), column] += height * rng.choice((-1, 1)) * (0.5 + rng.exponential())
+    return out
+
+
+SENSOR_LAWS = {law.__name__: law for law in (
+    late_reading, damped, damped_twice, bowed, sticking_float, leading, kinked, stretched, offset, jumped, wandering,
+    creeping, humming, freezing, clipped,
+)} | {"clipped_reading": clipped}  # fmt: skip
+# A transmitter's own limit clips the noise with the level: it acts twice, on either side of the noise.
+READOUT_LAWS = {"bursting": bursting, "clipped_reading": clipped, "rounded": rounded}

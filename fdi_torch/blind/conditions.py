@@ -8,22 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.blind.control import LevelControl, draw_control
 from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.inputs import (
     DECIMALS,
     FACTORS,
+    LevelControl,
     as_printed,
     channel_limits,
     command_unit,
     commanded,
+    draw_control,
     drawn,
     pumps_of_channels,
     with_standstills,
 )
-from fdi_torch.blind.plants import Rig
+from fdi_torch.blind.plants import BENCH, Rig, Scales, on_bench
 from fdi_torch.blind.random_flows import Disturbance
-from fdi_torch.blind.scaling import BENCH, Scales, on_bench
 from fdi_torch.blind.sensor_noise import WHITE, NoiseCorrelation, draw_correlation
 from fdi_torch.blind.simulator import Drive, HiddenRigs, SimulatedRun, simulate
 from fdi_torch.parameters import ParameterName
@@ -76,9 +76,7 @@ class Conditions:
 
 
 def as_built(plant: PlantDescription, rng: np.random.Generator) -> PlantDescription:
-    """The rig as built, with constants drawn within their tolerances: x (1 + s z), or x + s z for an offset, with z
-    standard normal and clipped.
-    """
+    """The rig as built: constants x (1 + s z), offsets x + s z, with tolerance s and z standard normal, clipped."""
     drawn: dict[str, dict[str, Any]] = {}
     for constant, tolerance in plant.tolerances.items():
         name = ParameterName.parse(constant)

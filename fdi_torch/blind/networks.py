@@ -41,9 +41,7 @@ class Networks:
             )
 
     def rig(self, rng: np.random.Generator) -> Rig:
-        """A network whose equilibrium levels at medium inputs lie between two shares of the rims; others
-        are rejected.
-        """
+        """A network whose equilibrium levels at medium inputs lie between two shares of the rims."""
         tanks = int(rng.integers(self.fewest, self.most + 1))
         for _ in range(_MOST_DRAWS):
             plant = _drawn(rng, tanks)

@@ -58,9 +58,7 @@ def effect_places(plant: PlantDescription) -> tuple[Cause, ...]:
 
 
 def canonical(cause: Cause, plant: PlantDescription) -> Cause:
-    """The canonical name of a cause: a leak at the floor of a drained tank and a wider outlet are both
-    called the leak.
-    """
+    """The canonical name of a cause: a leak at the floor and a wider outlet of a drained tank are both the leak."""
     effect, location = cause
     if effect == "plugging":
         for pipe in plant.pipes:

@@ -110,9 +110,7 @@ def _stated(kind: str, true: list[Cause], answer: Answer, plant: PlantDescriptio
 def _judge_unknown(
     unknown: Cause, named: list[Cause], causes: list[Cause], sets: list[list[Cause]], verdict: Any, where: list[str]
 ) -> Row:
-    """Scores for a law outside the library. named: true causes of the library at other locations, all of which
-    `cause_beside` requires.
-    """
+    """Scores for a law outside the library. named: true causes elsewhere, all of which `cause_beside` requires."""
     at_place = where[:1] == [unknown[1]] or unknown in causes
     row = {"right": verdict == "unknown" and at_place, "place": at_place, "named_wrong": verdict == "named"}
     if not named:

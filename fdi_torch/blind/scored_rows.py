@@ -1,16 +1,20 @@
-"""Scored answers as rows, of one benchmark or several, and the scores of rows that belong together."""
+"""Scored answers as rows, of one benchmark or several, the scores of rows that belong together, and their tables for
+terminal, report page and Markdown.
+"""
 
 from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from fdi_torch.blind.cases import answers, lines_of, manifest, open_key, read_plant
 from fdi_torch.blind.score import Row, by_effect, judge, summary
-from fdi_torch.blind.sealed_files import answers, lines_of, manifest, open_key, read_plant
 from fdi_torch.blind.sizes import sizes
 from fdi_torch.blind.statistics import clopper_pearson
 from fdi_torch.disk import write_text
@@ -107,3 +111,135 @@ def reliability(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 {"low": low, "high": high, "stated": mean} | share | {"ci95": clopper_pearson(hits, len(inside))}
             )
     return bins
+
+
+OWN = "fdi"
+NAMES = {
+    "right": "right",
+    "in_set": "truth in the answer set",
+    "place": "right place",
+    "named_wrong": "named and wrong",
+}
+SIZES = {
+    "false_alarm": "false alarm",
+    "detected": "detected",
+    "set_size": "explanations",
+    "utility": "utility",
+    "cause_beside": "cause named beside an unknown",
+}
+CLOSURE = {
+    "closed_within": "`closed` within 3 points",
+    "median_closed_error": "median error of `closed`",
+    "sec": "s a case",
+    "median_sec": "median s a case",
+}
+MOST_MISSES = 200
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table with a title; the first `left` columns are text."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    left: int = 1
+
+
+def sheets(by: Mapping[str, Scores]) -> list[Sheet]:
+    """All score tables of one rig, from the scores by diagnosis."""
+    own, others = by[OWN], [name for name in by if name != OWN]
+    strata = own["strata"]
+    beside = [[s, *(in_words(by[n]["strata"].get(s, {}).get("right")) for n in (OWN, *others))] for s in strata]
+    over_all = [
+        [name, *(in_words(by[name]["strata"]["all"].get(c)) for c in (*NAMES, "utility"))] for name in (OWN, *others)
+    ]
+    tables = [
+        Sheet("Names and places, by kind", ("kind", *NAMES.values()), _rows(strata, NAMES)),
+        Sheet("Alarm, size of the answer set and utility, by kind", ("kind", *SIZES.values()), _rows(strata, SIZES)),
+        Sheet("Closure and time, by kind", ("kind", *CLOSURE.values()), _rows(strata, CLOSURE)),
+        Sheet("Right answers, and those of the baselines", ("kind", OWN, *others), beside),
+        Sheet("All kinds together, and the baselines", ("", *NAMES.values(), "utility"), over_all),
+        Sheet(
+            "Calibration: how often the best explanation is true, by its stated probability",
+            ("stated probability", "mean", "is true"),
+            [[f"{b['low']:g} to {b['high']:g}", f"{b['stated']:.3f}", in_words(b)] for b in own["calibration"]],
+        ),
+        Sheet(
+            "Sizes of named causes, by effect: z against the truth",
+            ("effect", "root mean square of z", "within 1.96 standard errors"),
+            _rows(own["sizes"], ("rms", "within")),
+        ),
+        Sheet(
+            "Cases with one cause, by effect; laws outside the library by their own name",
+            ("effect", *NAMES.values()),
+            _rows(own["by_effect"], NAMES),
+        ),
+    ]
+    return [sheet for sheet in tables if sheet.rows]
+
+
+def misses(rows: Iterable[Row]) -> Sheet:
+    """Wrong answers of our diagnosis."""
+    wrong = [row for row in rows if row["by"] == OWN and not row["right"]]
+    return Sheet(
+        "Wrong answers",
+        ("kind", "rig", "seed", "case", "truth", "verdict", "best explanation"),
+        [
+            [r["kind"], r["rig"], str(r["seed"]), r["case"], _truth(r), r["verdict"], listed(r["causes"])]
+            for r in wrong[:MOST_MISSES]
+        ],
+        left=7,
+    )
+
+
+def origin(rows: Iterable[Row]) -> str:
+    """Number of cases, their seeds, and the states of the code that answered."""
+    own = list(rows)
+    seeds = ", ".join(str(seed) for seed in sorted({row["seed"] for row in own}))
+    by_code = Counter(row["code"] or "an unknown state" for row in own)
+    states = ", ".join(f"{code} ({count})" for code, count in by_code.items())
+    return f"{len(own)} cases of seeds {seeds}, answered by the code of {states}. Brackets are 95 % intervals."
+
+
+def listed(causes: Iterable[Sequence[str]]) -> str:
+    return " + ".join(f"{effect} at {place}" for effect, place in causes)
+
+
+def _truth(row: Row) -> str:
+    """True causes; laws outside the library by their own name."""
+    law = row.get("law") or row["effect"]  # older logs have the latter only
+    return listed((law if e == "unknown" else e, p) for e, p in row["truth"]) or "nothing"
+
+
+def markdown(scores: Tables, rows: Sequence[Row]) -> str:
+    """All tables of all rigs, then the wrong answers, as Markdown."""
+    parts = []
+    for group, by in scores.items():
+        parts += [f"## {group}", origin(row for row in rows if row["by"] == OWN and group_of(row) == group)]
+        for sheet in sheets(by):
+            parts += [f"{sheet.title}:", _table(sheet)]
+    missed = misses(rows)
+    return "\n\n".join([*parts, f"## {missed.title}", _table(missed)] if missed.rows else parts) + "\n"
+
+
+def in_words(score: Mapping[str, Any] | None) -> str:
+    """Hits of cases with their interval in per cent; or a mean or median with its interval."""
+    if not score:
+        return ""
+    low, high = score["ci95"]
+    if "share" in score:
+        return f"{score['hits']}/{score['of']} ({100 * low:.0f} .. {100 * high:.0f} %)"
+    value = score["mean"] if "mean" in score else score["median"]
+    if low is None or low != low:
+        return f"{value:.2g}"
+    return f"{value:.3g} ({low:.2g} .. {high:.2g})"
+
+
+def _rows(strata: Mapping[str, Mapping[str, Any]], columns: Iterable[str]) -> list[list[str]]:
+    return [[name, *(in_words(scores.get(column)) for column in columns)] for name, scores in strata.items()]
+
+
+def _table(sheet: Sheet) -> str:
+    lines = [sheet.header, ["---"] * len(sheet.header), *sheet.rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.blind.control import LevelControl
 from fdi_torch.blind.deviation import Array, Deviation, Index, Moment
+from fdi_torch.blind.inputs import LevelControl
 from fdi_torch.blind.laws_pipe import HEAD_LAWS, PIPE_LAWS
 from fdi_torch.blind.laws_pump import PUMP_LAWS
 from fdi_torch.blind.laws_tank import STORAGE_LAWS, TANK_LAWS
@@ -35,9 +35,7 @@ def conductance(plant: PlantDescription) -> Array:
 
 @dataclass
 class Group:
-    """The places where one law is at work. spot, other (n,): index of the component and of the tank at the other end
-    among those of all rigs.
-    """
+    """The places of one law. spot, other (n,): index of the component, and of the tank at its other end."""
 
     law: Callable[..., Any]
     spot: Index

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from fdi_torch.blind.scaling import Scales
+from fdi_torch.blind.plants import Scales
 from fdi_torch.blind.simulator import conductance
 from fdi_torch.blind.statistics import clopper_pearson, root_mean_square_interval
 from fdi_torch.plant.description import PlantDescription

@@ -18,11 +18,9 @@ import torch
 from fdi_torch.blind.benchmark import Diagnosis, Each, blind_benchmark
 from fdi_torch.blind.conditions import exercised
 from fdi_torch.blind.networks import Networks
-from fdi_torch.blind.plants import RIGS, Rig
-from fdi_torch.blind.scaling import scales_of
+from fdi_torch.blind.plants import RIGS, Rig, scales_of
 from fdi_torch.blind.score import Row
-from fdi_torch.blind.score_tables import misses, sheets
-from fdi_torch.blind.scored_rows import Tables, joined
+from fdi_torch.blind.scored_rows import Tables, joined, misses, sheets
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.config.plant_file import chosen_plant

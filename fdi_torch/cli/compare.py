@@ -1,6 +1,6 @@
 """`fdi compare`: what it does and prints. Its options: `options/compare.py`.
 
-Path: cli.compare.run → jobs.run_comparison.compare → logbook.compare.compare →
+Path: cli.compare.run → jobs.report.compare → logbook.compare.compare →
 report.comparison_headline.comparison_headline
 """
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import replacing
-from fdi_torch.jobs.run_comparison import ComparisonResult, compare
+from fdi_torch.jobs.report import ComparisonResult, compare
 from fdi_torch.report.comparison import result_table
 from fdi_torch.report.comparison_headline import left_out_words, setting_differences
 from fdi_torch.report.style import save

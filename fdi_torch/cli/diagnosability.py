@@ -14,7 +14,7 @@ import torch
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import planned_recordings
 from fdi_torch.config.plant_file import chosen_plant
-from fdi_torch.config.reading_noise import reading_noise
+from fdi_torch.config.simulation import reading_noise
 from fdi_torch.effects import full_name
 from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
 from fdi_torch.monitor.monitor_setup import usual_faults

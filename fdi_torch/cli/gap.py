@@ -148,8 +148,7 @@ def _error(plant: PlantDescription, recordings: Sequence[Recording]) -> float:
     for recording in recordings:
         errors = predict(plant, recording).rmse
         for sensor in plant.sensors:
-            column = recording.output_names.index(sensor.column)
-            std = float(recording.outputs[recording.mask[:, column], column].std())
+            std = float(recording.valid_readings(sensor.column).std())
             total += (errors[sensor.name] / max(std, 1e-300)) ** 2
     return total
 

@@ -1,6 +1,6 @@
 """`fdi inspect`: what it does and prints. Its options: `options/inspect.py`.
 
-Path: cli.inspect.run → logbook.inspect.inspect_log → logbook.export.export
+Path: cli.inspect.run → logbook.export.inspect_log → logbook.export.export
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import named_errors, write_text
 from fdi_torch.logbook import Inspection, export, export_attachment, foxglove_layout, inspect_log, read_run
 from fdi_torch.names import counted
-from fdi_torch.report.estimate_table import HEADER, correlation_table, estimate_cells
+from fdi_torch.report.numbers import HEADER, correlation_table, estimate_cells
 
 MOST_RESULTS, MOST_COLUMNS = 12, 11
 ESTIMATE = ("names", "units", "value", "std", "covariance", "covariance_shape")  # results that are shown as tables

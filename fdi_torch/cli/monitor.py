@@ -21,7 +21,7 @@ from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.logbook import Listener
-from fdi_torch.logbook.channel import Channel
+from fdi_torch.logbook.topic_definitions import Channel
 from fdi_torch.monitor.events import FORMAT, Event
 from fdi_torch.monitor.monitor_setup import PreparedMonitor
 from fdi_torch.quantities import quantity_text
@@ -102,8 +102,8 @@ def _metrics(wish: str, screen: Screen) -> Iterator[Listener]:
 
 @contextmanager
 def _publisher(url: str) -> Iterator[Publish]:
-    from fdi_torch.live.address import address_of
     from fdi_torch.live.mqtt import EventPublisher
+    from fdi_torch.live.values import address_of
 
     try:
         publisher = EventPublisher(address_of(url, ("mqtt", "mqtts")))

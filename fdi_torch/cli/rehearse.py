@@ -1,6 +1,6 @@
 """`fdi rehearse`: what it does and prints. Its options: `options/rehearse.py`.
 
-Path: cli.rehearse.run → config.rehearsal_file.load_rehearsal → jobs.rehearsal.rehearse → jobs.rehearsal.result_tables
+Path: cli.rehearse.run → config.rehearsal_file.load_rehearsal → jobs.study.rehearse → jobs.study.result_tables
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import argparse
 from fdi_torch.cli.options import live
 from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.config.rehearsal_file import load_rehearsal
-from fdi_torch.jobs.rehearsal import RehearsalResult, rehearse
+from fdi_torch.jobs.study import RehearsalResult, rehearse
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:

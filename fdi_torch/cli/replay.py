@@ -43,7 +43,7 @@ def faithful(arguments: argparse.Namespace, screen: Screen) -> int:
 def what_if(arguments: argparse.Namespace, screen: Screen) -> int:
     """Repeat the run with another setting, and compare the new log with the old one."""
     from fdi_torch.jobs.replay import repeat_run
-    from fdi_torch.jobs.run_comparison import compare
+    from fdi_torch.jobs.report import compare
 
     source = Path(arguments.log)
     target = Path(arguments.out or source.with_name(f"{source.name.removesuffix('.mcap')}.what_if.mcap"))

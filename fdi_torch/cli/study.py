@@ -1,7 +1,7 @@
 """`fdi study`: what it does and prints. Its options: `options/study.py`.
 
 Path: cli.study.run → config.study_file.load_study → jobs.study.run_study → study.monte_carlo.run_blocks (or
-study.cluster.run_on_cluster) → study.trial_readings.make_trials → study.summary.summarise
+study.cluster.run_on_cluster) → study.monte_carlo.make_trials → study.summary.summarise
 """
 
 from __future__ import annotations

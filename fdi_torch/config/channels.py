@@ -12,15 +12,14 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text, si_unit_of
 from fdi_torch.recordings.csv_files import first_row, read_header
 from fdi_torch.recordings.csv_tags import tag_columns
-from fdi_torch.recordings.csv_text import HeaderlessError
-from fdi_torch.recordings.header import header_unit, names_in
+from fdi_torch.recordings.csv_text import HeaderlessError, header_unit, names_in
 from fdi_torch.recordings.source import ChannelSource, ClockSource
+
+ONLY_CLOCK = ("stamps", "zone", "shift", "sort", "period")  # keys that time alone may have
 
 
 def channel_mapping(config: FileConfig, plant: PlantDescription) -> dict[str, ChannelSource]:
-    """The source of each channel that the configuration mentions; time is `t`. Raises ValueError for unknown channels
-    and keys.
-    """
+    """The source of each channel mentioned; time is `t`. Raises ValueError for unknown channels and keys."""
     units = _units(plant)
     mapping: dict[str, ChannelSource] = {}
     for name, column in config.columns.items():
@@ -36,9 +35,9 @@ def channel_mapping(config: FileConfig, plant: PlantDescription) -> dict[str, Ch
 
 def _expect_keys_that_fit(place: str, name: str, column: ColumnConfig, plant: PlantDescription) -> None:
     """Raises ValueError for a key that does not apply to that channel."""
-    only_clock, only_input = ("stamps", "zone", "shift", "sort", "period"), ("held",)
+    only_input = ("held",)
     only_channel = ("constant", "recorded", "held", "words", "quality", "good", "plus")
-    not_allowed = only_channel if name == "t" else only_clock
+    not_allowed = only_channel if name == "t" else ONLY_CLOCK
     if name != "t" and name not in plant.channels():
         not_allowed = (*not_allowed, *only_input)
     for key in not_allowed:
@@ -56,15 +55,7 @@ def _expect_rows_in_time(place: str, column: ColumnConfig, config: FileConfig) -
 
 
 def _clock_source(column: ColumnConfig) -> ClockSource:
-    return ClockSource(
-        column.column,
-        column.unit,
-        stamps=column.stamps,
-        zone=column.zone,
-        shift=column.shift,
-        sort=column.sort,
-        period=column.period,
-    )
+    return ClockSource(column.column, column.unit, **{key: getattr(column, key) for key in ONLY_CLOCK})
 
 
 def _channel_source(place: str, column: ColumnConfig, unit: str) -> ChannelSource:

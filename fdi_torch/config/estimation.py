@@ -13,13 +13,12 @@ from fdi_torch.config.problems import ConfigError, naming
 from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity, quantity_at
 from fdi_torch.effects import all_placements, build_network, full_name, placements_for, unknown_parameter
 from fdi_torch.estimate.evolution_settings import STRATEGIES, EvolutionSettings
+from fdi_torch.estimate.objectives import Objective
 from fdi_torch.names import shortened, unknown
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.quantities import display_unit
-
-Objective = Literal["correlation", "likelihood"]
 
 
 class ParameterConfig(Strict):

@@ -13,9 +13,8 @@ from fdi_torch.config.channels import expect_units
 from fdi_torch.config.problems import naming
 from fdi_torch.config.recording_config import StartLevels
 from fdi_torch.config.strict import Amount, HeldFor, Seconds, Strict, quantity
-from fdi_torch.live.address import Address, address_of
 from fdi_torch.live.row_buffer import LiveChannel, Row, RowBuffer
-from fdi_torch.live.values import Connection
+from fdi_torch.live.values import Address, Connection, address_of
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import si_unit_of, unit_factor

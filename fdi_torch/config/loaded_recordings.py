@@ -20,7 +20,6 @@ from fdi_torch.config.channels import (
     unrecorded_valves,
     without_column,
 )
-from fdi_torch.config.file_kinds import expect_kind
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.recording_config import (
     ColumnConfig,
@@ -30,7 +29,7 @@ from fdi_torch.config.recording_config import (
     config_of,
     in_seconds,
 )
-from fdi_torch.config.yaml_files import YAML_ENDINGS, find_data, find_file, read_extended
+from fdi_torch.config.yaml_files import YAML_ENDINGS, expect_kind, find_data, find_file, read_extended
 from fdi_torch.logbook import LogError
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription

@@ -34,13 +34,7 @@ class WindowConfig(Strict):
     together: int = Field(2, ge=1, description="greatest number of simultaneous faults")
 
     def settings(self) -> MonitorSettings:
-        return MonitorSettings(
-            lookback=self.lookback,
-            confirm=self.confirm,
-            longest=self.longest,
-            incipient=self.incipient,
-            together=self.together,
-        )
+        return MonitorSettings(**self.model_dump(exclude={"stride"}))
 
 
 class MonitorConfig(Strict):

@@ -2,28 +2,72 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Callable, Sized
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_type_hints
 
+import pydantic
 from pydantic import Field, ValidationError
 
-from fdi_torch.config.component_sections import component_sections
-from fdi_torch.config.file_kinds import expect_kind
 from fdi_torch.config.plant_in_code import Plant, effect_in_si, effect_parameters, si_value, tolerances_in_si
 from fdi_torch.config.problems import explain, naming
-from fdi_torch.config.strict import Acceleration, Amount, Strict, quantity
+from fdi_torch.config.strict import Acceleration, Amount, Strict, quantity, quantity_of
 from fdi_torch.config.written_units import written_units
-from fdi_torch.config.yaml_files import find_plant, read_yaml
+from fdi_torch.config.yaml_files import expect_kind, find_plant, read_yaml
 from fdi_torch.effects import units_for_display
 from fdi_torch.names import unknown
 from fdi_torch.parameters import ParameterName
+from fdi_torch.plant.components import Component
 from fdi_torch.plant.description import FLOW_KINDS, READING_UNITS, FaultPriority, PlacedEffect, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.quantities import SI_UNITS, display_in, unit_factor
 from fdi_torch.untrusted_input import MOST_COMPONENTS
+
+
+def component_sections(base: type[Strict]) -> type[Strict]:
+    """The model `base` with one mapping of components by name for each kind: `tanks`, `pipes` and others."""
+    sections: dict[str, Any] = {"tanks": (_components(Tank), ...)}
+    sections |= {kind.part(): (_components(kind), Field(default_factory=dict)) for kind in FLOW_KINDS}
+    return pydantic.create_model(f"{base.__name__}WithComponents", __base__=base, **sections)
+
+
+def _components(kind: type[Component]) -> Any:
+    """Mapping of names to components of a kind, with a key for each field that has a meaning in plant files."""
+    hints = get_type_hints(kind)
+    keys: dict[str, Any] = {f.name: _key(f, hints[f.name]) for f in written_fields(kind)}
+    return dict[str, pydantic.create_model(f"{kind.__name__}Config", __base__=Strict, **keys)]  # type: ignore[misc]
+
+
+def written_fields(kind: type[Component]) -> list[dataclasses.Field[Any]]:
+    """The fields of a kind that plant files have."""
+    return [f for f in fields(kind) if "meaning" in f.metadata]  # type: ignore[arg-type]
+
+
+def written_default(field: dataclasses.Field[Any]) -> Any:
+    """The value of a field that a plant file leaves out; MISSING if it is required."""
+    return field.metadata.get("written_default", field.default)
+
+
+def _key(field: dataclasses.Field[Any], hint: Any) -> tuple[Any, Any]:
+    meta, default = field.metadata, written_default(field)
+    annotation = hint
+    if "unit_field" in meta:
+        annotation = Amount
+    elif "unit" in meta:
+        annotation = Annotated[float, *quantity_of(meta["unit"])]
+        if default is None:
+            none = pydantic.BeforeValidator(lambda value: None if value == meta["none"] else value)
+            annotation = Annotated[annotation | None, none]
+    return annotation, Field(
+        ... if default is MISSING else default,
+        description=meta["meaning"],
+        ge=meta.get("least"),
+        le=meta.get("most"),
+    )
+
 
 MARK = re.compile(r"\s*([\w.-]+):[^#]*#\s*!\s*(.*\S)\s*")
 """An entry whose comment begins with an exclamation mark."""

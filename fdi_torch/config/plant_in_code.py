@@ -170,9 +170,7 @@ def _units_as_written(plant: PlantDescription) -> dict[str, str]:
 
 
 def si_value(place: str, value: float | str, unit: str, read: Read | None = None) -> float:
-    """The SI value of a quantity: text by its unit, a number unchanged; or by `read`. Raises ValueError naming
-    `place`.
-    """
+    """The SI value of a text with a unit; a number is unchanged. Or by `read`. Raises ValueError naming `place`."""
     with naming(place):
         if read is None:
             return quantity(value, unit) if isinstance(value, str) else quantity(value, "1")

@@ -90,9 +90,7 @@ def _changes(before: PlantDescription, after: PlantDescription) -> Iterator[tupl
 
 
 def _unit_of(path: Path, plant: PlantDescription) -> str:
-    """The unit in which a new entry of the file is written if its SI unit is "1": % for a relative tolerance, otherwise
-    the unit for display.
-    """
+    """The unit of a new entry whose SI unit is "1": % for a relative tolerance, otherwise that for display."""
     name = ".".join(map(str, path[-2:])) if path[0] == "sensors" else str(path[-1])
     if path[0] == "tolerances" and name not in absolute_units(plant):
         return "%"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fdi_torch.config.component_sections import written_fields
+from fdi_torch.config.plant_file import written_fields
 from fdi_torch.config.plant_in_code import absolute_units, effect_parameters
 from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import write_yaml

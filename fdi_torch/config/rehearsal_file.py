@@ -12,16 +12,14 @@ from pydantic import BeforeValidator, Field
 
 from fdi_torch.capacity import expect_room
 from fdi_torch.config.monitor_file import WindowConfig
-from fdi_torch.config.reading_noise import reading_noise
 from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
+from fdi_torch.config.simulation import reading_noise
 from fdi_torch.config.strict import ScaledSeconds, Share, Strict, quantity
 from fdi_torch.effects import build_network, full_name, placements_for
 from fdi_torch.monitor.monitor_setup import with_shapes
-from fdi_torch.monitor.monte_carlo.detection_plan import DetectionPlan
-from fdi_torch.monitor.monte_carlo.false_alarm_plan import FalseAlarmPlan
+from fdi_torch.monitor.monte_carlo.detection_plan import DetectionPlan, FalseAlarmPlan
 from fdi_torch.monitor.monte_carlo.isolation_plan import IsolationPlan
-from fdi_torch.monitor.monte_carlo.level_control import moving_commands, moving_set_points
-from fdi_torch.monitor.monte_carlo.simulated_runs import SimulatedRig
+from fdi_torch.monitor.monte_carlo.simulated_runs import SimulatedRig, moving_commands, moving_set_points
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import parse_quantity

@@ -9,13 +9,12 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from pydantic import Field, ValidationError, field_validator
 
-from fdi_torch.config.file_kinds import expect_kind
 from fdi_torch.config.key_reference import meanings
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.strict import Config, Strict, scaled_to_plant
-from fdi_torch.config.yaml_files import find_file, read_extended, with_overrides, write_yaml
+from fdi_torch.config.yaml_files import expect_kind, find_file, read_extended, with_overrides, write_yaml
 from fdi_torch.effects import units_for_display
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale

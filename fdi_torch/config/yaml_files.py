@@ -1,9 +1,11 @@
-"""YAML files: reading, overriding by --set, writing and finding. This is the only file that imports yaml."""
+"""YAML files: reading, overriding by --set, writing and finding, and their kinds, recognized by their keys. This is the
+only file that imports yaml.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -185,9 +187,7 @@ def _set(node: Any, keys: Sequence[str], value: Any, override: str) -> None:
 
 
 def find_file(name: str, base: Path, also: Sequence[Path] = ()) -> Path:
-    """A file named in a configuration: as given, relative to the configuration's folder, the current folder, or
-    `also`.
-    """
+    """A file named in a configuration: as given, relative to its folder, the current folder, or `also`."""
     folders = [base, Path.cwd(), *also]
     for folder in folders:
         if (folder / name).is_file():
@@ -227,3 +227,35 @@ def find_plant(name: str, base: Path) -> Path:
 def _similar(name: str, folders: Sequence[Path]) -> str:
     beside = {path.name for folder in folders for path in (folder / name).parent.glob("*")}
     return nearest(Path(name).name, beside)
+
+
+_OWN_KEYS = {
+    "plant": ("tanks",),
+    "study": ("study",),
+    "monitor": ("fault_free", "recording", "source"),
+    "rehearsal": ("reading_noise", "false_alarms", "faults_found", "naming"),
+    "run": ("recordings", "simulate", "estimate"),
+}
+_READ_BY = {
+    "study": "fdi study reads it; without its block study it is a run file",
+    "monitor": "fdi monitor reads it",
+    "rehearsal": "fdi rehearse reads it",
+    "run": "fdi train and fdi simulate read it",
+}
+
+
+def expect_kind(data: Mapping[str, Any], kind: str, file: Path, expected: str = "") -> None:
+    """Raises ConfigError if the keys of a file are those of another kind: plant, run, study, monitor or rehearsal.
+
+    expected: what could be there, in words; by default a file of that kind. A run file may become a study by --set.
+    """
+    kinds = [each for each, keys in _OWN_KEYS.items() if any(key in data for key in keys)]
+    base = "run" if kind == "study" else kind
+    if not kinds or kinds[0] == kind or (base in kinds and (kind == "study" or "study" not in kinds)):
+        return
+    given = kinds[0]
+    if given == "plant":
+        advice = f"name it under the key plant of such a file: fdi new {kind} --plant {file.name} writes one"
+    else:
+        advice = _READ_BY[given]
+    raise ConfigError([f"{file}: expected {expected or f'a {kind} file'}, got a {given} file; {advice}"])

@@ -17,10 +17,16 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.batch_algebra import apply, dot, row_sum
-from fdi_torch.estimate.bounds import reflected
 from fdi_torch.estimate.draws import stream, uniform
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
-from fdi_torch.estimate.strategy import Proposal, SearchState, before_first_generation, pick, with_first_guess
+from fdi_torch.estimate.strategy import (
+    Proposal,
+    SearchState,
+    before_first_generation,
+    pick,
+    reflected,
+    with_first_guess,
+)
 
 FIRST_STEP = 0.3  # in widths of the box (Hansen 2016, section B.1: about a quarter, so that the optimum is within 3 s)
 

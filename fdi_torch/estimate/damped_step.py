@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from fdi_torch.estimate.batch_algebra import apply, dot, solve_positive
-from fdi_torch.estimate.refined import held_back
+from fdi_torch.estimate.linearisation import held_back
 
 _RIDGE = 1e-10  # relative to the unit diagonal: regularises combinations of parameters without curvature
 _MAX_CORRECTION_RATIO = 0.75  # largest 2 |correction| / |step| (Transtrum and Sethna 2012, section 3.2)

@@ -77,9 +77,7 @@ class Diagnosis:
 
     @property
     def statement(self) -> str:
-        """Kind and names of the faults that differ from nominal: 'multiple faults: leak at T1, leak at T2 or plugging
-        at OUT2'.
-        """
+        """Kind and names of the faults present: 'multiple faults: leak at T1, leak at T2 or plugging at OUT2'."""
         names = ", ".join([*(parameter_words(f.name) for f in self.present), *map(_rivals, self.not_isolated)])
         return f"{self.kind}: {names or self._none}"
 

@@ -15,11 +15,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from fdi_torch.estimate.bounds import halfway
 from fdi_torch.estimate.draws import stream, uniform
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.shade import draw_factor, draw_rate, update_archive, update_memory
-from fdi_torch.estimate.strategy import Proposal, SearchState, before_first_generation, pick, with_first_guess
+from fdi_torch.estimate.strategy import Proposal, SearchState, before_first_generation, halfway, pick, with_first_guess
 
 _VARIATION, _ARCHIVE = 0, 2  # indices of the random streams of one generation
 

@@ -17,19 +17,20 @@ from fdi_torch.device import on_its_device
 from fdi_torch.estimate.diagnosis import Diagnosis, correlation_inflation, diagnose
 from fdi_torch.estimate.evolution import EvolutionResult, Search, evolve
 from fdi_torch.estimate.fitting import Fitting
-from fdi_torch.estimate.hybrid_settings import HybridSettings, with_less_effort
 from fdi_torch.estimate.levenberg_marquardt import Progress
+from fdi_torch.estimate.linearisation import Refined
 from fdi_torch.estimate.misfit import channel_misfit, worst
 from fdi_torch.estimate.objectives import Problem
-from fdi_torch.estimate.refined import Refined
 from fdi_torch.estimate.refinement import (
     ADAPTIVE_STEPS,
+    HybridSettings,
     nearest_to_nominal,
     refine_adaptively,
     refine_to_convergence,
     starting_points,
     status_of,
     unrefined,
+    with_less_effort,
 )
 from fdi_torch.estimate.uncertainty import Estimate, make_estimate
 from fdi_torch.plant.scales import time_scale

@@ -28,15 +28,19 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.damped_step import Quadratic, Step, bent_step, damped_step, newton_decrement
-from fdi_torch.estimate.linearisation import AnyTrial, Linearisation, Linearise, Neighbourhood, are_all_lanes
-from fdi_torch.estimate.refined import (
+from fdi_torch.estimate.linearisation import (
     ABANDONED,
     CONVERGED,
     FAILED,
     MAX_ITERATIONS,
     RUNNING,
     STALLED,
+    AnyTrial,
+    Linearisation,
+    Linearise,
+    Neighbourhood,
     Refined,
+    are_all_lanes,
     flat_box,
     typical_size,
     unfinished,

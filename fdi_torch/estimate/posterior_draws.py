@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fdi_torch.estimate.bounds import reflected
+from fdi_torch.estimate.strategy import reflected
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
 

@@ -187,3 +187,23 @@ def pick(rows: Float[Tensor, "*problems M P"], index: Int[Tensor, "*problems K"]
     problem = torch.arange(index[..., 0].numel(), device=index.device).reshape(*index.shape[:-1], 1)
     flat = (index + problem * rows.shape[-2]).reshape(-1)
     return rows.reshape(-1, rows.shape[-1]).index_select(0, flat).reshape(*index.shape, rows.shape[-1])
+
+
+def halfway(theta: Tensor, parent: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Midpoint between the parent and the violated bound (Zhang & Sanderson 2009, JADE; Tanabe & Fukunaga 2014).
+
+    parent: the vector inside the box that `theta` was made from.
+    """
+    return _where_outside(theta, (torch.where(theta < low, low, high) + parent) / 2.0, low, high)
+
+
+def reflected(theta: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Reflection at the bounds, as often as needed."""
+    width = high - low
+    turns = torch.remainder((theta - low) / torch.where(width > 0, width, 1.0), 2.0)
+    return _where_outside(theta, low + width * torch.where(turns > 1.0, 2.0 - turns, turns), low, high)
+
+
+def _where_outside(theta: Tensor, repaired: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    # The clamp removes rounding errors: low + 1.0 * width may exceed high.
+    return torch.where((theta < low) | (theta > high), repaired.clamp(low, high), theta)

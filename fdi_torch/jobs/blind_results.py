@@ -7,10 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from fdi_torch.blind.cases import manifest, read_plant
 from fdi_torch.blind.score import Row
-from fdi_torch.blind.score_tables import OWN, markdown
-from fdi_torch.blind.scored_rows import Tables, tables, write_rows
-from fdi_torch.blind.sealed_files import manifest, read_plant
+from fdi_torch.blind.scored_rows import OWN, Tables, markdown, tables, write_rows
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.disk import write_text
 from fdi_torch.estimate.uncertainty import plain_value

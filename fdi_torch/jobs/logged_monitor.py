@@ -20,8 +20,7 @@ from fdi_torch.amounts import parameter_words
 from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.gap.preprocess.acquisition import usable
-from fdi_torch.jobs.event_messages import event_fields
-from fdi_torch.jobs.monitor_rows import CLOCK, FROM_SOURCE, samples_of_rows
+from fdi_torch.jobs.monitor_rows import CLOCK, FROM_SOURCE, event_fields, samples_of_rows
 from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.monitor.diagnosability import diagnosability
 from fdi_torch.monitor.events import Event

@@ -8,28 +8,31 @@ from __future__ import annotations
 
 import math
 import os
+import queue
+import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
+from typing import TypeVar
 
 from fdi_torch.clock import clock_text, show_clock
 from fdi_torch.config.growing_recordings import Row, growing_rows
 from fdi_torch.config.live_source import LiveRows
 from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor_file import MonitorRun
-from fdi_torch.jobs.event_messages import event_key
-from fdi_torch.jobs.live_batches import DelayWatch, LiveBatches
 from fdi_torch.jobs.log_paths import RESUMES, expect_unfinished, free_path, partial_path
 from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.monitor_rows import (
     ALARM,
+    event_key,
+    fault_free_recording,
     logged_items,
     logged_origin,
-    recording_of_rows,
     resumed_items,
+    rows_in,
     rows_until,
 )
 from fdi_torch.logbook import Run as LoggedRun
@@ -72,7 +75,7 @@ def run_monitor(
     reported = Counter(event_key(message.payload) for message in messages)
     zeros: list[float] = []
     try:  # before the log begins, so that a source that cannot be reached leaves none
-        source = _source(run, idle, origin, _rows(earlier), zeros) if follow else iter(())
+        source = _source(run, idle, origin, rows_in(earlier), zeros) if follow else iter(())
     except BaseException:
         if unfinished is not None:
             os.replace(unfinished.path, partial_path(path))  # for the next attempt to resume
@@ -118,18 +121,17 @@ def _follow(
 ) -> None:
     """Process samples as they come, after waiting for the end of the fault-free part."""
     run = monitor.run
-    batches = LiveBatches(resumed_items(earlier, source) if _rows(earlier) else source)
+    batches = LiveBatches(resumed_items(earlier, source) if rows_in(earlier) else source)
     callbacks.tell(None, "waiting for samples")
     first = _until_fault_free_part_ends(run, callbacks, batches)
     zero = source.origin if isinstance(source, LiveRows) else next(iter(zeros), None)
     show_clock([zero])
-    rows = _rows(first)
-    monitor.learn(recording_of_rows(rows_until(rows, run.config.fault_free[1]) or rows, run))
+    monitor.learn(fault_free_recording(rows_in(first), run))
     if zero is not None:
         monitor.log_origin(zero)
     delay_watch = DelayWatch(time.monotonic)
     for batch in chain([first], batches):
-        rows = _rows(batch)
+        rows = rows_in(batch)
         notices = delay_watch.received([row[0] for row in rows]) if rows else []
         if monitor.process_items([*notices, *batch]):
             delay_watch.clock_jumped()
@@ -148,7 +150,7 @@ def _until_fault_free_part_ends(
     end = run.config.fault_free[1]
     for batch in batches:
         items += batch
-        rows = _rows(items)
+        rows = rows_in(items)
         callbacks.tell(None, f"{_last_sample(rows)}, learning until {end:g} s" if rows else "waiting for samples")
         if rows_until(rows, end):
             break
@@ -161,5 +163,93 @@ def _last_sample(rows: Sequence[Row]) -> str:
     return f"last sample at {rows[-1][0]:g} s" + (f" ({moment})" if moment else "")
 
 
-def _rows(items: Iterable[Row | str]) -> list[Row]:
-    return [item for item in items if not isinstance(item, str)]
+T = TypeVar("T")
+
+LARGEST_BATCH = 4096
+LATE, SILENT = 5.0, 2.0  # s of delay and of silence that are never reported
+BURST_INTERVALS = 10.0  # a longer silence, in sampling intervals, followed by as many samples is a burst
+
+
+class _End:
+    """Marks the end of the source."""
+
+
+class LiveBatches(Iterator[list[T]]):
+    """Iterator over batches: all items that a thread has read from the source since the previous batch.
+
+    An exception of the source is raised here, after the items before it. Ctrl-C interrupts the waiting.
+    """
+
+    def __init__(self, source: Iterator[T]) -> None:
+        self._queue: queue.Queue[T | BaseException | _End] = queue.Queue(LARGEST_BATCH)
+        self._end: BaseException | None = None
+        threading.Thread(target=self._read, args=(source,), daemon=True, name="live-batches").start()
+
+    def _read(self, source: Iterator[T]) -> None:
+        try:
+            for item in source:
+                self._queue.put(item)
+            self._queue.put(_End())
+        except BaseException as error:
+            self._queue.put(error)
+
+    def __next__(self) -> list[T]:
+        batch: list[T] = []
+        while self._end is None and len(batch) < LARGEST_BATCH:
+            try:
+                item = self._queue.get_nowait() if batch else self._queue.get()
+            except queue.Empty:
+                return batch
+            if isinstance(item, _End):
+                self._end = StopIteration()
+            elif isinstance(item, BaseException):
+                self._end = item
+            else:
+                batch.append(item)
+        if batch or self._end is None:
+            return batch
+        raise self._end
+
+
+class DelayWatch:
+    """Compares the plant's clock with real time, and reports processing delays and bursts after a silence.
+
+    clock: real time in s. Each notice is given once, and again when the delay or the silence has doubled. delay: of the
+    last processed sample against the least delayed one, s.
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock, self.delay = clock, 0.0
+        self._smallest_difference: float | None = None
+        self._last_batch: float | None = None
+        self._interval = 1.0
+        self._reported_delay, self._reported_silence = LATE, SILENT
+
+    def received(self, times: list[float]) -> list[str]:
+        """Notices after a batch with the sample times `times` (s) was received."""
+        now, notices = self._clock(), []
+        gaps = sorted(b - a for a, b in pairwise(times) if b > a)
+        self._interval = gaps[len(gaps) // 2] if gaps else self._interval
+        if self._last_batch is not None:
+            silence = now - self._last_batch
+            burst = silence > BURST_INTERVALS * self._interval and len(times) > BURST_INTERVALS
+            if burst and silence > 2.0 * self._reported_silence:
+                self._reported_silence = silence
+                notices.append(f"{len(times)} samples came at once after {silence:.1f} s of silence")
+        self._last_batch = now
+        return notices
+
+    def processed(self, time: float) -> list[str]:
+        """Notices after the sample with time `time` (s) was processed."""
+        difference = self._clock() - time
+        smallest = self._smallest_difference
+        self._smallest_difference = difference if smallest is None else min(smallest, difference)
+        self.delay = difference - self._smallest_difference
+        if self.delay > 2.0 * self._reported_delay:
+            self._reported_delay = self.delay
+            return [f"the monitor is {self.delay:.1f} s behind real time"]
+        return []
+
+    def clock_jumped(self) -> None:
+        """Restart the comparison after a jump of the plant's clock."""
+        self._smallest_difference = None

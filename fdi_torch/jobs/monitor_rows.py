@@ -1,17 +1,22 @@
-"""Rows read from a growing file, converted to samples and to the recording from which a monitor learns its noise."""
+"""Rows read from a growing file, converted to samples and to the recording from which a monitor learns its noise; and
+the samples and events in a monitor's log.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain, pairwise, takewhile
+from typing import Any
 
+import orjson
 import torch
 
 from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.logbook import Run as Log
 from fdi_torch.logbook import series
+from fdi_torch.monitor.events import FORMAT, Event
 from fdi_torch.monitor.samples import GAP, Samples
 from fdi_torch.recording import Recording
 
@@ -25,6 +30,11 @@ def samples_of_rows(rows: Sequence[Row], run: MonitorRun) -> Samples:
     time, inputs, readings = (torch.tensor(column, dtype=torch.float64) for column in zip(*rows, strict=True))
     sensors = len(run.plant.sensors)
     return Samples(time, inputs.reshape(len(time), -1), readings.reshape(-1, sensors), run.config.recording.hold)
+
+
+def rows_in(items: Iterable[Row | str]) -> list[Row]:
+    """The rows among rows and notices."""
+    return [item for item in items if not isinstance(item, str)]
 
 
 def rows_until(rows: Sequence[Row], until: float) -> list[Row]:
@@ -52,8 +62,9 @@ def rows_until(rows: Sequence[Row], until: float) -> list[Row]:
     return []
 
 
-def recording_of_rows(rows: Sequence[Row], run: MonitorRun) -> Recording:
-    """The rows after the last jump of the clock, as a recording."""
+def fault_free_recording(rows: Sequence[Row], run: MonitorRun) -> Recording:
+    """The first rows up to the end of the fault-free part, or else all after the last jump of the clock."""
+    rows = rows_until(rows, run.config.fault_free[1]) or rows
     if len(rows) < 2:
         raise ValueError(
             f"{run.config.recording.file}: expected samples to follow, got {len(rows)}; check that the plant delivers "
@@ -101,7 +112,7 @@ def resumed_items(earlier: Sequence[Row | str], source: Iterable[Row | str]) -> 
     A growing file begins with the rows that the log has, unless it was rotated.
     """
     yield from earlier
-    rows = [item for item in earlier if not isinstance(item, str)]
+    rows = rows_in(earlier)
     later, head = iter(source), list[Row | str]()
     for item in later:
         head.append(item)
@@ -128,3 +139,36 @@ def _equal_rows(a: Row, b: Row) -> bool:
     """Whether two rows have equal values; NaN equals NaN."""
     first, second = ([r[0], *r[1], *r[2]] for r in (a, b))
     return len(first) == len(second) and all(x == y or (x != x and y != y) for x, y in zip(first, second, strict=True))
+
+
+def event_key(payload: dict[str, Any]) -> tuple[Any, ...]:
+    """Key by which a logged event is recognised in another log."""
+    return payload["t"], payload["event"], payload["message"]
+
+
+def event_fields(event: Event) -> dict[str, Any]:
+    """An event's fields for the log: numbers, texts and flat lists, and the whole event as JSON in `details`."""
+    return {
+        "alarm": event.alarm or None,
+        "state": str(event.state),
+        "headline": event.headline if event.explanations else None,
+        "faults": list(event.faults) or None,
+        "sizes": list(event.sizes) or None,
+        "stds": list(event.stds) or None,
+        "units": list(event.units) or None,
+        "onset": event.onset,
+        "onset_std": event.onset_std,
+        "delay": event.delay,
+        "growing": event.growing if event.faults else None,
+        "explanations": [e.text for e in event.explanations] or None,
+        "masses": [e.mass for e in event.explanations] or None,
+        "sensors": [name for name, _ in event.shares] or None,
+        "shares": [share for _, share in event.shares] or None,
+        "first": event.first,
+        "last": event.last,
+        "count": event.count,
+        "severity": event.severity or None,
+        "announced": event.announced,
+        "format": FORMAT,
+        "details": orjson.dumps(event.to_dict()).decode(),
+    }

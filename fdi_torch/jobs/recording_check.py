@@ -10,14 +10,12 @@ from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.gap.preprocess.acquisition import examined
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.channel_finding import ChannelFinding
 from fdi_torch.recordings.check import RecordingCheck, check_recording
+from fdi_torch.recordings.plant_limits import ChannelFinding
 
 
 def checked(config: RecordingConfig, plant: PlantDescription, base: Path) -> tuple[Recording, RecordingCheck]:
-    """A recording and its check: readings beyond the tanks first, as they make the rest meaningless, then refused or
-    masked channels.
-    """
+    """A recording and its check: readings beyond the tanks, which make the rest meaningless, come first."""
     whole = read_recording(config, plant, base)
     check = check_recording(whole, plant)
     examinations = [examined(plant, part) for part in whole.known_segments()]

@@ -17,7 +17,7 @@ from fdi_torch.jobs import study as study_job
 from fdi_torch.jobs.gap import groups, run_gap
 from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.logged_recordings import logged_recording
-from fdi_torch.jobs.monitor_rows import logged_items, recording_of_rows, rows_until
+from fdi_torch.jobs.monitor_rows import fault_free_recording, logged_items, rows_in
 from fdi_torch.jobs.run_setup import fitting_of, requested_space
 from fdi_torch.jobs.study import TRIAL, log_summary, log_trials
 from fdi_torch.jobs.train import STATE, estimate_logged, log_recordings, state_is_due
@@ -81,12 +81,11 @@ def replay_monitor(log: LoggedRun, path: Path, overrides: Iterable[str], tell: T
     run = build_monitor(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
     callbacks = MonitorCallbacks(tell, lambda event: None, lambda prepared: None)
     items = logged_items(log, run)
-    rows = [item for item in items if not isinstance(item, str)]
     about = log.about("data")
     data = [{"path": about["0.path"], "sha256": about.get("0.sha256", "")}] if "0.path" in about else []
     with RunLog(path, "monitor", **run.log_records(data), parent_run_id=parent) as again:
         monitor = LoggedMonitor(run, again, callbacks)
-        monitor.learn(recording_of_rows(rows_until(rows, run.config.fault_free[1]) or rows, run))
+        monitor.learn(fault_free_recording(rows_in(items), run))
         monitor.process_items(items)
         monitor.close()
         again.result({"events": monitor.events, "faults": monitor.faults()})

@@ -15,8 +15,8 @@ from fdi_torch.config.simulation import noise_std, planned_recording
 from fdi_torch.device import usable_device
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.fitting import Fitting, set_up, start_levels
-from fdi_torch.estimate.hybrid_settings import HybridSettings
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings
+from fdi_torch.estimate.refinement import HybridSettings
 from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.operating_range import bounded_by_recording
@@ -54,9 +54,7 @@ def _usable_readings(run: Run, recording: Recording) -> Recording:
 
 
 def simulate_recording(run: Run) -> Recording:
-    """Simulate the recording described by `simulate:` of a run file, with faults and noise.
-    Deterministic for a seed.
-    """
+    """Simulate what `simulate:` of a run file describes, with faults and noise. Deterministic for a seed."""
     config = run.config.simulate
     if config is None:
         raise ValueError(f"{run.source}: expected simulate, got none; fdi new run writes a file that shows its keys")

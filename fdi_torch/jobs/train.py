@@ -15,10 +15,10 @@ from fdi_torch.config.run_file import Run
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.hybrid import HybridResult, estimate_parameters
-from fdi_torch.estimate.hybrid_settings import HybridSettings
 from fdi_torch.estimate.levenberg_marquardt import Progress
 from fdi_torch.estimate.posterior_draws import Draws
 from fdi_torch.estimate.profile import Profile
+from fdi_torch.estimate.refinement import HybridSettings
 from fdi_torch.estimate.uncertainty import Estimate
 from fdi_torch.jobs.estimate_uncertainty import profiled_names, profiles_of, with_draws
 from fdi_torch.jobs.log_paths import RESUMES, free_path, unfinished_search
@@ -184,9 +184,7 @@ class SearchLogger:
 
 
 def state_is_due(generation: int) -> bool:
-    """Whether the complete search state is logged: a resumed run repeats at most 32 generations, or an
-    eighth of all.
-    """
+    """Whether the complete search state is logged: a resumed run repeats at most 32 generations, or an eighth."""
     return generation % (1 << max(5, generation.bit_length() - 4)) == 0
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import orjson
 
-from fdi_torch.logbook.channel import Channel
+from fdi_torch.logbook.topic_definitions import Channel
 from fdi_torch.tables import needed
 
 PORT = 9464

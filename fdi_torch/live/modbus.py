@@ -9,8 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from fdi_torch.live.address import Address
-from fdi_torch.live.values import BackOff, Item, Value
+from fdi_torch.live.values import Address, BackOff, Item, Value
 from fdi_torch.names import unknown
 from fdi_torch.tables import needed
 

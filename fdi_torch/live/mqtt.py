@@ -10,8 +10,7 @@ from typing import Any
 
 import orjson
 
-from fdi_torch.live.address import Address, credentials
-from fdi_torch.live.values import Inbox, Item, Value
+from fdi_torch.live.values import Address, Inbox, Item, Value, credentials
 from fdi_torch.logbook import number_at
 from fdi_torch.recordings.time_stamps import seconds_of
 from fdi_torch.tables import needed

@@ -13,8 +13,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
-from fdi_torch.live.address import Address, credentials
-from fdi_torch.live.values import Inbox, Item, Value
+from fdi_torch.live.values import Address, Inbox, Item, Value, credentials
 from fdi_torch.tables import needed
 
 WAIT = 15.0

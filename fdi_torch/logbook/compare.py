@@ -1,18 +1,45 @@
-"""Comparison of runs: the differences of their records, the agreement of their results, curves on a common axis."""
+"""Comparison of runs: the differences of their records, the agreement of their results, curves on a common axis, and a
+hash of a log's content (topic, time and payload of every message) independent of chunks and wall time.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import math
-from collections.abc import Mapping, Sequence
+import struct
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import orjson
 
-from fdi_torch.logbook.fingerprint import content_hash
-from fdi_torch.logbook.reader import Run, read_run
+from fdi_torch.logbook.payload import WALL
+from fdi_torch.logbook.reader import Message, Run, read_run
 from fdi_torch.logbook.signals import series
+
+
+def content_hash(messages: Iterable[Message]) -> str:
+    """SHA-256 over the messages in their order, as hexadecimal text."""
+    digest = hashlib.sha256()
+    for message in messages:
+        topic, data = message.topic.encode(), canonical(message)
+        digest.update(struct.pack("<qqq", len(topic), message.log_time, len(data)) + topic + data)
+    return digest.hexdigest()
+
+
+def canonical(message: Message) -> bytes:
+    """The payload in canonical form: JSON with sorted keys and without wall time; other encodings unchanged."""
+    if message.channel.encoding != "json":
+        return message.data
+    try:
+        fields = orjson.loads(message.data)
+    except ValueError:
+        return message.data
+    if isinstance(fields, dict):
+        fields.pop(WALL, None)
+    return orjson.dumps(fields, option=orjson.OPT_SORT_KEYS)
+
 
 SECTIONS = ("run", "config", "seeds", "data", "env", "git", "status", "result")
 _WALL = {"run": ("started", "run_id", "parent_run_id"), "status": ("ended", "wall_seconds")}

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from fdi_torch.logbook.channel import Channel
+from fdi_torch.logbook.topic_definitions import Channel
 
 PORT = 8765
 KEPT = 20_000  # latest messages of a channel, for viewers that connect late

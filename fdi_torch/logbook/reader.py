@@ -20,11 +20,11 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import Header, Metadata, Schema
 
 from fdi_torch.logbook import scan
-from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.payload import decode
 from fdi_torch.logbook.schemas import conforming
 from fdi_torch.logbook.sink import EPOCH_NS
+from fdi_torch.logbook.topic_definitions import Channel
 from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_UNPACKED
 
 # Outside chunks these records have no CRC. Logs of this program have none there; one found there is a damaged record.
@@ -238,9 +238,7 @@ def open_part(
     max_chunk_bytes: int = scan.MAX_CHUNK_BYTES,
     require_crc: bool = False,
 ) -> list[Message]:
-    """All messages of a chunk, or of a record outside chunks. Raises ChunkError; a chunk is read completely or not at
-    all.
-    """
+    """All messages of a chunk, read completely or not at all, or of a record outside chunks. Raises ChunkError."""
     if part.opcode == Opcode.CHUNK:
         body = scan.chunk_body(data, part, max_chunk_bytes, require_crc)
     else:

@@ -12,8 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import orjson
 
-from fdi_torch.logbook.compare import AXES
-from fdi_torch.logbook.fingerprint import canonical
+from fdi_torch.logbook.compare import AXES, canonical
 from fdi_torch.logbook.payload import NON_FINITE, WALL, unpack
 from fdi_torch.logbook.provenance import environment
 from fdi_torch.logbook.reader import Message, Run, read_run
@@ -27,9 +26,7 @@ ABSOLUTE, RELATIVE = 1e-12, 1e-9
 
 @dataclass(frozen=True)
 class Difference:
-    """The first differing field of an event: its number among those compared (from 1), its place, both values
-    as text.
-    """
+    """The first differing field of an event: its number among those compared (from 1), its place, both values."""
 
     event: int
     topic: str

@@ -110,9 +110,7 @@ def unpacked_size(data: Buffer, frame: Frame) -> int:
 
 
 def chunk_body(data: Buffer, frame: Frame, cap: int = MAX_CHUNK_BYTES, require_crc: bool = False) -> bytes:
-    """The records inside a chunk. Raises ChunkError if they exceed `cap`, cannot be decompressed, or have a
-    wrong CRC.
-    """
+    """The records inside a chunk. Raises ChunkError if they exceed `cap`, or have a wrong compression or CRC."""
     size, crc = _CHUNK.unpack_from(data, frame.start + 9)[2:]
     name_end = frame.start + 41 + _U32.unpack_from(data, frame.start + 37)[0]
     compression = bytes(data[frame.start + 41 : name_end])

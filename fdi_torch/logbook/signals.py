@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 import orjson
 
-from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.reader import Message, Run
 from fdi_torch.logbook.sink import EPOCH_NS
-from fdi_torch.logbook.topic_definitions import topic_definition
+from fdi_torch.logbook.topic_definitions import Channel, topic_definition
 from fdi_torch.untrusted_input import MOST_ARRAY_BYTES, MOST_ARRAY_EXPANSION, expect_unpacked
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")

@@ -19,9 +19,9 @@ from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
-from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.exclusive_file import ExclusiveFile
 from fdi_torch.logbook.scan import MAGIC
+from fdi_torch.logbook.topic_definitions import Channel
 
 PROFILE = "fdi_torch"
 CHUNK_BYTES = 256 * 1024

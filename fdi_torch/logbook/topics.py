@@ -6,20 +6,167 @@ that viewers draw it over its number; other events default to the latest logged 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain, count, repeat
 from typing import Any
 
+import numpy as np
 import orjson
 
-from fdi_torch.logbook.messages import Messages, Named
-from fdi_torch.logbook.payload import as_array, pack
-from fdi_torch.logbook.sink import log_time_of
+from fdi_torch.interruption import SteadyLock
+from fdi_torch.logbook.payload import NON_FINITE, WALL, as_array, as_it_is, pack, plain
+from fdi_torch.logbook.schemas import Register
+from fdi_torch.logbook.sink import EPOCH_NS, Timed, log_time_of
+from fdi_torch.logbook.topic_definitions import Channel
 
-_INFO = 2  # of the levels debug (1) to fatal (5) of foxglove.Log
+Named = Mapping[str, Any]
+_RESERVED = ("t", NON_FINITE, WALL, "masked")
+_NORMAL_95 = 1.96  # half width of the central 95 % of a normal distribution, standard deviations
+_BLOCK = 4096
 
 
-class Topics(Messages):
-    """One method per topic."""
+class Topics:
+    """Encodes messages, each on a channel that describes its fields, and passes them to `put`. One method per topic."""
+
+    def __init__(self) -> None:
+        self._lock = SteadyLock()
+        self._latest = 0.0
+        self.register = Register()
+
+    def put(self, messages: Iterable[Timed]) -> None:
+        raise NotImplementedError
+
+    def write(
+        self,
+        topic: str,
+        fields: Named,
+        t: float | None = None,
+        *,
+        units: Mapping[str, str] | None = None,
+    ) -> None:
+        """Write one message. units: of named numbers.
+
+        A field with the value None is omitted. Raises ValueError for a non-finite time and for reserved names.
+        """
+        if "t" in fields:
+            raise ValueError(f"{topic}: expected the time as argument, got it among the fields; remove it there")
+        t = self._latest if t is None else float(t)
+        if not math.isfinite(t):
+            raise ValueError(f"{topic}: expected a finite time, got {t}; give the plant's time in s")
+        with self._lock:
+            message: Named = {"t": t, **fields}
+            data = as_it_is(message)
+            if data is None:
+                message = plain(message)
+                data = orjson.dumps(message)
+            self._latest = max(self._latest, t)
+            channel, log_time = self.register.channel(topic, fields, message, units), log_time_of(t)
+            self.put([(channel, log_time, log_time, self.register.next_number(topic), data)])
+
+    def samples(
+        self,
+        topic: str,
+        time: Any,
+        values: Any,
+        names: Sequence[str],
+        units: Sequence[str],
+    ) -> None:
+        """Write a whole signal, values (T, N) over time (T,), one message per sample."""
+        self.recording_blocks([(topic, as_array(values), names, units, None, None)], as_array(time))
+
+    def recording(
+        self,
+        time: Any,
+        inputs: Any,
+        outputs: Any,
+        input_names: Sequence[str],
+        output_names: Sequence[str],
+        input_units: Sequence[str],
+        output_units: Sequence[str],
+        *,
+        mask: Any = None,
+        hold: str = "zero_order",
+        group: str = "",
+    ) -> None:
+        """Write a recording to `/plant/input` and `/plant/output`, or `/plant/GROUP/...` if a log has several.
+
+        time (T,) s, inputs (T, M), outputs (T, N), mask (T, N): True for valid readings. NaN is preserved.
+        """
+        root = f"/plant/{group}" if group else "/plant"
+        mask = None if mask is None else as_array(mask).astype(bool)
+        self.recording_blocks(
+            [
+                (f"{root}/input", as_array(inputs), input_names, input_units, None, {"hold": hold}),
+                (f"{root}/output", as_array(outputs), output_names, output_units, mask, None),
+            ],
+            as_array(time),
+        )
+
+    def predictions(
+        self,
+        time: Any,
+        outputs: Any,
+        predicted: Any,
+        names: Sequence[str],
+        units: Sequence[str],
+        *,
+        mask: Any = None,
+        noise_std: Any = None,
+        group: str = "",
+    ) -> None:
+        """Write the model's readings and the residuals to `/estimate/output` and `/estimate/residual`.
+
+        time (T,) s, outputs and predicted (T, N), mask (T, N): True for valid readings; other residuals are NaN.
+        noise_std (N,): noise level of each sensor, whose 95 % band (1.96 standard deviations) is written beside it.
+        group: as for `recording`.
+        """
+        root = f"/estimate/{group}" if group else "/estimate"
+        model, readings = as_array(predicted).astype(np.float64), as_array(outputs).astype(np.float64)
+        valid = np.isfinite(readings) if mask is None else as_array(mask).astype(bool)
+        residual, columns, shown = np.where(valid, readings - model, np.nan), list(names), list(units)
+        if noise_std is not None:
+            band = np.broadcast_to(_NORMAL_95 * as_array(noise_std), residual.shape)
+            residual = np.concatenate([residual, -band, band], axis=1)
+            columns += [f"{name}_{side}" for side in ("low", "high") for name in names]
+            shown += [*units, *units]
+        self.recording_blocks(
+            [
+                (f"{root}/output", model, names, units, None, None),
+                (f"{root}/residual", residual, columns, shown, None, None),
+            ],
+            as_array(time),
+        )
+
+    def recording_blocks(self, signals: Sequence[tuple[Any, ...]], time: np.ndarray) -> None:
+        """Write several signals with one clock, sample by sample, in blocks that limit memory."""
+        for topic, values, names, *_ in signals:
+            _check_signal(topic, values, names, len(time))
+        if not np.isfinite(time).all():
+            raise ValueError(f"{signals[0][0]}: expected finite times, got NaN or infinity; drop those samples")
+        topics = [topic for topic, *_ in signals]
+        for first in range(0, len(time), _BLOCK):
+            last = first + _BLOCK
+            clock = time[first:last].astype(np.float64)
+            log_times = EPOCH_NS + np.rint(clock * 1e9).astype(np.int64)
+            blocks = [values[first:last].astype(np.float64) for _, values, *_ in signals]
+            hidden = [
+                np.zeros(0, bool) if mask is None else ~mask[first:last] & np.isfinite(block)
+                for block, (*_, mask, _) in zip(blocks, signals, strict=True)
+            ]
+            for topic, _, names, units, _, about in signals:
+                numbers = dict.fromkeys(names, 0.0)
+                self.register.channel(topic, numbers, numbers, dict(zip(names, units, strict=True)), about)
+            named = [names for _, _, names, *_ in signals]
+            channels, sequences = self.register.next_numbers(topics, len(clock))
+            encoded = [_rows(*parts, clock.tolist()) for parts in zip(named, blocks, hidden, strict=True)]
+            self.put(_interleaved(channels, sequences, log_times.tolist(), encoded))
+        self._latest = max(self._latest, float(time.max())) if len(time) else self._latest
+
+    def follow_on(self, channel: Channel, sequence: int, t: float) -> None:
+        """Continue numbering and description as if the message (channel, sequence, t) had just been written."""
+        self.register.follow_on(channel, sequence)
+        self._latest = max(self._latest, t)
 
     def alarm(self, t: float, event: str, channel: str, message: str = "", **numbers: Any) -> None:
         """An event of the detection; numbers: value, threshold, onset (s) and others by name."""
@@ -110,6 +257,46 @@ class Topics(Messages):
         sec, nsec = divmod(log_time_of(self._latest), 10**9)
         fields = {"timestamp": {"sec": sec, "nsec": nsec}, "level": _INFO, "message": message, "name": "fdi"}
         self.write("/log", {**fields, "file": "", "line": 0})
+
+
+def _interleaved(
+    channels: Sequence[Channel],
+    sequences: Sequence[int],
+    log_times: Sequence[int],
+    encoded: Sequence[Sequence[bytes]],
+) -> Iterator[Timed]:
+    """One message of each channel per sample."""
+    streams = [
+        zip(repeat(channel), log_times, log_times, count(first), payloads, strict=False)
+        for channel, first, payloads in zip(channels, sequences, encoded, strict=True)
+    ]
+    return chain.from_iterable(zip(*streams, strict=True))
+
+
+def _rows(names: Sequence[str], block: np.ndarray, hidden: np.ndarray, clock: list[float]) -> list[bytes]:
+    """Payloads of samples (B, N), with readings masked by hidden (B, N)."""
+    keys = ("t", *names)
+    rows = zip(clock, *block.T.tolist(), strict=True)
+    if np.isfinite(block).all() and not hidden.any():
+        return [orjson.dumps(dict(zip(keys, row, strict=True))) for row in rows]
+    return [orjson.dumps(_row(keys, row, hidden[i : i + 1])) for i, row in enumerate(rows)]
+
+
+def _row(keys: Sequence[str], row: Sequence[float], hidden_row: np.ndarray) -> dict[str, Any]:
+    hidden = zip(keys[1:], hidden_row.ravel(), strict=True) if hidden_row.size else ()
+    masked = [name for name, is_hidden in hidden if is_hidden]
+    return plain({**dict(zip(keys, row, strict=True)), "masked": masked or None})
+
+
+def _check_signal(topic: str, values: np.ndarray, names: Sequence[str], samples: int) -> None:
+    if values.shape != (samples, len(names)):
+        raise ValueError(f"{topic}: expected values of shape {(samples, len(names))}, got {values.shape}")
+    for name in names:
+        if name in _RESERVED:
+            raise ValueError(f"{topic}: expected a name other than {', '.join(_RESERVED)}, got {name}; rename it")
+
+
+_INFO = 2  # of the levels debug (1) to fatal (5) of foxglove.Log
 
 
 def _cause(cause: Named) -> str:

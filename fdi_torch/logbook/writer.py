@@ -22,13 +22,12 @@ import numpy as np
 import orjson
 
 from fdi_torch.interruption import UNDISTURBED, Terminated
-from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.payload import as_array, plain
 from fdi_torch.logbook.provenance import environment, git_state, version_of
 from fdi_torch.logbook.reader import Message
 from fdi_torch.logbook.sink import Sink, Timed
-from fdi_torch.logbook.topic_definitions import FORMAT_VERSION
+from fdi_torch.logbook.topic_definitions import FORMAT_VERSION, Channel
 from fdi_torch.logbook.topics import Topics
 
 Listener = Callable[[Channel, int, bytes], None]

@@ -31,8 +31,7 @@ from fdi_torch.monitor.known_faults import (
     with_new_sizes,
 )
 from fdi_torch.monitor.monitor_state import DetectedChange, HiddenFault, MonitorState, PendingAlarm
-from fdi_torch.monitor.residual_test import ResidualTest
-from fdi_torch.monitor.state_update import adopt_change, adopt_sizes, beside_deviation
+from fdi_torch.monitor.state_update import ResidualTest, adopt_change, adopt_sizes, beside_deviation
 
 
 class AlarmHandler:

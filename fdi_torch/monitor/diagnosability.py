@@ -18,6 +18,7 @@ from fdi_torch.effects import placements_for
 from fdi_torch.estimate.combinations import undetermined_groups
 from fdi_torch.estimate.fitting import StartLevels, set_up
 from fdi_torch.estimate.information import certainty
+from fdi_torch.estimate.uncertainty import plain_value
 from fdi_torch.monitor.structural_analysis import structure_of
 from fdi_torch.names import listed
 from fdi_torch.parameters import ParameterName
@@ -59,7 +60,7 @@ class Diagnosability:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON; infinite values become None."""
-        return {key: _plain(value) for key, value in asdict(self).items()}
+        return {key: plain_value(value, key) for key, value in asdict(self).items()}
 
 
 def diagnosability(
@@ -136,9 +137,7 @@ def without_gain_and_offset(slopes: Tensor, readings: Tensor) -> Tensor:
 
 
 def without_constants(scaled: Tensor, faults: int, std: Tensor) -> Tensor:
-    """Signatures (K, F) of the faults in noise standard deviations, without the part that uncertain
-    constants explain.
-    """
+    """Signatures (K, F) of faults, in noise standard deviations, less the part that uncertain constants explain."""
     flat = scaled.flatten(0, 1)
     signatures, constants = flat[:, :faults], flat[:, faults:]
     if not constants.shape[1]:
@@ -207,9 +206,3 @@ def _limits(reach: float, length: Tensor, whole: Tensor) -> tuple[float, ...]:
 
 def _rows(table: Tensor) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in table.tolist())
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and value in (float("inf"), float("-inf")) else value

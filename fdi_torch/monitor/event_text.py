@@ -183,9 +183,7 @@ class EventWriter:
         return forecast_limits(self.observer, state, change, faulty, horizon, lookback, generator)
 
     def _severity(self, explanations: Sequence[Explanation]) -> tuple[str, bool]:
-        """The plant file's urgency of the likeliest explanation, and whether one of its faults is large enough to
-        announce.
-        """
+        """The urgency of the likeliest explanation, and whether one of its faults is large enough to announce."""
         urgencies, announced = [], []
         for s in explanations[0].sizes:
             matter = self.matters.get(s.name)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from fdi_torch.amounts import amount_words, estimate_words, parameter_words, sized_words
 from fdi_torch.clock import clock_text
-from fdi_torch.estimate.uncertainty import end_reached
+from fdi_torch.estimate.uncertainty import end_reached, plain_value
 from fdi_torch.monitor.alarm_state import State
 from fdi_torch.parameters import Parameter, ParameterName
 from fdi_torch.quantities import display_unit, quantity_text, significant
@@ -208,9 +208,9 @@ class Event:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON and logs."""
-        fields: dict[str, Any] = _plain(asdict(self))
+        fields = asdict(self) | {"state": str(self.state)}
         likeliest = {"faults": self.faults, "sizes": self.sizes, "stds": self.stds, "onset": self.onset}
-        return {**fields, **_plain({**likeliest, "onset_std": self.onset_std}), "headline": self.headline}
+        return plain_value(fields | likeliest | {"onset_std": self.onset_std, "headline": self.headline}, "event")
 
 
 def headline(explanations: Sequence[Explanation], sizes: bool = True) -> str:
@@ -255,13 +255,3 @@ def shares_text(shares: Sequence[tuple[str, float]]) -> str:
     """'h1 81 %, h3 19 %': the sensors with the largest shares of an alarm."""
     largest = sorted((s for s in shares if s[1] >= SMALLEST_SHARE), key=lambda s: -s[1])
     return ", ".join(f"{name} {percent_text(share)}" for name, share in largest)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return str(value) if isinstance(value, State) else value

@@ -176,9 +176,7 @@ class FlowFilter:
         return 0.5 * (slope @ self.covariance_of_parameters * slope).sum(-1).sqrt()
 
     def over(self, samples: int) -> tuple[Tensor, Tensor]:
-        """Transition (2 n, 2 n) of states and flows over some samples, and covariance of the shocks that add up
-        meanwhile, by repeated doubling.
-        """
+        """Transition (2 n, 2 n) of states and flows over some samples, and covariance of their shocks, by doubling."""
         levels = slice(2 * len(self.linear.transition))
         step, shocks = self.transition[levels, levels], torch.diag(self.process_std[levels] ** 2)
         transition, total = torch.eye(len(step), dtype=step.dtype), torch.zeros_like(step)

@@ -12,8 +12,7 @@ from torch import Tensor
 from fdi_torch.estimate.evidence import ODDS, log_prior, log_volume
 from fdi_torch.estimate.information import certainty
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
-from fdi_torch.estimate.linearisation import Linearisation
-from fdi_torch.estimate.refined import held_back
+from fdi_torch.estimate.linearisation import Linearisation, held_back
 from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.monitor.hypothesis import NO_CHANGE, Hypothesis, HypothesisFit
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow

@@ -23,9 +23,8 @@ from fdi_torch.monitor.monitor_settings import MonitorSettings, usual_settings
 from fdi_torch.monitor.monitor_state import MonitorState
 from fdi_torch.monitor.noise_model import NoiseModel
 from fdi_torch.monitor.observer_bank import LONG_AGO, ObserverBank
-from fdi_torch.monitor.residual_test import ResidualTest
 from fdi_torch.monitor.samples import Samples, split_at_gaps
-from fdi_torch.monitor.state_update import advance_observer, drop_old_samples, initial_state
+from fdi_torch.monitor.state_update import ResidualTest, advance_observer, drop_old_samples, initial_state
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 

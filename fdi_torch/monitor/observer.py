@@ -99,16 +99,6 @@ class Observation:
         """The residual with its first samples scaled to the steady variance."""
         return self.residual / self.inflation
 
-    def last(self, count: int) -> Observation:
-        """Its last samples."""
-        return Observation(
-            self.time[-count:],
-            self.state[..., -count:, :],
-            self.residual[..., -count:, :],
-            self.inflation[..., -count:, :],
-            self.tanks,
-        )
-
 
 class Observer:
     """x_hat' = f(x_hat, u; theta) + K (y - y_hat): predict over each interval, then correct by L (y - y_hat).
@@ -184,9 +174,7 @@ class Observer:
 
 
 def bind_parameters(network: TankNetwork, space: ParameterSpace | None, theta: Tensor | None) -> PlaceValues:
-    """All constants of the plant, those of `space` from theta (*batch, P). Raises ValueError for
-    one without the other.
-    """
+    """The constants of the plant, those of `space` from theta (*batch, P). Raises ValueError for one of the two."""
     if (space is None) != (theta is None):
         raise ValueError("expected a parameter space together with its values, got one of the two; give both or none")
     if space is None or theta is None:
@@ -201,9 +189,7 @@ def _first_readings(readings: Tensor) -> Tensor:
 
 
 def initial_levels(network: TankNetwork, samples: Samples, values: PlaceValues) -> Tensor:
-    """Levels (*batch, tanks) from the first reading of each sensor, within ABSENT samples; nominal
-    where none is read.
-    """
+    """Levels (*batch, tanks) from the first reading of each sensor within ABSENT samples; nominal without one."""
     start = [level.expand(samples.batch) for level in network.start_levels(values)]
     readings = _first_readings(samples.readings[..., :ABSENT, :]).unbind(-1)
     levels = levels_from_readings(network, readings, start, samples.time[0], values)

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.uncertainty import end_reached
-from fdi_torch.monitor.observer import initial_levels, run_observers
+from fdi_torch.monitor.observer import ObserverRun, initial_levels, run_observers
 from fdi_torch.monitor.observer_gain import Gain
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.stepper import Stepper
-from fdi_torch.monitor.switched_plant import ONSET, RAMP, SwitchedNetwork
+from fdi_torch.monitor.switched_plant import ONSET, RAMP, SwitchedNetwork, own_onsets
 from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.network import TankNetwork
@@ -102,9 +102,8 @@ class ObserverBank:
         self.stepper = Stepper(network, longest_step)
         self.network, self.space, self.gain, self.whitening = network, space, gain, whitening
         self.changing = SwitchedNetwork(network, space.names)
-        self._held = _with_own_onset(network, space)
-        onsets = [str(ParameterName.parse(name).sibling("onset")) for name in self._held]
-        names = [*space.names, *(f"after {name}" for name in space.names), ONSET, RAMP, *onsets]
+        self._held = own_onsets(network, space)
+        names = [*space.names, *(f"after {name}" for name in space.names), ONSET, RAMP, *self._held.values()]
         groups: dict[str, list[int]] = {}
         for column, name in enumerate(space.names):
             groups.setdefault(ParameterName.parse(name).prefix, []).append(column)
@@ -135,18 +134,9 @@ class ObserverBank:
 
     def run(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> tuple[Tensor, Tensor]:
         """States (L, S, order + M) after each sample, and residuals (L, S, sensors) scaled to the steady variance."""
-        samples, count = window.samples, len(window)
-        ran = run_observers(
-            self.changing,
-            self._columns,
-            self._lanes(believed, changes, float(samples.time[-1])),
-            samples,
-            window.state.expand(len(changes), -1),
-            self.gain.table(window.number, count),
-            self.stepper.longest,
-            from_first=False,
-        )
-        return ran.state, (samples.readings[1:] - ran.expected) / self.gain.spread(window.number, count)
+        count, start = len(window), window.state.expand(len(changes), -1)
+        ran = self._ran(window.samples, start, believed, changes, self.gain.table(window.number, count))
+        return ran.state, (window.samples.readings[1:] - ran.expected) / self.gain.spread(window.number, count)
 
     def simulate(
         self, samples: Samples, start: Tensor, believed: Tensor, changes: ChangeHypotheses, shocks: Tensor
@@ -161,32 +151,14 @@ class ObserverBank:
         readings[:, 0] = SHOCK_READING
         gains = start.new_zeros(len(changes), len(samples) - 1, self.network.order, sensors)
         gains[..., 0] = shocks / SHOCK_READING
-        return run_observers(
-            self.changing,
-            self._columns,
-            self._lanes(believed, changes, float(samples.time[-1])),
-            replace(samples, readings=readings),
-            start,
-            gains,
-            self.stepper.longest,
-            from_first=False,
-        ).state
+        return self._ran(replace(samples, readings=readings), start, believed, changes, gains).state
 
     def first_state(self, samples: Samples, believed: Tensor, levels: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """State (order + M,) after the first sample and the residual there. levels: from the readings if None."""
         first = samples.segment(0, 1)
         if levels is None:
             levels = initial_levels(self.network, samples, self.network.bind(self.space, believed))
-        ran = run_observers(
-            self.changing,
-            self._columns,
-            self._lanes(believed, no_change(believed), float(first.time[0])),
-            first,
-            levels[None],
-            self.gain.table(0, 1),
-            self.stepper.longest,
-            from_first=True,
-        )
+        ran = self._ran(first, levels[None], believed, no_change(believed), self.gain.table(0, 1), from_first=True)
         return ran.state[0, 0], (first.readings[0] - ran.expected[0, 0]) / self.gain.spread(0, 1)[0]
 
     def space_width(self) -> Tensor:
@@ -208,6 +180,18 @@ class ObserverBank:
                 space = space.with_changes(p.name, **further)
         return space
 
+    def _ran(
+        self,
+        samples: Samples,
+        start: Tensor,
+        believed: Tensor,
+        changes: ChangeHypotheses,
+        gains: Tensor,
+        from_first: bool = False,
+    ) -> ObserverRun:
+        lanes, longest = self._lanes(believed, changes, float(samples.time[-1])), self.stepper.longest
+        return run_observers(self.changing, self._columns, lanes, samples, start, gains, longest, from_first)
+
     def _lanes(self, believed: Tensor, changes: ChangeHypotheses, end: float) -> Tensor:
         """Parameter values of the switched plant for each hypothesis, (L, columns)."""
         before = believed.expand(len(changes), -1)
@@ -218,14 +202,3 @@ class ObserverBank:
             already = before[:, self.space.index(name)] != p.nominal
             onsets.append(torch.where(already, LONG_AGO, changes.onset))
         return torch.cat([before, changes.theta, timing, *(column.unsqueeze(1) for column in onsets)], dim=1)
-
-
-def _with_own_onset(network: TankNetwork, space: ParameterSpace) -> list[str]:
-    """Parameters of `space` that are sizes of effects with a memory and an onset parameter."""
-    named = []
-    for placement in network.placements:
-        size, *shape = placement.effect.parameters(placement.location, network.description)
-        name = placement.full_name(size.name)
-        if placement.effect.memory and any(p.name == "onset" for p in shape) and name in space:
-            named.append(name)
-    return named

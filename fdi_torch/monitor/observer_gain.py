@@ -37,9 +37,7 @@ class Gain:
         return torch.cat([opening, self.steady.expand(count - len(opening), *self.steady.shape)])
 
     def spread(self, first: int, count: int) -> Tensor:
-        """The `inflation` of the samples `first` to `first` + `count` of a run, 1 after its opening samples, (*batch,
-        count, sensors).
-        """
+        """`inflation` (*batch, count, sensors) of `count` samples from the `first` of a run on; 1 after its opening."""
         opening = self.inflation[first : first + count]
         steady = torch.ones_like(self.steady[..., 0, :]).expand(count - len(opening), *self.steady[..., 0, :].shape)
         return torch.cat([opening, steady]).movedim(0, -2)
@@ -47,18 +45,14 @@ class Gain:
 
 @dataclass(frozen=True)
 class Linear:
-    """Linearised plant over one sampling interval: transition (*batch, order, order), output
-    (*batch, sensors, order), for each state of the network.
-    """
+    """Plant over one sampling interval: transition (*batch, order, order), output (*batch, sensors, order)."""
 
     transition: Tensor
     output: Tensor
 
 
 def linearised(stepper: Stepper, levels: Tensor, inputs: Tensor, span: float, values: PlaceValues) -> Linear:
-    """The plant linearised about levels (*batch, tanks), with the effects in steady state, under inputs (*batch,
-    channels) held for `span` s.
-    """
+    """The plant linearised about levels (*batch, tanks), effects steady, inputs (*batch, channels) held `span` s."""
 
     def moved(x: Tensor) -> Tensor:
         return stepper.advance(stepper.start(x, inputs, values), lambda share: inputs, 0.0, span, values).levels

@@ -45,9 +45,7 @@ def with_wrapped_phases(theta: Tensor, oscillations: Sequence[tuple[int, int]], 
 
 
 def period_step(period: Tensor, length: float) -> Tensor:
-    """Finite-difference step of periods of any shape, s: it turns the phase by PHASE_STEP at the ends of a window of
-    `length` s.
-    """
+    """Finite-difference step of periods, s: it turns the phase by PHASE_STEP at the ends of a window of `length` s."""
     return PHASE_STEP * period.square() / (math.pi * length)
 
 

@@ -29,9 +29,7 @@ def usual_step(plant: PlantDescription) -> float:
 
 @dataclass(frozen=True)
 class PlantState:
-    """The network's integrated states (*batch, order) in m, the tanks' levels first, and the memory of actuators and
-    sensors.
-    """
+    """Integrated states (*batch, order) in m, the tanks' levels first, and the memory of actuators and sensors."""
 
     levels: Tensor
     commands: Memory = ()
@@ -85,9 +83,7 @@ class Stepper:
         return state
 
     def read(self, state: PlantState, end: float, span: float, values: PlaceValues) -> tuple[Tensor, PlantState]:
-        """Readings (*batch, sensors) at the end of an interval of `span` s, and the state with
-        updated sensor memory.
-        """
+        """Readings (*batch, sensors) at the end of an interval of `span` s, and the state with new sensor memory."""
         clock = self._clock(state.levels, end - span, span, span)
         readings, memory = self.network.read(self._seen(state.levels), state.readings, clock, values)
         return torch.stack(torch.broadcast_tensors(*readings), dim=-1), replace(state, readings=memory)

@@ -54,3 +54,14 @@ class SwitchedNetwork(TankNetwork):
             before = values[name.prefix][name.field]
             mean[name.prefix][name.field] = before + (values[f"after {name.prefix}"][name.field] - before) * share
         return mean
+
+
+def own_onsets(network: TankNetwork, space: ParameterSpace) -> dict[str, str]:
+    """Sizes in `space` of effects with a memory and an onset parameter, with the names of these onsets."""
+    named = {}
+    for placement in network.placements:
+        size, *shape = placement.effect.parameters(placement.location, network.description)
+        name = placement.full_name(size.name)
+        if placement.effect.memory and any(p.name == "onset" for p in shape) and name in space:
+            named[name] = placement.full_name("onset")
+    return named

@@ -33,9 +33,7 @@ CONSTANT_RATIO = 1.2
 
 @dataclass(frozen=True)
 class WindowData:
-    """fitting: plant and inputs of the window, faults first. readings (R, S, C) of R runs; std (R, C): their noise if
-    known.
-    """
+    """fitting: of a window, faults first. readings (R, S, C): of R runs; std (R, C): their noise if known."""
 
     fitting: Fitting
     readings: Tensor

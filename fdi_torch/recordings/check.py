@@ -13,11 +13,10 @@ from torch import Tensor
 
 from fdi_torch.names import counted
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.channel_finding import ChannelFinding
 from fdi_torch.recordings.input_sampling import undersampled_inputs
-from fdi_torch.recordings.plant_limits import plant_limit_findings
-from fdi_torch.recordings.reading_checks import reading_findings
+from fdi_torch.recordings.plant_limits import ChannelFinding, plant_limit_findings
 from fdi_torch.recordings.repeated_readings import resolution
 
 MANY_RUNS = 5
@@ -172,3 +171,88 @@ def _runs(flags: Tensor) -> list[tuple[int, int]]:
     padded = flags.to(torch.int8)
     edges = torch.diff(padded, prepend=padded.new_zeros(1), append=padded.new_zeros(1)).nonzero().flatten().tolist()
     return [(first, after - 1) for first, after in zip(edges[::2], edges[1::2], strict=True)]
+
+
+FROZEN_SAMPLES = 20
+ODD_SHARE, FEWEST_STEPS, ALIKE, IRREGULAR, FINER = 0.1, 40, 2.0, 3.0, 5.0
+"""Logged on change: all steps but a tenth are at least one that is not far below the usual one and far above the
+resolution, and the times between them differ by more than a factor of three.
+"""
+CLIPPED_SAMPLES = 5
+CLIPPED_PILE = 5.0
+"""Clipped: the extreme value occurs this many times as often as its neighbour."""
+COARSE_SHARE = 0.5
+"""Rounded coarsely: more than this share of the readings equal the one before."""
+
+
+def reading_findings(recording: Recording) -> Iterator[ChannelFinding]:
+    """Findings of all sensors of the recording."""
+    for i, (name, unit) in enumerate(zip(recording.output_names, recording.output_units, strict=True)):
+        mask = recording.mask[:, i]
+        values = recording.outputs[mask, i]
+        if len(values) < 2:
+            continue
+        if bool((values == values[0]).all()):
+            text = f"constant at {_shown(values[0], unit)}: its correlation with anything is undefined"
+            yield ChannelFinding("constant", name, text, {"value": float(values[0])})
+            continue
+        yield from _on_change(name, values, recording.time[mask], unit)
+        yield from _clipped(name, values, unit)
+        yield from _frozen(name, values, recording.time[mask])
+        yield from _quantised(name, values, unit)
+
+
+def _on_change(name: str, values: Tensor, time: Tensor, unit: str) -> Iterator[ChannelFinding]:
+    """Readings logged only when they have changed by a least step, so that successive ones are hardly ever closer."""
+    steps, intervals = torch.diff(values).abs(), torch.diff(time)
+    least_step = float(steps.quantile(ODD_SHARE)) if len(steps) >= FEWEST_STEPS else 0.0
+    usual = float(steps.median())
+    irregular = float(intervals.quantile(0.9)) > IRREGULAR * float(intervals.quantile(0.1))
+    if irregular and least_step > 0.0 and usual < ALIKE * least_step and least_step > FINER * resolution(values):
+        text = (
+            f"seems to be logged on change, when it has moved by {_shown(least_step, unit)}: readings come early or "
+            "late by as much, which standard errors do not include; log at a fixed rate where accuracy matters"
+        )
+        yield ChannelFinding("on change", name, text, {"step": least_step})
+
+
+def _clipped(name: str, values: Tensor, unit: str) -> Iterator[ChannelFinding]:
+    """An extreme value that occurs much more often than the value next to it."""
+    distinct, counts = values.unique(return_counts=True)
+    for side, end, neighbour in (("lowest", 0, 1), ("highest", -1, -2)):
+        times = int(counts[end])
+        if times >= CLIPPED_SAMPLES and times >= CLIPPED_PILE * int(counts[neighbour]):
+            value = float(distinct[end])
+            text = f"the {side} value {_shown(value, unit)} was read {times} times: clipped there, or at rest"
+            yield ChannelFinding("clipped", name, text, {"value": value, "count": times})
+
+
+def _frozen(name: str, values: Tensor, time: Tensor) -> Iterator[ChannelFinding]:
+    """A value that is repeated much longer than is usual for these readings."""
+    lengths, ends = _repeats(values)
+    longest = int(lengths.argmax())
+    usual = float(lengths.double().mean())
+    if int(lengths[longest]) >= FROZEN_SAMPLES * usual:
+        count, last = int(lengths[longest]), int(ends[longest])
+        start, stop = float(time[last - count + 1]), float(time[last])
+        text = f"did not change for {count} samples, from {start:g} s to {stop:g} s (usually for {usual:.2g})"
+        yield ChannelFinding("frozen", name, text, {"start": start, "stop": stop, "count": count})
+
+
+def _quantised(name: str, values: Tensor, unit: str) -> Iterator[ChannelFinding]:
+    """Readings with steps so coarse that most equal the one before."""
+    same = float((torch.diff(values) == 0).double().mean())
+    step = resolution(values)
+    if same > COARSE_SHARE:
+        moves = f"moves in steps of {_shown(step, unit)} and stays on one for {100 * same:.0f} % of the samples"
+        yield ChannelFinding("quantised", name, f"{moves}: rounded coarsely", {"step": step, "share": same})
+
+
+def _shown(value: Tensor | float, unit: str) -> str:
+    return f"{100 * float(value):.4g} %" if unit == "1" else quantity_text(float(value), unit)
+
+
+def _repeats(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Lengths of the runs of equal values, and the index at which each ends."""
+    _, lengths = torch.unique_consecutive(values, return_counts=True)
+    return lengths, torch.cumsum(lengths, 0) - 1

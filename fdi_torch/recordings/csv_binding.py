@@ -14,8 +14,7 @@ from pathlib import Path
 from fdi_torch.names import nearest, shortened
 from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_cells import BAD, GOOD_WORDS, Columns, Rule
-from fdi_torch.recordings.csv_text import Heading
-from fdi_torch.recordings.header import header_unit
+from fdi_torch.recordings.csv_text import Heading, header_unit
 from fdi_torch.recordings.source import ChannelSource, ClockSource
 from fdi_torch.recordings.time_stamps import StampReader
 from fdi_torch.units import spelled
@@ -46,13 +45,12 @@ class Bound:
     unit: str = ""
 
 
-def bind_clock(path: Path, header: Sequence[str], source: ChannelSource | None) -> Bound:
+def bind_clock(path: Path, header: Sequence[str], source: ClockSource) -> Bound:
     """The column of time: the mapped one, or else one with such a name, if possible with a unit, or of time stamps.
 
     Without a column, time is the number of rows above times the period, which is the factor.
     """
-    source = source or ClockSource()
-    if isinstance(source, ClockSource) and source.period is not None:
+    if source.period is not None:
         return Bound("t", "t", None, source.period, "s")
     if source.column is None:
         units = {h: header_unit(h) for h in header}
@@ -74,9 +72,7 @@ def _words(name: str) -> list[str]:
 
 
 def bind(path: Path, header: Sequence[str], name: str, source: ChannelSource | None, want: str | None = None) -> Bound:
-    """The binding of one channel; want: the SI unit that it must have. Raises ValueError for a missing column or a
-    wrong unit.
-    """
+    """The binding of one channel; want: its SI unit. Raises ValueError for a missing column or a wrong unit."""
     source = source or ChannelSource()
     if source.constant is not None:
         unit = source.unit or "1"
@@ -104,9 +100,7 @@ def unit_notes(bounds: Sequence[Bound]) -> list[str]:
 
 
 def column_of(path: Path, header: Sequence[str], column: str) -> str:
-    """The header `column` of a column that is no channel. Raises ValueError, with the nearest header, if there
-    is none.
-    """
+    """The header `column` of a column that is no channel. Raises ValueError, with the nearest, if there is none."""
     if column in header:
         return column
     raise ValueError(f"{path}: expected a column '{column}', got {', '.join(header)}{nearest(column, header)}")
@@ -162,9 +156,7 @@ def _unit_in(path: Path, column: str, name: str) -> str:
     return name_and_unit[1]
 
 
-def columns_of(
-    path: Path, heading: Heading, bounds: Sequence[Bound], clock: ChannelSource | None = None, sparse: bool = False
-) -> Columns:
+def columns_of(path: Path, heading: Heading, bounds: Sequence[Bound], clock: ClockSource, sparse: bool) -> Columns:
     """The columns of the file to read, each once, in the order of their first use: time comes first.
 
     clock: the format of its time stamps. sparse: whether empty cells differ from cells that report a bad value.
@@ -173,5 +165,4 @@ def columns_of(
     positions = list(dict.fromkeys(b.position for b in bounds if b.position is not None))
     rules = {b.position: b.rule for b in bounds if b.position is not None and b.rule is not None}
     stamps = next((b.position for b in bounds if b.stamps), None)
-    read = StampReader(clock.stamps, clock.zone) if isinstance(clock, ClockSource) else StampReader()
-    return Columns(path, heading, positions, stamps, read, rules, sparse)
+    return Columns(path, heading, positions, stamps, StampReader(clock.stamps, clock.zone), rules, sparse)

@@ -76,9 +76,7 @@ def parse_fast(lines: list[str], columns: Columns) -> np.ndarray:
 
 
 def parse_carefully(lines: list[str], columns: Columns, above: int) -> np.ndarray:
-    """Parse lines cell by cell: empty cells are NaN, bad ones BAD; an error names row and column. above: lines before
-    these.
-    """
+    """Parse cell by cell: empty cells are NaN, bad ones BAD; errors name row and column. above: lines before these."""
     return np.array(list(_rows(lines, columns, above)), dtype=np.float64).reshape(-1, len(columns.positions))
 
 

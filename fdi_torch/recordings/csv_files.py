@@ -23,10 +23,9 @@ from fdi_torch.recording import Hold, Recording
 from fdi_torch.recordings.csv_binding import Bound, bind, bind_clock, columns_of, unit_notes
 from fdi_torch.recordings.csv_cells import Columns, parse_carefully, parse_fast
 from fdi_torch.recordings.csv_tags import read_tags
-from fdi_torch.recordings.csv_text import heading_of, open_csv
-from fdi_torch.recordings.header import names_in
+from fdi_torch.recordings.csv_text import heading_of, names_in, open_csv
 from fdi_torch.recordings.sheets import Sheet, in_order, informative_rows, merge_sheets
-from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource, file_sha256
+from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource, clock_in, file_sha256
 from fdi_torch.recordings.time_stamps import StampReader, from_zone, offset_of_zone
 from fdi_torch.units import spelled
 
@@ -108,9 +107,7 @@ def read_csv_files(
 
 
 def _assign_to_files(files: Sequence[FileSource], names: Sequence[str]) -> list[list[str]]:
-    """The channels to take from each file; channels that no file has are assigned to the first, whose reader reports
-    them.
-    """
+    """The channels to take from each file; those that none has are for the first, whose reader reports them."""
     names_by_file: list[list[str]] = [[] for _ in files]
     headers = [names_in(read_header(file.path, file.header, file.sheet)) if len(files) > 1 else set() for file in files]
     for name in names:
@@ -122,7 +119,7 @@ def _assign_to_files(files: Sequence[FileSource], names: Sequence[str]) -> list[
 
 def _read_rows(file: FileSource, names: Sequence[str]) -> Read:
     """A file with one row per instant: one sheet."""
-    path, clock_source = file.path, file.columns.get("t")
+    path, clock_source = file.path, clock_in(file.columns)
     with open_csv(path, file.sheet) as handle:
         heading, lines = heading_of(path, handle, file.header)
         clock = bind_clock(path, heading.names, clock_source)
@@ -135,7 +132,7 @@ def _read_rows(file: FileSource, names: Sequence[str]) -> Read:
     seconds = _clock(cells, clock, clock_source, place, first)
     in_file = [b for b in bounds if b.position is not None]
     values = channels_in_si(table, columns, in_file)
-    order = in_order(seconds, values, _sorted(clock_source), place, first, _summer_time_hint(clock, clock_source))
+    order = in_order(seconds, values, clock_source.sort, place, first, _summer_time_hint(clock, clock_source))
     sheet = Sheet(str(path), order.seconds, tuple(b.name for b in in_file), order.values)
     notes = [f"{path.name}: {note}" for note in (*unit_notes(bounds), *notes, *order.notes)]
     zone = _zone(clock_source, columns.read_stamp, order.seconds)
@@ -144,7 +141,7 @@ def _read_rows(file: FileSource, names: Sequence[str]) -> Read:
 
 def _read_tagged(file: FileSource, names: Sequence[str]) -> Read:
     """A file with one row per value: one sheet per channel."""
-    path, clock_source = file.path, file.columns.get("t")
+    path, clock_source = file.path, clock_in(file.columns)
     constant = [name for name in names if (source := file.columns.get(name)) and source.constant is not None]
     clock, tagged = read_tags(file, [name for name in names if name not in constant])
     sheets, notes = [], []
@@ -152,7 +149,7 @@ def _read_tagged(file: FileSource, names: Sequence[str]) -> Read:
         place = f"{path}: row {{}} ({bound.header}), column {clock.header}"
         seconds = _clock(stamps, clock, clock_source, place, 0, rows)
         values = (numbers * np.float64(bound.factor))[:, None]
-        order = in_order(seconds, values, _sorted(clock_source), place, 0, _summer_time_hint(clock, clock_source), rows)
+        order = in_order(seconds, values, clock_source.sort, place, 0, _summer_time_hint(clock, clock_source), rows)
         sheets.append(Sheet(f"{path} ({bound.header})", order.seconds, (bound.name,), order.values))
         notes += [f"{path.name}: {bound.header}: {note}" for note in order.notes]
     bounds = [bound for bound, *_ in tagged] + [bind(path, (), name, file.columns[name]) for name in constant]
@@ -160,10 +157,9 @@ def _read_tagged(file: FileSource, names: Sequence[str]) -> Read:
     return Read(sheets, *_units_and_constants(bounds), clock.stamps, zone, notes)
 
 
-def _zone(source: ChannelSource | None, read: StampReader, seconds: np.ndarray) -> float:
+def _zone(source: ClockSource, read: StampReader, seconds: np.ndarray) -> float:
     """How far the file's clock is ahead of UTC, s: by the zone of its column of time, or else by its stamps."""
-    named = source.zone if isinstance(source, ClockSource) else None
-    return offset_of_zone(float(seconds[0]), named) if named else read.offset
+    return offset_of_zone(float(seconds[0]), source.zone) if source.zone else read.offset
 
 
 def _units_and_constants(bounds: Sequence[Bound]) -> tuple[dict[str, str], dict[str, str], dict[str, float]]:
@@ -180,15 +176,10 @@ def _columns(whole: Sheet, names: Sequence[str], constants: Mapping[str, float])
     return table
 
 
-def _sorted(clock: ChannelSource | None) -> bool:
-    return isinstance(clock, ClockSource) and clock.sort
-
-
-def _summer_time_hint(clock: Bound, clock_source: ChannelSource | None) -> str:
+def _summer_time_hint(clock: Bound, clock_source: ClockSource) -> str:
     """Hint for a clock that is set back at the end of summer time; empty if a time zone is given."""
-    zoned = isinstance(clock_source, ClockSource) and clock_source.zone
     hint = "where summer time ends, say in which zone this is: columns: {t: {zone: Europe/Berlin}}"
-    return hint if clock.stamps and not zoned else ""
+    return hint if clock.stamps and not clock_source.zone else ""
 
 
 def _sha256(paths: Sequence[Path]) -> str:
@@ -211,9 +202,7 @@ def first_row(path: Path) -> list[str]:
 
 
 def _read_table(lines: Iterator[str], columns: Columns) -> tuple[np.ndarray, list[str]]:
-    """The columns as (rows, columns) float64, with non-finite cells where there is no number; and notes on omitted
-    lines.
-    """
+    """The columns (rows, columns) float64, non-finite where there is no number, and notes on omitted lines."""
     blocks, above, notes = [], columns.heading.lines, []
     for block in _blocks(columns.path, lines):
         if cut := cut_off(block[-1], columns):
@@ -247,7 +236,7 @@ def _blocks(path: Path, lines: Iterable[str]) -> Iterator[list[str]]:
 def _clock(
     cells: np.ndarray,
     clock: Bound,
-    source: ChannelSource | None,
+    source: ClockSource,
     place: str,
     first: int,
     rows: np.ndarray | None = None,
@@ -261,8 +250,6 @@ def _clock(
         row = int(np.flatnonzero(~np.isfinite(seconds))[0])
         number = first + row if rows is None else int(rows[row])
         raise ValueError(f"{place.format(number)}: expected a time in every row, got none")
-    if not isinstance(source, ClockSource):
-        source = ClockSource()
     if source.zone:
         seconds = from_zone(seconds, source.zone)
     return seconds + source.shift if source.shift else seconds

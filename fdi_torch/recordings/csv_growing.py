@@ -13,7 +13,7 @@ from fdi_torch.recordings.csv_cells import parse_carefully
 from fdi_torch.recordings.csv_files import SINCE_1970, channels_in_si, from_first
 from fdi_torch.recordings.csv_text import heading_of, joined, open_csv
 from fdi_torch.recordings.sheets import fill_held
-from fdi_torch.recordings.source import ChannelSource
+from fdi_torch.recordings.source import ChannelSource, clock_in
 from fdi_torch.recordings.table_files import TableText
 
 
@@ -39,13 +39,14 @@ class GrowingCsv:
             self._encoding = handle.encoding
         if self._encoding == "utf-16":
             raise ValueError(f"{path}: expected a file that is followed in UTF-8, got UTF-16; let it be written so")
-        self._clock = bind_clock(path, heading.names, mapping.get("t"))
+        clock = clock_in(mapping)
+        self._clock = bind_clock(path, heading.names, clock)
         self._inputs = [bind(path, heading.names, name, mapping.get(name)) for name in inputs]
         self._outputs = [bind(path, heading.names, name, mapping.get(name)) for name in outputs]
         sources = [mapping.get(name, ChannelSource()) for name in inputs]
         self._held = {k: source.held for k, source in enumerate(sources) if source.held > 0.0}
         bounds = [self._clock, *self._inputs, *self._outputs]
-        self._columns = columns_of(path, heading, bounds, mapping.get("t"), bool(self._held))
+        self._columns = columns_of(path, heading, bounds, clock, bool(self._held))
         self._logged = np.empty((0, 1 + len(inputs)))  # the last rows with a logged value of a held input
         self._line = heading.lines
         self._first: float | None = None
@@ -86,9 +87,7 @@ class GrowingCsv:
         return seconds, self._filled_inputs(seconds, inputs), outputs, troubles
 
     def _filled_inputs(self, seconds: np.ndarray, inputs: np.ndarray) -> np.ndarray:
-        """Inputs (R, M) with empty cells filled by the last logged value while it is held, also from before
-        these rows.
-        """
+        """Inputs (R, M) with empty cells filled by the last logged value while it is held, also from earlier rows."""
         rows = np.concatenate([self._logged, np.column_stack([seconds, inputs])])
         before = len(self._logged)
         if self._held and len(rows):

@@ -14,7 +14,7 @@ from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_binding import Bound, bind_clock, column_of, rule_of
 from fdi_torch.recordings.csv_cells import apply_rule, number_in
 from fdi_torch.recordings.csv_text import heading_of, open_csv, rows_of
-from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource, TagRows
+from fdi_torch.recordings.source import ChannelSource, FileSource, TagRows, clock_in
 from fdi_torch.recordings.time_stamps import StampReader
 
 TAG_NAMES = (
@@ -62,15 +62,13 @@ def read_tags(file: FileSource, names: Sequence[str]) -> tuple[Bound, list[Tagge
             raise ValueError(f"{path}: columns.{channel}.plus: expected no such key where rows have tags; leave it out")
     with open_csv(path, file.sheet) as handle:
         heading, lines = heading_of(path, handle)
-        clock_source = file.columns.get("t")
+        clock_source = clock_in(file.columns)
         clock = bind_clock(path, heading.names, clock_source)
         time_column = heading.names.index(clock.header)
         tag, value = (heading.names.index(column_of(path, heading.names, c)) for c in (tags.tag, tags.value))
         quality = None if tags.quality is None else heading.names.index(column_of(path, heading.names, tags.quality))
         rules = {name: rule_of(source, quality) for name, source in sources.items()}
-        read = StampReader()
-        if isinstance(clock_source, ClockSource):
-            read = StampReader(clock_source.stamps, clock_source.zone)
+        read = StampReader(clock_source.stamps, clock_source.zone)
         for number, cells in rows_of(path, lines, heading.delimiter, heading.lines):
             if len(cells) != len(heading.names):
                 if not any(cell.strip() for cell in cells):

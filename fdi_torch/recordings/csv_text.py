@@ -1,4 +1,6 @@
-"""The text of a CSV file as loggers, spreadsheets and historians write it: encoding, delimiter and header."""
+"""The text of a CSV file as loggers, spreadsheets and historians write it: encoding, delimiter, header, and the units
+in it.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +10,48 @@ import gzip
 import io
 import re
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any, TextIO
 
 from fdi_torch.quantities import si_unit_of
-from fdi_torch.recordings.header import header_unit
 from fdi_torch.recordings.table_files import TableText, format_of, table_text
+from fdi_torch.units import MOST_CHARACTERS
 from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_LINE, MOST_UNPACKED, expect_unpacked
+
+
+@lru_cache(maxsize=1024)
+def header_unit(header: str) -> tuple[str, str] | None:
+    """Split a CSV header of the form name_unit, name [unit] or name (unit): 'Q1_cm3_s' -> ('Q1', 'cm3_s'); None without
+    a unit.
+
+    The shortest name followed by a unit wins: `qL_cmd_lps` is (`qL_cmd`, `lps`), `Q1_cm3_s` is (`Q1`, `cm3_s`).
+    `tank_A` is a name without unit: write amperes as mA, or in brackets.
+    """
+    cuts = [i for i in range(max(0, len(header) - MOST_CHARACTERS - 1), len(header)) if header[i] == "_"]
+    splits = [(header[:i], header[i + 1 :]) for i in cuts if header[i + 1 :] != "A"]
+    for name, unit in [bracketed] if (bracketed := _bracketed(header)) else splits:
+        try:
+            si_unit_of(unit)
+        except ValueError:
+            continue
+        return name, unit
+    return None
+
+
+def names_in(header: Sequence[str]) -> set[str]:
+    """What a channel may be called: whole headers, and names of headers with a unit."""
+    return {*header, *(split[0] for column in header if (split := header_unit(column)))}
+
+
+def _bracketed(header: str) -> tuple[str, str] | None:
+    opening = {"]": "[", ")": "("}.get(header[-1:])
+    place = header.rfind(opening) if opening else -1
+    return (header[:place].rstrip(" \t_"), header[place + 1 : -1].strip()) if place > 0 else None
+
 
 _SNIFFED = 1 << 16
 _FOREIGN = {

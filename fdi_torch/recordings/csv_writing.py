@@ -11,7 +11,7 @@ import torch
 from fdi_torch.disk import replacing
 from fdi_torch.quantities import display_unit, unit_factor
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.header import header_unit
+from fdi_torch.recordings.csv_text import header_unit
 
 
 def write_csv(recording: Recording, path: Path | str) -> Path:

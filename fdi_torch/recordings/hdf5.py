@@ -7,8 +7,7 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.recordings.table_files import Row, expect_cells
-from fdi_torch.recordings.vectors import rows_of_arrays
+from fdi_torch.recordings.table_files import Row, expect_cells, rows_of_arrays
 from fdi_torch.tables import needed
 
 MOST_DATASETS = 10_000

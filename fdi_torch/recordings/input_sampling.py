@@ -20,7 +20,7 @@ import torch
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.channel_finding import ChannelFinding
+from fdi_torch.recordings.plant_limits import ChannelFinding
 from fdi_torch.recordings.repeated_readings import BY_CHANCE, resolution
 from fdi_torch.sample_noise import sample_noise
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from scipy.io import loadmat, whosmat
 
-from fdi_torch.recordings.table_files import Row, expect_cells
-from fdi_torch.recordings.vectors import rows_of_arrays
+from fdi_torch.recordings.table_files import Row, expect_cells, rows_of_arrays
 
 _NUMBERS = frozenset(
     {"double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}

@@ -1,10 +1,12 @@
-"""Checks of a recording's channels against the plant: units, rims, and limits of pumps and valves."""
+"""Checks of a recording's channels against the plant: units, rims, and limits of pumps and valves; and the findings of
+all checks.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 
 import torch
@@ -14,9 +16,21 @@ from fdi_torch.plant.description import PlantDescription, Sensor, Tank, with_tol
 from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.channel_finding import ChannelFinding
 from fdi_torch.recordings.plant_units import refusal
 from fdi_torch.sample_noise import sample_noise
+
+
+@dataclass(frozen=True)
+class ChannelFinding:
+    """kind: read, clock, gap, constant, constant input, clipped, frozen, quantised, range, rim, unit, missing, on
+    change, undersampled, unknown, stuck or slip. values: the numbers stated in `text`, by name, SI.
+    """
+
+    kind: str
+    channel: str
+    text: str
+    values: Mapping[str, float] = field(default_factory=dict)
+
 
 RIM_MARGIN = 0.02
 """A level within this share of the rim may be at it; overflowing water stands a few millimetres above it."""
@@ -72,8 +86,7 @@ def expect_no_denied_rim(plant: PlantDescription, recording: Recording) -> None:
 
 
 def _denied(plant: PlantDescription, sensor: Sensor, recording: Recording) -> DeniedRim | None:
-    column = recording.output_names.index(sensor.column)
-    values = recording.outputs[recording.mask[:, column], column]
+    values = recording.valid_readings(sensor.column)
     tank, share = plant.tank(sensor.tank), plant.tolerances.get
     levels = (values - sensor.offset) / sensor.gain
     noise = float(sample_noise(values.unsqueeze(1))) / abs(sensor.gain)

@@ -44,6 +44,12 @@ class ClockSource(ChannelSource):
     period: float | None = None
 
 
+def clock_in(columns: Mapping[str, ChannelSource]) -> ClockSource:
+    """The source of time among the sources of channels, `t`."""
+    source = columns.get("t", ClockSource())
+    return source if isinstance(source, ClockSource) else ClockSource(**vars(source))
+
+
 @dataclass(frozen=True)
 class TagRows:
     """Column headers of a file with one row per value: tag, value, and quality (or None)."""

@@ -1,10 +1,13 @@
-"""A chart of signals: its description, from which the picture and the data of the interactive chart are made."""
+"""A chart of signals: its description, from which the picture and the data of the interactive chart are made. Long
+signals are reduced to their extremes, without visible change.
+"""
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,9 +15,46 @@ import orjson
 from matplotlib.figure import Figure
 
 from fdi_torch.clock import clock_text, clock_zero
-from fdi_torch.report.downsampling import extremes, thinned
 from fdi_torch.report.html import clean, short
 from fdi_torch.report.style import HEIGHT, MARK, SOFT, VARIABLES, label_lines, logarithmic, panel, styled
+
+BINS = 400
+
+
+def thinned(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray]:
+    """A signal (T,) reduced to the minimum and maximum of each of `bins` segments, in order, so that spikes remain.
+
+    A segment without finite values becomes a gap (NaN).
+    """
+    if len(time) <= 2 * bins:
+        return time, values
+    kept = extremes(values, bins)
+    return time[kept], values[kept]
+
+
+def extremes(values: np.ndarray, bins: int) -> np.ndarray:
+    """Indices of the minimum and maximum of each of `bins` segments of a signal (T,), T >= bins.
+
+    Of a segment without finite values the first sample is taken.
+    """
+    edges = np.linspace(0, len(values), bins + 1).astype(int)
+    missing, finite = np.isnan(values), np.isfinite(values)
+    low, high = np.where(missing, np.inf, values), np.where(missing, -np.inf, values)
+    kept: list[int] = []
+    for first, last in pairwise(edges.tolist()):
+        ends = {int(low[first:last].argmin()), int(high[first:last].argmax())} if finite[first:last].any() else {0}
+        kept += sorted(first + end for end in ends)
+    return np.array(kept)
+
+
+def corner_points(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The corners of a signal (T,) that is constant between changes."""
+    if not len(time):
+        return time, values
+    changes = np.flatnonzero(values[1:] != values[:-1]) + 1
+    corners = np.unique(np.concatenate(([0], changes, [len(time) - 1])))
+    return time[corners], values[corners]
+
 
 MOST_SAMPLES = 6000  # of a line; longer ones keep the extremes of half as many segments
 MOST_EVENTS = 50
@@ -24,9 +64,7 @@ ONE_ROW = 44  # letters of title and names of lines that fit one row above the p
 
 
 class Line(NamedTuple):
-    """A signal: y (T,) over x (T,). steps: the value holds until the next sample. wide: broad and pale,
-    so that it is visible below other lines.
-    """
+    """y (T,) over x (T,). steps: a value holds until the next sample. wide: broad and pale, for lines below others."""
 
     name: str
     x: np.ndarray

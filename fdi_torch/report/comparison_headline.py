@@ -18,7 +18,7 @@ from fdi_torch.quantities import quantity_text
 from fdi_torch.report.html import short
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import percent
-from fdi_torch.report.progress import SensorResidual, sensor_residuals
+from fdi_torch.report.predictions import SensorResidual, sensor_residuals
 from fdi_torch.report.verdict import headline, kind_words
 from fdi_torch.units import UnitError, in_unit, number_and_unit
 
@@ -76,9 +76,7 @@ def _same_readings(runs: Sequence[Material]) -> bool:
 
 
 def _same(runs: Sequence[Material], columns: str) -> bool:
-    """Whether these columns of the recordings, `time`, `inputs` or `outputs`, are the same in all runs, whatever their
-    hold-outs.
-    """
+    """Whether the recordings' `time`, `inputs` or `outputs` are the same in all runs, whatever their hold-outs."""
     first, *others = ([getattr(recording, columns) for recording in run.fitted.values()] for run in runs)
     return all(
         len(first) == len(other)
@@ -175,9 +173,7 @@ def left_out_words(left_out: int) -> str:
 
 
 def plain_text(text: str) -> str:
-    """The text of a setting; a JSON list or mapping in words, a number without its rounding error, and 'none' for a
-    missing one.
-    """
+    """A setting as text: JSON in words, a number without its rounding error, 'none' for a missing one."""
     with suppress(ValueError):
         value = orjson.loads(text)
         text = f"{value:.12g}" if isinstance(value, float) else _in_words(value) if text[0] in "[{" else text

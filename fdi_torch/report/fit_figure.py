@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from fdi_torch.recording import Recording
-from fdi_torch.report.downsampling import thinned
+from fdi_torch.report.chart import thinned
 from fdi_torch.report.html import short
 from fdi_torch.report.numbers import axis, shown_unit
 from fdi_torch.report.style import MARK, MODEL, SOFT, label_lines, set_title, styled

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 MOST_ROWS = 300
@@ -67,6 +67,12 @@ def pairs(entries: Sequence[tuple[Any, Any]]) -> Markup:
     """A list of names and values."""
     rows = (tag("div", tag("dt", name), tag("dd", value)) for name, value in entries[:MOST_ROWS])
     return tag("dl", *rows)
+
+
+def bullets(items: Iterable[Any], **attributes: str) -> list[Markup]:
+    """The items as a list, or nothing without any. attributes: of each item."""
+    entries = [tag("li", item, **attributes) for item in items]
+    return [tag("ul", *entries)] if entries else []
 
 
 def folded(summary: str, *content: Any, printed: bool = True) -> Markup:

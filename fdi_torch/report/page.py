@@ -1,21 +1,43 @@
-"""The report page: each run's verdict, then its sections, in one file without network access."""
+"""The report page: each run's verdict, then its sections, in one file without network access.
+
+Its only script is uPlot with the charts made with it; the content security policy allows the script by its hash.
+"""
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 
 from fdi_torch.logbook import labels_of
 from fdi_torch.report.html import Markup, join, tag
 from fdi_torch.report.material import Material
-from fdi_torch.report.page_assets import POLICY, SCRIPT, STYLESHEET
 from fdi_torch.report.section import Maker, Picture, Section, section_html
 from fdi_torch.report.sections import SECTIONS
-from fdi_torch.report.sections.rig import RIG
+from fdi_torch.report.sections.origin import RIG
 from fdi_torch.report.style import save
 from fdi_torch.report.verdict import headline, how_it_ended, kind_words
+
+_ASSETS = files("fdi_torch.report") / "assets"
+
+
+def _text(name: str) -> str:
+    return (_ASSETS / name).read_text(encoding="utf-8")
+
+
+LICENCE = _text("uPlot.LICENSE.txt")
+_OWN = f'(() => {{\n"use strict";\n{_text("charts.js")}\n{_text("page.js")}}})();\n'
+SCRIPT = "\n".join((f"/*\n{LICENCE}*/", _text("uPlot.iife.min.js"), _OWN))
+STYLESHEET = _text("uPlot.min.css") + _text("page.css")
+
+# Even if something passed the escaping, the browser would load nothing, and run nothing but SCRIPT.
+_HASH = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
+POLICY = f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{_HASH}'"
+
 
 WIDEST_BESIDE = 6.8  # inches of a rig beside the result; a wider one would have letters too small to read
 
@@ -78,7 +100,7 @@ def write_pictures(report: RunReport, folder: Path) -> list[Path]:
 def _article(report: RunReport, prefix: str) -> Markup:
     material = report.material
     top = [tag("h1", f"{kind_words(material)} · {material.run.path.stem}"), tag("h2", unbroken(headline(material)))]
-    top += [tag("p", sentence, class_="meta") for sentence in how_it_ended(material)]
+    top.append(tag("p", how_it_ended(material), class_="meta"))
     named = [(f"{prefix}s{k}", section) for k, section in enumerate(report.sections)]
     lead = [section_html(section, prefix, name) for name, section in named if section.lead]
     others = [section_html(section, prefix, name) for name, section in named if not section.lead]

@@ -1,9 +1,16 @@
-"""The models whose free runs a gap diagnosis compares on its hold-outs, in words, for terminal and page."""
+"""What terminal and page say of a gap answer in the same words: the models whose free runs it compares on its
+hold-outs, and the random flows that people need to know of.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
+
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.scales import emptying_time
+from fdi_torch.report.numbers import as_float
 
 _NAMES = {
     "nominal": "nominal model",
@@ -20,11 +27,35 @@ def has_causes(answer: Mapping[str, Any]) -> bool:
 
 
 def reference_models(answer: Mapping[str, Any]) -> dict[str, str]:
-    """Names of the models by their key in the closure, and of the noise. The free form of an unknown cause is the best
-    that free functions can reach.
-    """
+    """Names of models and noise by their key in the closure; free functions are the best of an unknown cause."""
     if not has_causes(answer):
         return {key: _NAMES[key] for key in ("nominal", "recalibrated", "noise_floor")}
     if answer.get("verdict") == "unknown":
         return {key: name for key, name in _NAMES.items() if key != "ceiling"} | {"augmented": "with the free form"}
     return _NAMES
+
+
+SMALLEST_MOVE = 0.1
+"""Standard deviation of a level, in those of the best sensor's noise. Less adds below 1 % to the readings' variance."""
+
+
+def flows_that_matter(answer: Mapping[str, Any], plant: PlantDescription | None) -> dict[str, Mapping[str, Any]]:
+    """Tank -> its random flow, if it moves the tank's level by more than `SMALLEST_MOVE`; all without a plant.
+
+    A flow w that is constant moves the level of a tank by w T / A, with area A and emptying time T; a random flow of
+    that standard deviation moves it by less. A tank without an outlet has no such bound, hence its flow matters.
+    """
+    flows = answer.get("disturbances")
+    flows = {k: f for k, f in flows.items() if isinstance(f, Mapping)} if isinstance(flows, Mapping) else {}
+    noise = answer.get("noise")
+    if plant is None or not isinstance(noise, Mapping) or not noise:
+        return flows
+    gains = {sensor.name: abs(sensor.gain) for sensor in plant.sensors}
+    stds = [as_float((noise.get(s) or {}).get("std")) / gain for s, gain in gains.items() if s in noise]
+    best = min(stds, default=math.nan)
+    tanks = {t.name: emptying_time(plant, t) / t.area for t in plant.tanks}
+    return {
+        name: flow
+        for name, flow in flows.items()
+        if name not in tanks or not as_float(flow.get("std")) * tanks[name] <= SMALLEST_MOVE * best
+    }

@@ -1,17 +1,82 @@
-"""The diagnosis on the drawing of a rig: levels, texts at components, strength of colours."""
+"""The diagnosis on the drawing of a rig: levels, texts at components, moved apart so that none stands on another, and
+strength of colours.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from textwrap import wrap
 
 import numpy as np
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import TextPath
 
 from fdi_torch.report.html import short
 from fdi_torch.report.numbers import percent, shown_unit
+from fdi_torch.report.rig_layout import Point
 from fdi_torch.report.style import INK
-from fdi_torch.report.text_blocks import LetterStyle
+
+POINTS, LINE = 9.0, 0.2  # size of the letters, points; height of a line in units of the drawing
+LetterStyle = tuple[str, str, str]  # text, colour, weight
+Box = tuple[float, float, float, float]  # left, bottom, right, top
+
+
+@dataclass(frozen=True)
+class TextBlock:
+    """Lines of text at a point. ha: left, center or right of it. down: the first line lies at the point and further
+    ones below; otherwise the last line lies there and the others above. unit: points per unit of the drawing.
+    """
+
+    lines: Sequence[LetterStyle]
+    point: Point
+    ha: str
+    down: bool
+    unit: float
+
+    @property
+    def box(self) -> Box:
+        x, y = self.point
+        width = max(text_width(text, weight) for text, _, weight in self.lines) / self.unit
+        left = x - width * {"left": 0.0, "center": 0.5, "right": 1.0}[self.ha]
+        height = LINE * len(self.lines)
+        return left, y - height if self.down else y, left + width, y if self.down else y + height
+
+    def placed_lines(self) -> list[tuple[Point, LetterStyle]]:
+        """Each line with the point of its upper end if `down`, else of its lower end."""
+        x, y = self.point
+        if self.down:
+            return [((x, y - k * LINE), line) for k, line in enumerate(self.lines)]
+        return [((x, y + k * LINE), line) for k, line in enumerate(reversed(self.lines))]
+
+
+@lru_cache(maxsize=1024)  # a drawing asks for the width of each line again and again
+def text_width(text: str, weight: str = "normal") -> float:
+    """Width of a text in points."""
+    path = TextPath((0.0, 0.0), text, size=POINTS, prop=FontProperties(weight=weight), usetex=False)
+    return float(path.get_extents().width) if text.strip() else 0.0
+
+
+def separated(blocks: Iterable[TextBlock], obstacles: Iterable[Box] = ()) -> list[TextBlock]:
+    """The blocks in order, each moved down (or up, if not `down`) until it is free of obstacles and earlier blocks."""
+    taken, placed = list(obstacles), []
+    for block in blocks:
+        while hit := [box for box in taken if _overlap(box, block.box)]:
+            beyond = min(box[1] for box in hit) - GAP if block.down else max(box[3] for box in hit) + GAP
+            block = replace(block, point=(block.point[0], beyond))
+        taken.append(block.box)
+        placed.append(block)
+    return placed
+
+
+GAP = 0.04
+"""Between two blocks, in units of the drawing."""
+
+
+def _overlap(a: Box, b: Box) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
 
 LETTERS, LONGEST = 9, 40  # letters per line, and per effect
 LEAST_SHARE = 0.005  # of a probability that is written

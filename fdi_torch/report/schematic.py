@@ -13,11 +13,21 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent, Sketch
 from fdi_torch.report.html import short
-from fdi_torch.report.line_geometry import Point, arrow_head, direction, longest_piece
-from fdi_torch.report.rig_layout import tank_places
-from fdi_torch.report.rig_overlay import Overlay, level_text, strength
+from fdi_torch.report.rig_layout import Point, arrow_head, direction, longest_piece, tank_places
+from fdi_torch.report.rig_overlay import (
+    GAP,
+    LINE,
+    POINTS,
+    Box,
+    LetterStyle,
+    Overlay,
+    TextBlock,
+    level_text,
+    separated,
+    strength,
+    text_width,
+)
 from fdi_torch.report.style import INK, MARK, MODEL, PAPER, SOFT, styled
-from fdi_torch.report.text_blocks import GAP, LINE, POINTS, Box, LetterStyle, TextBlock, separated, text_width
 
 INCH = 0.8  # per unit of the drawing; a tank is one unit wide
 POINTS_PER_UNIT = 72 * INCH

@@ -16,7 +16,7 @@ from fdi_torch.names import counted, listed
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number, sentence
-from fdi_torch.report.sections.rehearsal import rehearsal_tables
+from fdi_torch.report.sections.monitor import rehearsal_tables
 from fdi_torch.report.sections.study import ESTIMATORS
 from fdi_torch.report.sections.windows import logged_windows
 
@@ -58,9 +58,7 @@ def headline(material: Material) -> str:
 
 
 def unreliable_words(material: Material) -> str:
-    """The warning of an estimate that has not converged or whose model does not explain its recording; logs before
-    2026-11 lack its ratio.
-    """
+    """The warning of a model that has not converged or does not explain its recording; old logs lack the ratio."""
     result = material.about("result")
     warnings = [convergence_warning(result.get("status", "")) if material.kind == "train" else ""]
     if material.unexplained:
@@ -190,8 +188,8 @@ def windows_words(material: Material) -> str:
     return text[:1].upper() + text[1:]
 
 
-def how_it_ended(material: Material) -> list[str]:
-    """Start, duration and status of the run, one sentence each."""
+def how_it_ended(material: Material) -> str:
+    """Status, start and duration of the run."""
     status, run = material.about("status"), material.about("run")
     ended = status.get("status", "no end in the log").replace("_", " ")
     reason = f" ({status['reason']})" if status.get("reason") else ""
@@ -199,8 +197,7 @@ def how_it_ended(material: Material) -> list[str]:
     seconds = status.get("wall_seconds")  # of a blind benchmark: of writing its log, after all diagnoses
     parts += [f"started {run['started'][:19].replace('T', ' ')} UTC"] if run.get("started") else []
     parts += [f"took {_rounded(seconds)} s"] if seconds and material.kind != "challenge" else []
-    sentences = [" · ".join(parts)]
-    return sentences
+    return " · ".join(parts)
 
 
 def _rounded(seconds: str) -> str:

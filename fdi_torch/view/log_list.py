@@ -11,7 +11,7 @@ from fdi_torch.jobs.report import plant_of
 from fdi_torch.logbook import being_written, read_run
 from fdi_torch.report.material import gather
 from fdi_torch.report.numbers import amount
-from fdi_torch.report.progress import Progress, progress_of, residual_size
+from fdi_torch.report.predictions import Progress, progress_of, residual_size
 from fdi_torch.report.verdict import headline, kind_words
 
 RUNNING, NO_END, UNREADABLE = "running", "did not end", "unreadable"

@@ -12,7 +12,7 @@ from fdi_torch.report.html import Markup, clean, folded, join, table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
 from fdi_torch.report.page import document
-from fdi_torch.report.progress import Progress
+from fdi_torch.report.predictions import Progress
 from fdi_torch.view.log_list import RUNNING, SORTS, UNREADABLE, Entry
 
 SECONDS_BETWEEN_UPDATES = 2

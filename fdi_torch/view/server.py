@@ -16,7 +16,7 @@ from typing import Any
 from fdi_torch.jobs.report import page_of, report_of_log
 from fdi_torch.logbook import LogError, read_run
 from fdi_torch.report.material import gather
-from fdi_torch.report.page_assets import POLICY
+from fdi_torch.report.page import POLICY
 from fdi_torch.tables import needed
 from fdi_torch.view.log_list import RUNNING, UNSHOWN, Entry, LogList, selected
 from fdi_torch.view.pages import address, follow_page, list_page, navigation, problem_page, query_of

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.logbook import RunLog
-from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.schemas import json_schema
 from fdi_torch.logbook.sink import Sink
-from fdi_torch.logbook.topic_definitions import topic_definition
+from fdi_torch.logbook.topic_definitions import Channel, topic_definition
 
 FROZEN = 1_790_000_000_123_456_789
 FIXED: dict[str, Any] = {

@@ -137,7 +137,7 @@ def test_a_topic_that_is_not_there(finished: Path, form: str) -> None:
 
 
 def test_what_is_no_json_is_not_exported(tmp_path: Path) -> None:
-    from fdi_torch.logbook.channel import Channel
+    from fdi_torch.logbook.topic_definitions import Channel
 
     sink = Sink(tmp_path / "a.mcap", "x")
     sink.message(Channel("/a", "cdr"), 0, 0, 0, b"\x00")

@@ -26,12 +26,11 @@ from fdi_torch.logbook import (
     read_run,
     series,
 )
-from fdi_torch.logbook.channel import Channel
 from fdi_torch.logbook.payload import unpack
 from fdi_torch.logbook.recover import copy_log
 from fdi_torch.logbook.schemas import json_schema
 from fdi_torch.logbook.sink import EPOCH_NS, Sink
-from fdi_torch.logbook.topic_definitions import topic_definition
+from fdi_torch.logbook.topic_definitions import Channel, topic_definition
 
 
 def test_a_recording_comes_back_bit_for_bit(tmp_path: Path) -> None:

@@ -14,8 +14,7 @@ from browser import browser, draw_all, opened  # noqa: F401
 from sample_runs import material_of, write_train
 
 from fdi_torch.report.chart import MOST_SAMPLES, Chart, Line, chart_json, draw
-from fdi_torch.report.page import page, report_of
-from fdi_torch.report.page_assets import POLICY, SCRIPT
+from fdi_torch.report.page import POLICY, SCRIPT, page, report_of
 from fdi_torch.report.style import MARK, MODEL
 
 TIME = np.arange(100.0)

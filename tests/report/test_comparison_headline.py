@@ -12,7 +12,7 @@ from fdi_torch.jobs.report import report
 from fdi_torch.logbook import RunLog, compare, read_run
 from fdi_torch.report.comparison_headline import comparison_headline, plain_text, setting_differences
 from fdi_torch.report.material import gather
-from fdi_torch.report.progress import residual_size
+from fdi_torch.report.predictions import residual_size
 
 SAMPLES = 100
 

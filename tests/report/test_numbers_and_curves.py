@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fdi_torch.report.downsampling import corner_points, thinned
+from fdi_torch.report.chart import corner_points, thinned
 from fdi_torch.report.html import MOST_ROWS, short, table, tag
 from fdi_torch.report.numbers import number, percent, probability_text, raised, shown_unit, with_error
 

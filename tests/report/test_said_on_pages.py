@@ -11,7 +11,7 @@ from sample_runs import material_of, write_study
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.logbook import RunLog
 from fdi_torch.report.page import page, report_of
-from fdi_torch.report.sections.rehearsal import _texts
+from fdi_torch.report.sections.monitor import _texts
 from fdi_torch.report.verdict import headline
 
 

@@ -18,7 +18,7 @@ import pytest
 from fdi_torch.cli import MISUSE, main
 from fdi_torch.logbook import RunLog, read_run
 from fdi_torch.report.material import gather
-from fdi_torch.report.progress import residual_size
+from fdi_torch.report.predictions import residual_size
 from fdi_torch.view.log_list import LogList, selected
 
 DATA = Path(__file__).parents[1] / "data"

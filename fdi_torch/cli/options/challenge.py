@@ -39,9 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cases", metavar="N", type=int, help="number of recordings over all kinds (22)")
     parser.add_argument("--seed", metavar="S", type=int, help="seed of causes, places, noise and inputs (0)")
     parser.add_argument("--out", metavar="DIR", default="logs/challenge", help="folder (logs/challenge)")
-    parser.add_argument(
-        "--rig", choices=("cascaded_tanks", "quadruple_tank", "three_tank"), help="hidden rig (three_tank)"
-    )
+    parser.add_argument("--rig", choices=RIGS, help="hidden rig (three_tank)")
     parser.add_argument("--plant", metavar="NAME|FILE", help="instead of --rig: a rig like this plant file, or network")
     parser.add_argument("--tanks", metavar="N..M", help="number of tanks of random networks (3..12)")
     parser.add_argument(

@@ -12,8 +12,7 @@ from matplotlib.patches import Rectangle
 
 from fdi_torch.blind.kind_meanings import KIND_MEANINGS
 from fdi_torch.blind.score import Row
-from fdi_torch.blind.score_tables import OWN, Sheet, misses, sheets
-from fdi_torch.blind.scored_rows import Scores, group_of, tables
+from fdi_torch.blind.scored_rows import OWN, Scores, Sheet, group_of, misses, sheets, tables
 from fdi_torch.report.html import Markup, folded, join, short, table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.section import Picture, Section
@@ -156,9 +155,9 @@ def shares_panel(
     figure, axes = panel(short(title), "right answers, %", "", height=1.1 + 0.3 * len(kinds))
     rows = np.arange(len(kinds))
     for (name, shares), colour, mark in zip(others.items(), (OTHER, SOFT, INK, MARK), "dx+^", strict=False):
-        x = [_share(s) if s else np.nan for s in shares]
-        axes.plot(100 * np.array(x), rows, mark, color=colour, ms=5, label=short(name, 20).replace("_", " "))
-    low, middle, high = (100 * np.array([pick(s) for s in own]) for pick in (_low, _share, _high))
+        x = [100 * s["share"] if s else np.nan for s in shares]
+        axes.plot(x, rows, mark, color=colour, ms=5, label=short(name, 20).replace("_", " "))
+    low, middle, high = _intervals(own)
     axes.hlines(rows, low, high, color=MODEL, lw=2.0, alpha=0.5)
     axes.plot(middle, rows, "o", color=MODEL, ms=6, label="fdi")
     axes.set_xlim(-3, 103)
@@ -187,7 +186,7 @@ def calibration_panel(title: str, bins: Sequence[Mapping[str, Any]]) -> Figure:
     """Frequency with which the best explanation was true, against its stated probability (orange mark)."""
     figure, axes = panel(short(title), "stated probability of the best explanation", "it was true, %")
     at = np.arange(len(bins))
-    low, middle, high = (100 * np.array([pick(b) for b in bins]) for pick in (_low, _share, _high))
+    low, middle, high = _intervals(bins)
     axes.vlines(at, low, high, color=MODEL, lw=2.0, alpha=0.5)
     axes.plot(at, middle, "o", color=MODEL, ms=6)
     axes.plot(at, [100 * b["stated"] for b in bins], "_", color=MARK, ms=22, mew=2.0)
@@ -197,13 +196,6 @@ def calibration_panel(title: str, bins: Sequence[Mapping[str, Any]]) -> Figure:
     return figure
 
 
-def _low(score: Share) -> float:
-    return float(score["ci95"][0])
-
-
-def _share(score: Share) -> float:
-    return float(score["share"])
-
-
-def _high(score: Share) -> float:
-    return float(score["ci95"][1])
+def _intervals(scores: Sequence[Share]) -> np.ndarray:
+    """The least value of each, the share, and the largest value (3, scores), %."""
+    return 100 * np.array([(s["ci95"][0], s["share"], s["ci95"][1]) for s in scores]).T

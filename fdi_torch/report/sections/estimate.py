@@ -1,4 +1,6 @@
-"""Sections about the estimate: its table, the faults that are present, and its uncertainty."""
+"""Sections about an estimation: search, refinement, the table of the estimate, the faults that are present, and its
+uncertainty.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +12,14 @@ import numpy as np
 
 from fdi_torch.estimate.combinations import Combination
 from fdi_torch.estimate.misfit import NOT_ESTABLISHED
+from fdi_torch.names import counted
+from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
-from fdi_torch.report.estimate_table import HEADER, correlation_table, estimate_cells, signed
-from fdi_torch.report.html import table, tag
+from fdi_torch.report.html import bullets, table, tag
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import amount, number, shown_unit
-from fdi_torch.report.panels import ellipse_panel
-from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.numbers import HEADER, amount, axis, correlation_table, estimate_cells, number, shown_unit, signed
+from fdi_torch.report.section import Picture, Section, signals
+from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT, ellipse_panel
 
 MOST_ELLIPSES = 6
 
@@ -33,9 +36,8 @@ def estimate_section(material: Material) -> Section | None:
     header += ["simulated"] if material.truth else []
     notes = [str(note) for note in final.get("unidentifiable") or ()]
     notes += [f"{name} lies at the edge of its range" for name in final.get("at_bound") or ()]
-    listed = [tag("ul", *(tag("li", note) for note in notes))] if notes else []
     return Section(
-        "Estimate", [table(header, rows, left=header.index("unit") + 1), *_water(material), *listed], lead=True
+        "Estimate", [table(header, rows, left=header.index("unit") + 1), *_water(material), *bullets(notes)], lead=True
     )
 
 
@@ -123,8 +125,8 @@ def _water(material: Material) -> list[Any]:
             text = f"{finding.words} {change} the flow by {amount(finding.flow, 'm^3/s', 3)}"
             if np.isfinite(finding.hole):
                 text += f", as a sharp-edged hole of {number(1e3 * finding.hole, 3)} mm would"
-            lines.append(tag("li", text))
-    return [tag("ul", *lines)] if lines else []
+            lines.append(text)
+    return bullets(lines)
 
 
 def _ellipse(material: Material, final: Payload, covariance: np.ndarray, pair: tuple[int, int], k: int) -> Picture:
@@ -139,3 +141,66 @@ def _ellipse(material: Material, final: Payload, covariance: np.ndarray, pair: t
     truth = (scales[0] * material.truth[names[0]], scales[1] * material.truth[names[1]]) if simulated else None
     rho = part[0, 1] / np.sqrt(part[0, 0] * part[1, 1])
     return Picture(f"ellipse_{k + 1}", ellipse_panel(names, units, centre, part, truth), f"correlation {signed(rho)}")
+
+
+GENERATIONS, ITERATIONS = "/estimator/de/generation", "/estimator/refine/iteration"
+MOST_PARAMETERS = 6
+
+
+def search_section(material: Material) -> Section | None:
+    """Cost and best member of differential evolution over its generations."""
+    events = [m for m in material.of(GENERATIONS) if not m.get("problem")]
+    if len(events) < 2:
+        return None
+    steps = column(events, "generation")
+    lines = [Line("best", steps, column(events, "best_cost"), MODEL)]
+    mean = column(events, "mean_cost")
+    if np.isfinite(mean).any():
+        lines.append(Line("mean", steps, mean, SOFT))
+    chart = Chart("Cost", "generation", "cost", lines, log=True, clock="search")
+    pictures = [signals("search_cost", chart)]
+    pictures += _best_members(material, events, steps)
+    last = events[-1]
+    words = f"Differential evolution, {int(steps[-1])} generations"
+    words += f", {last['evaluations']} simulations" if last.get("evaluations") else ""
+    return Section("Search", [f"{words}; lowest cost {number(float(last['best_cost']))}.", pictures])
+
+
+def refinement_section(material: Material) -> Section | None:
+    """Cost of each start over the iterations of the refinement."""
+    events = material.of(ITERATIONS)
+    if not events:
+        return None
+    lanes = sorted({int(m.get("problem", 0)) for m in events})[:4]
+    colours = (MODEL, OTHER, MARK, SOFT)
+    lines: list[Line] = []
+    for colour, lane in zip(colours, lanes, strict=False):
+        start = [m for m in events if int(m.get("problem", 0)) == lane]
+        lines.append(Line(f"start {lane + 1}", np.arange(len(start)), column(start, "cost"), colour))
+    chart = Chart("Cost", "iteration", "cost", lines, log=True)
+    lowest = float(np.nanmin(column(events, "cost")))
+    words = f"{counted(len(events), 'iteration')} from {counted(len(lanes), 'start')}; lowest cost {number(lowest, 6)}."
+    return Section("Refinement", [words, [signals("refinement_cost", chart)]])
+
+
+def column(events: Sequence[Payload], name: str) -> np.ndarray:
+    """A number of each message, NaN where it is missing."""
+    values = (m.get(name) for m in events)
+    return np.array([float(v) if isinstance(v, int | float) else np.nan for v in values])
+
+
+def _best_members(material: Material, events: Sequence[Payload], steps: np.ndarray) -> list[Picture]:
+    """Parameters of the best member over the generations."""
+    final = last_estimate(material)
+    names = [str(name) for name in (final or {}).get("names", ()) if name in events[-1]][:MOST_PARAMETERS]
+    pictures = []
+    for k, name in enumerate(names):
+        unit, scale = shown_unit(material.unit(GENERATIONS, name))
+        lines = [Line("best member", steps, scale * column(events, name), MODEL)]
+        if name in material.truth:
+            lines.append(
+                Line("simulated", steps, np.full(len(steps), scale * material.truth[name]), OTHER, dashed=True)
+            )
+        chart = Chart(name, "generation", axis("best member", unit), lines, clock="search")
+        pictures.append(signals(f"search_parameter_{k + 1}", chart))
+    return pictures

@@ -15,13 +15,12 @@ from fdi_torch.gap.verdict_words import (
     explanation_words,
     rounding_words,
 )
-from fdi_torch.report.html import table, tag
+from fdi_torch.report.html import bullets, table
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, number, percent, probability_text, shown_unit, with_error
-from fdi_torch.report.panels import BAR_NAME, bar_panel
-from fdi_torch.report.random_flows import flows_that_matter
-from fdi_torch.report.reference_models import has_causes
+from fdi_torch.report.reference_models import flows_that_matter, has_causes
 from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.style import BAR_NAME, bar_panel
 
 MOST_BARS = 10
 LEAST_SHOWN = 1e-3  # of a probability that gets a bar
@@ -67,10 +66,9 @@ def causes_section(material: Material) -> Section | None:
     bars = posterior_bars(answer)
     plausible = [explanation_words(causes) for causes in answer.get("ambiguity_set") or _content(answer)]
     if len(plausible) > 1 and (not bars or max(map(len, plausible)) > BAR_NAME):
-        blocks += ["Explanations with 95 % of the probability together:"]
-        blocks.append(tag("ul", *(tag("li", words) for words in plausible)))
+        blocks += ["Explanations with 95 % of the probability together:", *bullets(plausible)]
     blocks += bars
-    blocks += [tag("ul", *(tag("li", str(remark)) for remark in answer["remarks"]))] if answer.get("remarks") else []
+    blocks += bullets(answer.get("remarks") or ())
     return Section("What causes it", blocks, lead=True) if blocks else None
 
 

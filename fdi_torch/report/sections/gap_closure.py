@@ -1,4 +1,7 @@
-"""Sections about the closure of a gap on data not used for fitting, and about the calibration constants."""
+"""Sections about what follows from a gap diagnosis: the closure on data not used for fitting, the calibration
+constants, the discrepancy as a function of the component's own variables, the limits of a recording's inputs, and the
+next experiment.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,17 @@ from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Any
 
-from fdi_torch.gap.verdict_words import closed_sentence
-from fdi_torch.report.html import table
+import numpy as np
+from matplotlib.figure import Figure
+
+from fdi_torch.gap.verdict_words import closed_sentence, explanation_words
+from fdi_torch.report.chart import Chart, Line
+from fdi_torch.report.html import bullets, folded, short, table
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import as_float, axis, number, percent, shown_unit, with_error
-from fdi_torch.report.panels import bar_panel
+from fdi_torch.report.numbers import as_float, as_vector, axis, number, percent, shown_unit, with_error
 from fdi_torch.report.reference_models import has_causes, reference_models
-from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.section import Picture, Section, signals
+from fdi_torch.report.style import MARK, MODEL, SOFT, bar_panel, label_lines, panel
 
 FROZEN = {"recalibrated": "constants recalibrated without them", "nominal": "nominal constants"}
 
@@ -110,3 +117,129 @@ def _each_holdout(closure: Mapping[str, Any], unit: str, stages: Mapping[str, st
         rows.append([name, *errors, closed if "augmented" in shown else ""])
     header = (f"hold-out, error in {unit}", *shown.values(), "closed")
     return [table(header, rows)] if rows else []
+
+
+MOST_LISTED = 40
+
+
+def next_input_section(material: Material) -> Section | None:
+    """The experiment that would distinguish the two likeliest explanations."""
+    proposal = material.answer.get("next_input")
+    if not isinstance(proposal, dict) or not isinstance(proposal.get("input"), dict):
+        return None
+    steps = {name: c for name, c in proposal["input"].items() if isinstance(c, dict) and "at" in c}
+    units, end = proposal["input"].get("unit") or {}, as_float(proposal["input"].get("duration"))
+    pictures = []
+    for k, (name, channel) in enumerate(steps.items()):
+        unit, scale = shown_unit(str(units.get(name, "")), name)
+        time, values = as_vector(channel["at"]), scale * as_vector(channel["value"])
+        line = Line("command", np.append(time, end), np.append(values, values[-1:]), MODEL, steps=True)
+        chart = Chart(name, "time, s", axis("command", unit), [line], clock="next")
+        pictures.append(signals(f"gap_next_input_{k + 1}", chart))
+    return Section("Next experiment", [_next_words(proposal), pictures])
+
+
+def limits_section(material: Material) -> Section | None:
+    """Effects that these inputs hide or confuse, and how often another cause would have got this name."""
+    excitation = material.answer.get("excitation") or {}
+    confusability = material.answer.get("impostors") or {}
+    blocks: list[Any] = [*_confusability_words(confusability)]
+    hidden = [explanation_words([cause]) for cause in excitation.get("hidden") or []]
+    pairs = [" and ".join(explanation_words([c]) for c in p["between"]) for p in excitation.get("inseparable") or []]
+    small = "Effects that these inputs do not show at their typical size"
+    for title, items in ((small, hidden), ("Pairs of effects with the same signature under these inputs", pairs)):
+        if items:
+            blocks.append(folded(f"{title}: {len(items)}", *bullets(items[:MOST_LISTED])))
+    return Section("Limits of these inputs", blocks) if blocks else None
+
+
+def _next_words(proposal: Mapping[str, Any]) -> str:
+    between = [explanation_words(causes) for causes in proposal.get("between") or []]
+    rivals = " from ".join(between) if len(between) == 2 else "the best two explanations"
+    words = f"Of step inputs within the limits of pumps and levels, this one separates {rivals} most."
+    when, samples = proposal.get("parted_after"), proposal.get("parted_after_samples")
+    if not isinstance(when, int | float):
+        return f"{words} It is too short to distinguish them with certainty."
+    count = f" ({samples} samples)" if isinstance(samples, int) else ""
+    return f"{words} They are expected to be distinguishable after {number(float(when))} s{count}."
+
+
+def _confusability_words(confusability: Mapping[str, Any]) -> list[str]:
+    sentences = []
+    best, unexplained = confusability.get("best"), confusability.get("left_open")
+    if best and isinstance(unexplained, int | float):
+        sentences.append(
+            f"If the library had lacked the cause, the best explanation would have been {explanation_words(best)}, "
+            f"with {percent(unexplained)} of the gap unexplained."
+        )
+    simulated = confusability.get("simulated")
+    if isinstance(simulated, dict):
+        passed_for = [explanation_words([c]) for c in simulated.get("passed_for") or []]
+        mostly = f", mostly for {', '.join(passed_for[:3])}" if passed_for else ""
+        rivals, draws = simulated.get("rivals"), simulated.get("draws")
+        sentences.append(
+            f"Reliability of the name: of {draws} recordings simulated with linearized effects, with a gap of this "
+            f"size from one of {rivals} other causes, {simulated.get('confused')} were given this name, and "
+            f"{simulated.get('passed')} if the library lacked the true cause{mostly}."
+        )
+    return sentences
+
+
+MOST_CURVES = 12
+QUANTITIES = {"flow": "flow added", "area": "cross-section added", "reading": "added to the reading"}
+# SI units of the variables that a free-form discrepancy may depend on.
+_VARIABLE_UNITS = {"level": "m", "head": "m", "difference": "m", "time": "s", "period": "s"}
+
+
+def curves_section(material: Material) -> Section | None:
+    """One panel for each variable of each component with a discrepancy."""
+    curves = [c for c in material.answer.get("curves") or [] if isinstance(c, dict)][:MOST_CURVES]
+    if not curves:
+        return None
+    pictures = [Picture(f"gap_curve_{k + 1}", curve_panel(curve)) for k, curve in enumerate(curves)]
+    words = "Discrepancy between the component and the plant file, averaged at equal values of its variable. "
+    if any("effect" in curve for curve in curves):
+        words += (
+            "Blue: a free function with two standard errors, estimated without the library; orange: the named cause. "
+            "Where both agree, the cause's equation is right. A free function has no memory and hardly shows lags or "
+            "delays."
+        )
+    else:
+        words += "The free function, with two standard errors, shows what an unnamed cause would have to do."
+    return Section("The discrepancy", [words, pictures])
+
+
+def curve_panel(curve: Mapping[str, Any]) -> Figure:
+    """Free function with its band, and the effect."""
+    unit, scale = shown_unit(str(curve.get("unit", "")))
+    quantity = str(curve.get("quantity", ""))
+    y_unit, y_scale = ("%", 100.0) if quantity == "area" else shown_unit(str(curve.get("quantity_unit", "")))
+    x, free, std = scale * as_vector(curve["at"]), y_scale * as_vector(curve["free"]), as_vector(curve["free_std"])
+    name = short(curve.get("variable", ""), 30)
+    label = axis(QUANTITIES.get(quantity, "added"), y_unit)
+    figure, axes = panel(f"{short(curve.get('location', ''), 20)}: by {name}", axis(name, unit), label)
+    axes.axhline(0.0, color=SOFT, lw=0.8)
+    axes.fill_between(x, free - 2.0 * y_scale * std, free + 2.0 * y_scale * std, color=MODEL, alpha=0.2, lw=0.0)
+    axes.plot(x, free, color=MODEL, lw=1.4, label="free function")
+    if "effect" in curve:
+        axes.plot(x, y_scale * as_vector(curve["effect"]), color=MARK, lw=1.4, ls="--", label="cause")
+        label_lines(axes)
+    return figure
+
+
+def shape_section(material: Material) -> Section | None:
+    """The free-form discrepancy as tables, for logs without curves."""
+    shape = material.answer.get("shape")
+    if material.answer.get("curves") or not isinstance(shape, dict) or not shape.get("tables"):
+        return None
+    pictures = []
+    for k, (name, curve) in enumerate(shape["tables"].items()):
+        variable = str(name).rpartition(".")[2]
+        unit, scale = shown_unit(_VARIABLE_UNITS.get(variable, "SI"))
+        x, y = scale * as_vector(curve["at"]), as_float(curve.get("scale", 1.0)) * as_vector(curve["share"])
+        title = f"{shape.get('location', '')}: by {variable}"
+        line = Line("discrepancy", x, y, MARK)
+        chart = Chart(title, axis(variable, unit), "discrepancy, SI", [line], level=0.0)
+        pictures.append(signals(f"gap_shape_{k + 1}", chart))
+    words = "What must be added at this location to explain the readings, whatever its cause."
+    return Section("The discrepancy", [words, pictures])

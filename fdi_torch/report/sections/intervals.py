@@ -9,7 +9,7 @@ import numpy as np
 
 from fdi_torch.estimate.uncertainty import chi_square_quantile
 from fdi_torch.report.chart import Chart, Line
-from fdi_torch.report.html import table, tag
+from fdi_torch.report.html import bullets, table
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import as_float, as_vector, axis, number, shown_unit
 from fdi_torch.report.section import Column, Picture, Section, signals
@@ -42,9 +42,10 @@ def intervals_section(material: Material) -> Section | None:
     )
     notes = [str(note) for each in profiles.values() for note in each.get("warnings") or ()]
     notes += [str(note) for note in material.listed("draws.warnings")]
-    warned = [tag("ul", *(tag("li", note, class_="bad") for note in notes))] if notes else []
     header = ["parameter", "unit", "standard error, 95 %", "profile", "draws, 95 %", "remark"]
-    return Section("Intervals", [words, *warned, table(header, rows, left=2), pictures[:MOST_PANELS]])
+    return Section(
+        "Intervals", [words, *bullets(notes, class_="bad"), table(header, rows, left=2), pictures[:MOST_PANELS]]
+    )
 
 
 def _draws(material: Material) -> dict[str, np.ndarray]:

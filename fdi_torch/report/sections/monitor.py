@@ -1,15 +1,18 @@
-"""Sections about a monitor: residuals, test statistics with their thresholds, and all events."""
+"""Sections about a monitor: residuals, test statistics with their thresholds, all events, and the tables of its Monte
+Carlo validation.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from fdi_torch.clock import clock_text
 from fdi_torch.report.chart import Chart, Line
-from fdi_torch.report.html import table, tag
+from fdi_torch.report.html import Markup, table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import as_float, axis, number, rounded_number, sentence, shown_unit
 from fdi_torch.report.section import Section, signals
@@ -94,3 +97,32 @@ def _onset(event: Payload, dated: bool) -> list[Any]:
 def _moment(seconds: float) -> Any:
     """A clock time that is not broken into two lines."""
     return tag("span", clock_text(seconds), class_="moment")
+
+
+def rehearsal_section(material: Material) -> Section | None:
+    """Every table under its title."""
+    blocks: list[Markup | str] = []
+    for entry in rehearsal_tables(material):
+        title, header, rows = (entry.get(name) for name in ("title", "header", "rows"))
+        if isinstance(header, list) and isinstance(rows, list):
+            complete = [row for row in rows if isinstance(row, list) and len(row) == len(header)]
+            words = str(title)
+            blocks += [tag("h4", words[:1].upper() + words[1:]), table(header, complete, _texts(complete))]
+    return Section("Validation of the monitor", blocks) if blocks else None
+
+
+def _texts(rows: Sequence[Sequence[Any]]) -> int:
+    """Number of leading columns that hold no number, at least one."""
+    columns = list(zip(*rows, strict=True))[1:]
+    return 1 + next((k for k, column in enumerate(columns) if any(map(_number_in, column))), 0)
+
+
+def _number_in(cell: Any) -> bool:
+    return any(letter.isdigit() for letter in str(cell))
+
+
+def rehearsal_tables(material: Material) -> list[dict[str, Any]]:
+    """The tables in the log's result; empty if they are missing or unreadable."""
+    if material.kind != "rehearsal":
+        return []
+    return [entry for entry in material.listed("tables") if isinstance(entry, dict)]

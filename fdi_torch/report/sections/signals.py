@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fdi_torch.logbook import Signals
-from fdi_torch.report.chart import Chart, Line
-from fdi_torch.report.downsampling import corner_points
+from fdi_torch.report.chart import Chart, Line, corner_points
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import axis, number, shown_unit

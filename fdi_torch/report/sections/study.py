@@ -1,4 +1,4 @@
-"""Sections about a study: summary by setting, errors, and trials."""
+"""Sections about a study: summary by setting, errors, trials, and stated against true sets of faults."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import orjson
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
 
 from fdi_torch.amounts import parameter_words
 from fdi_torch.effects import build_network, effect, full_name
@@ -102,9 +104,7 @@ def _unit_of(material: Material, name: str) -> tuple[str, float]:
 
 
 def _parameters(material: Material, estimator: str, count: int) -> list[str]:
-    """Names of the parameters, from the summary's ESTIMATOR.PARAMETER.rmse or, in an unfinished study, from its
-    configuration; numbers if neither has them.
-    """
+    """Names from the summary's ESTIMATOR.PARAMETER.rmse, else from the configuration, else numbers."""
     keys = [k for m in material.of(SUMMARY)[:1] for k in m if k.startswith(f"{estimator}.") and k.endswith(".rmse")]
     names = [key.removeprefix(f"{estimator}.").removesuffix(".rmse") for key in keys] or _configured(material)
     return names if len(names) == count else [f"parameter {i + 1}" for i in range(count)]
@@ -188,3 +188,50 @@ def _shown(value: Any, scale: float = 1.0) -> str | None:
     if isinstance(value, list) and len(value) <= 8:
         return ", ".join(number(float(v), 3) if isinstance(v, int | float) else str(v) for v in value)
     return None
+
+
+MOST_MODES = 64
+
+
+def isolation_section(material: Material) -> Section | None:
+    """The confusion matrix of the modes as a picture, and a table with one row per mode."""
+    labels, counts = _labels(material), material.arrays.get("confusion")
+    if counts is None or counts.shape != (len(labels), len(labels)) or not 0 < len(labels) <= MOST_MODES:
+        return None
+    result = material.about("result")
+    counts_ = [result.get(f"isolation.{name}", "?") for name in ("right", "trials", "missed", "false")]
+    words = (
+        "{} of {} modes stated correctly; {} faults missed, {} false faults. ".format(*counts_)
+        + "Row: true mode; column: stated mode; the table has their names."
+    )
+    rows = [_row(k, labels, counts) for k in range(len(labels)) if counts[k].sum()]
+    listed = table(["", "mode", "trials", "right", "most often taken for"], rows)
+    return Section("Isolation", [words, [Picture("isolation", matrix_panel(counts))], folded("The modes", listed)])
+
+
+def matrix_panel(counts: np.ndarray) -> Figure:
+    """Share of each row (M, M) as a heat map; right answers are on the diagonal."""
+    figure, axes = panel("Stated against true", "stated mode", "true mode", height=4.0)
+    share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
+    for row, column in np.argwhere(share > 0):
+        strength = 0.15 + 0.85 * float(share[row, column])
+        axes.add_patch(Rectangle((column + 0.5, row + 0.5), 1, 1, facecolor=MODEL, alpha=strength, edgecolor="none"))
+    axes.set_xlim(0.5, len(counts) + 0.5)
+    axes.set_ylim(len(counts) + 0.5, 0.5)
+    axes.set_aspect("equal")
+    axes.grid(False)
+    for side in (axes.xaxis, axes.yaxis):
+        side.set_major_locator(MaxNLocator(8, integer=True, min_n_ticks=1))
+    return figure
+
+
+def _row(k: int, labels: list[str], counts: np.ndarray) -> list[str]:
+    wrong = np.where(np.arange(len(labels)) == k, 0, counts[k])
+    worst = int(wrong.argmax())
+    taken = f"{short(labels[worst], 60)} ({percent(wrong[worst] / counts[k].sum())})" if wrong[worst] else ""
+    return [str(k + 1), short(labels[k], 60), str(int(counts[k].sum())), percent(counts[k, k] / counts[k].sum()), taken]
+
+
+def _labels(material: Material) -> list[str]:
+    """Names of the modes from the result record."""
+    return [str(label) for label in material.listed("isolation.labels")]
