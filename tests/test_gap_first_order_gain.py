@@ -166,7 +166,5 @@ def test_parameters_are_moved_to_the_largest_gain_and_not_along_a_plateau() -> N
     below = best_parameters(lambda tried: 1e4 * tried[:, 1], start, spacing, lambda tried: tried[:, 1] < 0.95)
     assert 0.93 < float(below[1]) < 0.95
     relays = Relays(start, start, relay_thresholds((-1.0, 1.0), 5))
-    assert (
-        relays.possible(around(torch.tensor([-0.8, -0.4], dtype=torch.float64), 0.5 * torch.ones(2).double())).sum()
-        == 6
-    )
+    tried = around(torch.tensor([-0.8, -0.4], dtype=torch.float64), torch.full((2,), 0.5, dtype=torch.float64))
+    assert len(tried) == 9 and relays.possible(tried).sum() == 6
