@@ -361,7 +361,9 @@ def test_a_draw_with_a_timer_is_one_regressor_although_random_flows_explain_each
     fitter, fit, noise = delivering(command, command + random_flow - draw, 7)
     found = localize(fitter, fit, noise, ("T1", "P13", "h1")).discrepancies
     assert found[0].location == "T1" and found[0].parameters == 1
-    assert found[0].periods[0] == pytest.approx(300.0, rel=5e-3)
+    ((period, duration),) = found[0].pulses
+    assert period == found[0].periods[0] == pytest.approx(300.0, rel=5e-3)
+    assert duration == pytest.approx(40.0, rel=0.1)
 
 
 def test_constants_stay_within_their_tolerances_beside_an_effect_and_the_error_of_its_law() -> None:

@@ -83,14 +83,19 @@ def _free_form_fails(result: DiagnosisResult, held: HeldOut) -> str | None:
 
 
 def _periods(result: DiagnosisResult) -> list[str]:
-    """Oscillations of an unknown discrepancy."""
-    shape: Any = discrepancy_tables(result.free_form_fit)["tables"] if result.free_form_fit else {}
-    waves = [(t["at"][0], t["share"][0]) for name, t in shape.items() if name.endswith(".period")]
+    """Oscillations and periodic pulses of an unknown discrepancy."""
+    unknown = result.posterior.best.unknown
+    if result.free_form_fit is None or unknown is None:
+        return []
+    tables: Any = discrepancy_tables(result.free_form_fit)["tables"]
+    waves = [(t["at"][0], t["share"][0]) for name, t in tables.items() if name.endswith(".period")]
+    words = [f"acts for {on:.3g} s of every {period:.3g} s" for period, on in unknown.pulses] or [
+        f"oscillates with a period of {period:.3g} s" for period, share in waves if share > SWINGS
+    ]
     return [
-        f"the unknown discrepancy at {result.posterior.best.unknown_at} oscillates with a period of {period:.3g} s; "
-        "its phase differs between recordings, so that it explains nothing of a hold-out"
-        for period, share in waves
-        if share > SWINGS
+        f"the unknown discrepancy at {unknown.location} {acts}; its phase differs between recordings, so that it "
+        "explains nothing of a hold-out"
+        for acts in words
     ]
 
 

@@ -77,13 +77,19 @@ class LocalizedDiscrepancy:
     estimate: Estimate
 
     @property
+    def pulses(self) -> tuple[tuple[float, float], ...]:
+        """Period and duration of the pulses, s."""
+        positions = self.selection.positions if self.selection else ()
+        return tuple(
+            (1.0 / p.frequency, p.parameters[2] / p.frequency) for p in positions if p.frequency and p.parameters
+        )
+
+    @property
     def periods(self) -> tuple[float, ...]:
-        """Periods of the sinusoids and pulses, s."""
-        if self.selection is None:
-            return ()
-        of_pulses = (p.frequency for p in self.selection.positions if p.frequency is not None)
-        frequencies = dict.fromkeys((*self.selection.frequencies, *of_pulses))
-        return tuple(1.0 / (k * frequency) for frequency in frequencies for k in range(1, HARMONICS + 1))
+        """Periods of the sinusoids, and of the pulses with their harmonics, s."""
+        sinusoids = (1.0 / frequency for frequency in (self.selection.frequencies if self.selection else ()))
+        first = dict.fromkeys((*sinusoids, *(period for period, _ in self.pulses)))
+        return tuple(period / k for period in first for k in range(1, HARMONICS + 1))
 
 
 def log_likelihood(fitter: Fitter, fit: Fit, linearised: Linearised) -> float:
