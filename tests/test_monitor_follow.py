@@ -251,6 +251,15 @@ def test_a_window_longer_than_the_recording_ends_at_its_beginning(
     assert "isolated" in kinds(monitored(["--config", config(tmp_path, window=window)], capsys))
 
 
+@pytest.mark.parametrize(("size", "ends"), [(0.0, True), (0.05, False)])
+def test_a_monitor_without_an_alarm_says_so_at_the_end(
+    size: float, ends: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written(tmp_path / "rig.csv", size)
+    assert main(["monitor", "--config", config(tmp_path)]) == 0
+    assert (capsys.readouterr().out.splitlines()[-1] == "no alarm") == ends
+
+
 def test_a_fault_within_the_part_taken_for_fault_free_is_suspected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -69,7 +69,7 @@ class LoggedMonitor:
         self.run, self.plant, self.log, self.callbacks = run, run.plant, log, callbacks
         self._reported = Counter() if reported is None else reported
         self.state: Any = None
-        self.events, self.spent = 0, 0.0
+        self.events, self.alarms, self.spent = 0, 0, 0.0
         self._ever_suspected: dict[str, None] = {}
         self._present_faults: tuple[tuple[str, float], ...] = ()
         self._first_time: float | None = None
@@ -189,6 +189,7 @@ class LoggedMonitor:
     def _report(self, event: Event, from_source: bool = False) -> None:
         """Log an event and the faults after it, and pass it on unless an earlier log of the run has it."""
         self.events += 1
+        self.alarms += event.kind == "alarm"
         fields = event_fields(event) | {FROM_SOURCE: from_source or None}
         self.log.alarm(event.time, event.kind, " + ".join(event.faults), event.text, **fields)
         self._present_faults = event.believed
