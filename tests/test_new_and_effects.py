@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -166,6 +167,41 @@ def test_what_is_commented_out_in_a_new_file_holds_too(tmp_path: Path) -> None:
     (tmp_path / "rig.yaml").write_text(text)
     plant = build_plant(read_yaml(tmp_path / "rig.yaml"), "rig.yaml")
     assert plant.channel_units() == {"Q": "V", "v1": "1"} and plant.sensors[-1].unit == "Pa" and plant.effects
+
+
+def test_the_fault_free_part_of_a_new_monitor_fits_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It begins where the recording does, and lasts until white noise at its sampling determines the false alarms."""
+    monkeypatch.chdir(tmp_path)
+    for interval, lasts, start in ((1, 1000, 0), (10, 20000, 0), (10, 20000, 50000)):
+        noise = "{std: {h1: 1 mm, h2: 1 mm, h3: 1 mm}}"
+        changes = {"sample_time": f"{interval} s", "duration": f"{lasts} s", "faults": "{}", "noise": noise}
+        words = [word for key, value in changes.items() for word in ("--set", f"simulate.{key}={value}")]
+        fdi("simulate", "--out", ".", "--replace", *words, "--set", "output.name=run")
+        header, *rows = Path("run.csv").read_text().splitlines()
+        later = [f"{start + float(t):g},{rest}" for t, rest in (row.split(",", 1) for row in rows)]
+        Path("run.csv").write_text("\n".join([header.replace("h1_cm", "level (cm)"), *later]))
+        fdi("new", "monitor", "--recording", "run.csv", "--out", f"m{interval}_{start}.yaml")
+        first, last = load_monitor(f"m{interval}_{start}.yaml").config.fault_free
+        capsys.readouterr()
+        fdi("monitor", "--config", f"m{interval}_{start}.yaml")
+        (learnt, needed), *_ = re.findall(r"learnt from (\S+) s of (\S+) s needed", capsys.readouterr().out)
+        assert first == start and float(learnt) == pytest.approx(last - first, abs=10 * interval)
+        assert (last - first) / min(float(needed), 0.5 * lasts) == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_new_monitor_of_a_live_source_has_a_tag_of_every_channel(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fdi("new", "monitor", "--recording", "mqtt://localhost/rig")
+    assert "next: complete the tags, then fdi monitor" in capsys.readouterr().out
+    source = load_monitor("monitor.yaml").config.source
+    assert source is not None and source.url == "mqtt://localhost/rig"
+    assert list(source.tags) == ["Q1", "Q2", "h1", "h2", "h3"] and source.tags["Q1"].unit == "cm^3/s"
+    assert cli.main(["new", "run", "--recording", "mqtt://localhost/rig"]) == cli.MISUSE
+    assert "--recording: expected a file for a run, got mqtt://localhost/rig" in capsys.readouterr().err
 
 
 def test_a_file_that_is_there_is_never_replaced(

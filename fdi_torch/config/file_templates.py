@@ -2,33 +2,42 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
+from urllib.parse import urlsplit
 
 from fdi_torch.config.channels import mapped
-from fdi_torch.config.yaml_files import find_data
+from fdi_torch.config.yaml_files import find_data, parse_yaml
+from fdi_torch.live.address import PORTS
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.quantities import quantity_text
+from fdi_torch.plant.scales import time_scale
+from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.recordings.csv_writing import header_of
 from fdi_torch.recordings.database import is_query
+
+FALSE_ALARMS_EVERY, LEARNING = 20000.0, 1000.0
+"""Of a plant with the time scale of three_tank, s. A fault-free part of unknown sampling lasts LEARNING."""
 
 
 def template(kind: str, plant: PlantDescription, plant_file: str, name: str, recording: str | None = None) -> str:
     """The text of a new run, monitor, rehearsal or study.
 
     plant: the plant of the file; plant_file: its entry under the key `plant`; name: of the run. recording: the file
-    that it reads; None for one of the name of the run, whose header is then told.
+    that it reads, of a monitor also the URL of a live source; None for one of the name of the run, whose header is then
+    told. Raises ValueError for a recording that cannot be read.
     """
-    header = header_of(plant.channel_units(), plant.output_units())
-    file = f"{name}.csv             # with the header {header}" if recording is None else f'"{recording}"'
-    indent = "    " if kind == "run" else "  "
-    to_complete = [] if recording is None or is_query(recording) else mapped(find_data(recording, Path.cwd()), plant)
-    columns = to_complete or [
-        "# columns:                # for headers of other names",
-        f"#   {plant.sensors[0].column}: {{column: LT-101, unit: mm}}",
-    ]
+    if recording is not None and urlsplit(recording).scheme in PORTS:
+        if kind != "monitor":
+            raise ValueError(
+                f"--recording: expected a file for a {kind}, got {recording}; only a monitor reads a source"
+            )
+        reading = _live_source(recording, plant)
+    else:
+        reading = _recording(kind, plant, name, recording)
+    every = _rounded_up(FALSE_ALARMS_EVERY * time_scale(plant))
     pipe = plant.pipes[0].name if plant.pipes else plant.tanks[0].name
     plugging = f"{pipe}.plugging" if plant.pipes else f"{pipe}.evaporation"
     constant = f"{pipe}.discharge_coefficient" if plant.pipes else f"{pipe}.area"
@@ -37,8 +46,9 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str, rec
     ).substitute(
         plant=plant_file,
         name=name,
-        file=file,
-        columns="\n".join(indent + line for line in columns),
+        reading="\n".join(reading),
+        every=f"{every:g}",
+        fault_free=_fault_free(plant, "\n".join(reading), every) if recording else _usual_part(plant),
         leak=f"{plant.tanks[0].name}.leak",
         plugging=plugging,
         constant=constant,
@@ -48,6 +58,61 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str, rec
         channels=", ".join(plant.channels()),
         commands=", ".join(_shares(plant, channel, (0.4,))[0] for channel in plant.channels()),
     )
+
+
+def _recording(kind: str, plant: PlantDescription, name: str, recording: str | None) -> list[str]:
+    """The entry of a recording in a run or monitor, with lines for the channels without a column of their name."""
+    header = header_of(plant.channel_units(), plant.output_units())
+    file = f"{name}.csv             # with the header {header}" if recording is None else f'"{recording}"'
+    to_complete = [] if recording is None or is_query(recording) else mapped(find_data(recording, Path.cwd()), plant)
+    columns = to_complete or [
+        "# columns:                # for headers of other names",
+        f"#   {plant.sensors[0].column}: {{column: LT-101, unit: mm}}",
+    ]
+    if kind == "run":
+        crop = ["# start: 60 s             # the first time that is used; stop: the last"]
+        crop += ["# mask: [[120 s, 130 s]]  # readings in between do not count"]
+        return ["recordings:", f"  - file: {file}", *(f"    {line}" for line in [*crop, *columns])]
+    return ["recording:", f"  file: {file}", *(f"  {line}" for line in columns)]
+
+
+def _live_source(url: str, plant: PlantDescription) -> list[str]:
+    """The entry of a live source, with a tag to be written for each channel."""
+    units = plant.channel_units() | plant.output_units()
+    tags = [f"    {name}: {{tag: ..., unit: {display_unit(unit, name)[0] or 1}}}" for name, unit in units.items()]
+    return [
+        "source:",
+        f"  url: {url}",
+        "  tags:                       # the address of each value, and its unit",
+        *tags,
+    ]
+
+
+def _usual_part(plant: PlantDescription) -> str:
+    """A fault-free part for a recording of unknown sampling."""
+    until = _rounded_up(LEARNING * time_scale(plant))
+    return f"[0 s, {until:g} s]    # the noise is learnt from it; the first event says how long it must be"
+
+
+def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
+    """The fault-free part for the entry of a recording: by its sampling, and at most half of it."""
+    entry = parse_yaml(reading.encode(), "recording").get("recording")
+    if entry is None or " ..." in reading:  # a live source, or columns that the user must write
+        return _usual_part(plant)
+    from fdi_torch.config.learning_time import learning_time
+    from fdi_torch.config.loaded_recordings import read_recording
+
+    read = read_recording(entry, plant)
+    first, last = float(read.time[0]), float(read.time[-1])
+    enough = _rounded_up(learning_time(read, every))
+    until = first + min(enough, 0.5 * (last - first))
+    return f"[{first:.10g} s, {until:.10g} s]    # the noise is learnt from it; {enough:g} s suffice if it is white"
+
+
+def _rounded_up(value: float) -> float:
+    """The value rounded up to two digits."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.ceil(value / unit - 1e-9) * unit
 
 
 def _inputs(plant: PlantDescription) -> str:
