@@ -17,7 +17,7 @@ import pytest
 
 import fdi_torch
 from fdi_torch import cli
-from fdi_torch.cli.options import LIVE, access_text, overrides
+from fdi_torch.cli.options import LIVE, access_text, library_entries, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import DiskError, write_text
 
@@ -163,6 +163,32 @@ def test_a_file_without_its_option_is_told_the_option(capsys: pytest.CaptureFixt
     with pytest.raises(SystemExit):
         cli.main(["train", "run.csv"])
     assert "run.csv; name it in the file for --config" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (
+            "gap --plant three_tank --recordng a.csv",
+            "unrecognized argument: --recordng; the nearest is '--recording'",
+        ),
+        ("train --confg=a.yaml", "unrecognized argument: --confg; the nearest is '--config'"),
+        ("train --seed one", "argument --seed: expected a whole number, got 'one'"),
+    ],
+)
+def test_a_mistaken_option_is_answered_with_what_was_expected(
+    words: str, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(words.split())
+    assert ended.value.code == cli.MISUSE and told in capsys.readouterr().err
+
+
+def test_an_effect_at_one_place_is_called_as_in_files() -> None:
+    assert library_entries("pump_lag, T1.leak,leak@T2,T1-T2.cross_flow") == (
+        *("pump_lag", "leak@T1", "leak@T2", "cross_flow@T1-T2"),
+    )
+    assert library_entries(None) is None
 
 
 def test_check_states_the_volume_and_the_emptying_time_of_each_tank(capsys: pytest.CaptureFixture[str]) -> None:

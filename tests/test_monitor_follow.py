@@ -268,6 +268,15 @@ def test_a_fault_within_the_part_taken_for_fault_free_is_suspected(
     assert "does the recording start faulty?" in texts(events)
 
 
+@pytest.mark.parametrize("part", [["400 s", "500 s"], ["150 s", "0 s"], ["0 s", "20 s"]])
+def test_a_fault_free_part_that_is_none_is_named(
+    part: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written(tmp_path / "rig.csv")
+    assert main(["monitor", "--config", config(tmp_path, fault_free=part), "--quiet"]) == 2
+    assert capsys.readouterr().err.startswith(f"fdi monitor: fault_free: {tmp_path}")
+
+
 def test_a_fault_that_was_there_before_the_recording_is_said_to_be(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

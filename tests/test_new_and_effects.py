@@ -100,12 +100,16 @@ def test_a_file_of_another_kind_is_called_what_it_is(given: str, tmp_path: Path)
             listed_recordings(str(path), load_plant("three_tank"), tmp_path)
 
 
-def test_a_yaml_file_in_place_of_a_recording_is_no_table(tmp_path: Path) -> None:
+def test_a_yaml_file_in_place_of_a_recording_is_no_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "runs.yaml").write_text("recordings: [{file: run.csv}]")
     with pytest.raises(
         ConfigError, match=r"runs\.yaml: expected a recording, got a YAML file; take the entries of its"
     ):
         read_recording("runs.yaml", load_plant("three_tank"), tmp_path)
+    assert (
+        cli.main(["new", "plant", "--recording", str(tmp_path / "runs.yaml"), "--out", str(tmp_path / "a.yaml")]) == 2
+    )
+    assert "runs.yaml: expected a recording, got a YAML file" in capsys.readouterr().err
 
 
 def test_a_spreadsheet_in_place_of_a_yaml_file_is_no_text(tmp_path: Path) -> None:
@@ -235,7 +239,8 @@ def test_what_the_catalogue_says_can_be_written(name: str) -> None:
     assert build_plant(data, "plant").effects[0].effect == name
     ((fault, value),) = yaml.safe_load(f"{{{entry.in_a_run_file}}}").items()
     network = build_network(described, placements_of([fault], described))
-    assert set(parameter_values({fault: value}, network.constants, described)) == {fault}
+    (size,) = parameter_values({fault: value}, network.constants, described).values()
+    assert size != entry.parameters[0].nominal, "an example shows the effect"
 
 
 def test_effects_of_a_plant_are_told_with_places_and_in_full(capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,6 +19,7 @@ from torch import Tensor
 from fdi_torch.amounts import parameter_words
 from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.monitor_file import MonitorRun
+from fdi_torch.config.problems import naming
 from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.jobs.event_messages import event_fields
 from fdi_torch.jobs.monitor_rows import CLOCK, FROM_SOURCE, samples_of_rows
@@ -268,7 +269,8 @@ def _positions(clock: Sequence[float], times: Sequence[tuple[float, bool]]) -> l
 
 def _prepare(run: MonitorRun, whole: Recording) -> PreparedMonitor:
     c = run.config
-    part = usable_part(run.plant, fault_free_part(whole, *c.fault_free))
+    with naming("fault_free"):
+        part = usable_part(run.plant, fault_free_part(whole, *c.fault_free))
     # The configured initial levels are valid only if the fault-free part starts with the recording.
     at_start = float(part.time[0]) == float(whole.time[0])
     return prepare_monitor(
