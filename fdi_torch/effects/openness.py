@@ -19,7 +19,7 @@ class Openness(Effect):
     mistaken_for = ("plugging", "cross_flow")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("size", "1", 1.0, 0.0, 1.0, meaning="share of the nominal flow that passes (1 - b)"),)
+        return (Parameter("size", "1", 1.0, 0.0, 1.0, meaning="share of the nominal flow that passes"),)
 
     def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * p["size"]
