@@ -198,6 +198,15 @@ def test_check_states_the_volume_and_the_emptying_time_of_each_tank(capsys: pyte
     assert ["T1", "160", "100", "16", "201"] in rows
 
 
+def test_check_of_a_plant_alone_names_the_columns_that_a_recording_has(
+    rig: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["check", "--plant", "quadruple_tank"]) == cli.DONE
+    assert capsys.readouterr().out.splitlines()[-1] == "columns of a recording: t_s,v1_V,v2_V,y1_V,y2_V"
+    assert cli.main(["check", "--plant", "three_tank", rig]) == cli.DONE
+    assert "columns of a recording" not in capsys.readouterr().out
+
+
 def test_check_as_json_prints_nothing_else(rig: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["check", rig, "--plant", "three_tank", "--json"]) == cli.DONE
     answer = json.loads(capsys.readouterr().out)
