@@ -9,8 +9,8 @@ from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, S
 
 
 class OutletDrop(Effect):
-    """The head is x + d: the law with the orifice or crest d below its height in the plant file, as at the end of a drain
-    hose; negative: above it, without flow at lower levels.
+    """The head is x + d: the law with the orifice or crest d below its height in the plant file, as at the end of a
+    drain hose; negative: above it, without flow at lower levels.
 
     Typical: d of -3 to 10 cm. Nearly the same as another exponent of the head or laminar flow.
     """
