@@ -31,6 +31,11 @@ from fdi_torch.report.estimate_table import HEADER, estimate_cells
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    if arguments.config is None:
+        screen.note(
+            "built-in example: a recording of the plant three_tank with four faults is simulated, then diagnosed; "
+            "--config FILE diagnoses yours (fdi new run writes one)"
+        )
     job = load_run(arguments.config, overrides(arguments))
     if job.config.estimate.windows is not None:
         with screen.progress(job.name) as advance:
