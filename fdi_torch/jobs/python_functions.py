@@ -137,14 +137,14 @@ def gap(
     holdouts: recordings on which the corrected model is validated. out: folder of the log. settings: library, leave_out
     (names of effects), step (s), most, named_only, as the options of `fdi gap`. Raises ValueError for other settings.
     """
-    plant, segments = _plant_and_recordings(plant, recordings, "gap")
+    valid_settings = [field.name for field in fields(Settings)]
+    for name in settings:  # first, because without recordings the plant counts as a run
+        if name not in valid_settings:
+            raise ValueError(f"gap: {unknown('a setting', name, [*valid_settings, 'recordings', 'holdouts', 'out'])}")
     for name in ("library", "leave_out"):
         if isinstance(settings.get(name), str):
             settings[name] = (settings[name],)
-    valid_settings = [field.name for field in fields(Settings)]
-    for name in settings:
-        if name not in valid_settings:
-            raise ValueError(f"gap: {unknown('a setting', name, [*valid_settings, 'holdouts', 'out'])}")
+    plant, segments = _plant_and_recordings(plant, recordings, "gap")
     log = free_path(Path(out), "gap")
     answer = run_gap(log, plant, segments, recordings_of(holdouts, plant), Settings(**settings), tell)
     return GapResult(answer, plant, log)
