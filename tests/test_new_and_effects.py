@@ -27,6 +27,7 @@ from fdi_torch.config.yaml_files import read_yaml, shipped_plants
 from fdi_torch.effects import EFFECTS, build_network
 from fdi_torch.effects.catalogue import effects
 from fdi_torch.jobs.run_setup import simulate_recording
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.recordings.csv_files import read_header
 
 
@@ -71,7 +72,9 @@ def test_every_template_is_a_file_of_its_kind_for_every_shipped_plant(name: str,
     block, _, estimate = described.partition("\nestimate:")
     paths["run"].write_text(head + "simulate:" + block.replace("\n# ", "\n") + "\nestimate:" + estimate)
     assert len(simulate_recording(load_run(paths["run"]))) == 601
-    assert load_study(paths["study"]).plan.trials == 600
+    study = load_study(paths["study"])
+    assert study.plan.trials == 600 and study.run.config.simulate is not None
+    assert study.run.config.simulate.duration == pytest.approx(600 * time_scale(plant), rel=0.1)
     assert len(load_rehearsal(paths["rehearsal"]).plans) == 2
 
 

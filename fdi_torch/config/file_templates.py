@@ -37,7 +37,7 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str, rec
         reading = _live_source(recording, plant)
     else:
         reading = _recording(kind, plant, name, recording)
-    every = _rounded_up(FALSE_ALARMS_EVERY * time_scale(plant))
+    every, sampling = (_rounded_up(time * time_scale(plant)) for time in (FALSE_ALARMS_EVERY, 1.0))
     pipe = plant.pipes[0].name if plant.pipes else plant.tanks[0].name
     plugging = f"{pipe}.plugging" if plant.pipes else f"{pipe}.evaporation"
     constant = f"{pipe}.discharge_coefficient" if plant.pipes else f"{pipe}.area"
@@ -47,13 +47,15 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str, rec
         plant=plant_file,
         name=name,
         reading="\n".join(reading),
-        every=f"{every:g}",
+        every=f"{every:.10g}",
+        sampling=f"{sampling:.10g}",
+        duration=f"{600 * sampling:.10g}",
         fault_free=_fault_free(plant, "\n".join(reading), every) if recording else _usual_part(plant),
         leak=f"{plant.tanks[0].name}.leak",
         plugging=plugging,
         constant=constant,
-        inputs=_inputs(plant),
-        simulated="\n".join(f"# {line}" for line in _inputs(plant).splitlines()),
+        inputs=_inputs(plant, sampling),
+        simulated="\n".join(f"# {line}" for line in _inputs(plant, sampling).splitlines()),
         noise=", ".join(f"{s.column}: {quantity_text(1e-3 * abs(s.gain), s.unit, 3, s.column)}" for s in plant.sensors),
         channels=", ".join(plant.channels()),
         commands=", ".join(_shares(plant, channel, (0.4,))[0] for channel in plant.channels()),
@@ -91,7 +93,7 @@ def _live_source(url: str, plant: PlantDescription) -> list[str]:
 def _usual_part(plant: PlantDescription) -> str:
     """A fault-free part for a recording of unknown sampling."""
     until = _rounded_up(LEARNING * time_scale(plant))
-    return f"[0 s, {until:g} s]    # the noise is learnt from it; the first event says how long it must be"
+    return f"[0 s, {until:.10g} s]    # the noise is learnt from it; the first event says how long it must be"
 
 
 def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
@@ -106,7 +108,7 @@ def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
     first, last = float(read.time[0]), float(read.time[-1])
     enough = _rounded_up(learning_time(read, every))
     until = first + min(enough, 0.5 * (last - first))
-    return f"[{first:.10g} s, {until:.10g} s]    # the noise is learnt from it; {enough:g} s suffice if it is white"
+    return f"[{first:.10g} s, {until:.10g} s]    # the noise is learnt from it; {enough:.10g} s suffice if it is white"
 
 
 def _rounded_up(value: float) -> float:
@@ -115,12 +117,12 @@ def _rounded_up(value: float) -> float:
     return math.ceil(value / unit - 1e-9) * unit
 
 
-def _inputs(plant: PlantDescription) -> str:
+def _inputs(plant: PlantDescription, sampling: float) -> str:
     """For each pump and transfer a step up and a step down about half of its range; valves are open."""
     lines = []
     for channel in plant.channels():
         steps = zip((0, 200, 400), _shares(plant, channel, (0.4, 0.5, 0.3)), strict=False)
-        listed = [f"[{t} s, {level}]" for t, level in steps]
+        listed = [f"[{sampling * k:.10g} s, {level}]" for k, level in steps]
         lines.append(f"    {channel}: " + ("1" if len(listed) == 1 else f"{{steps: [{', '.join(listed)}]}}"))
     return "\n".join(lines)
 

@@ -27,6 +27,9 @@ READING = re.compile(r"[LHPX]|.*(level|füllstand|niveau|pegel|pressure|druck)",
 COMMAND = re.compile(r".*(pump|valve|ventil|pwm|duty|cmd|command|speed|drehzahl)", re.IGNORECASE)
 
 
+PUMPS = "pumps:    # ! the tank that each fills, and its greatest flow; a flow out of a tank belongs under transfers"
+
+
 class _Column(NamedTuple):
     """A column with a unit in its header: its header, name, unit, SI unit and highest value (SI)."""
 
@@ -93,7 +96,7 @@ def plant_from_recording(path: Path, name: str) -> str:
             for pipe, a, b in pipes
         ),
         "",
-        *(["pumps:    # ! the tank that each fills, and its greatest flow", *pumps, ""] if pumps else []),
+        *([PUMPS, *pumps, ""] if pumps else []),
         "sensors:  # ! the tank of each, and its gain: reading at the rim divided by height; commands go to pumps",
         *(_sensor(column, tank) for column, tank in zip(sensors, tanks, strict=True)),
         "",
