@@ -17,9 +17,10 @@ import pytest
 
 import fdi_torch
 from fdi_torch import cli
-from fdi_torch.cli.options import LIVE, access_text, library_entries, overrides
+from fdi_torch.cli.options import LIVE, access_text, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import DiskError, write_text
+from fdi_torch.jobs.gap import library_entries
 
 CSV = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm\n" + "".join(
     f"{t},{50 + t % 7},50,{40 + t % 11},{30 + t % 5},{35 + t % 3}\n" for t in range(50)
@@ -185,10 +186,8 @@ def test_a_mistaken_option_is_answered_with_what_was_expected(
 
 
 def test_an_effect_at_one_place_is_called_as_in_files() -> None:
-    assert library_entries("pump_lag, T1.leak,leak@T2,T1-T2.cross_flow") == (
-        *("pump_lag", "leak@T1", "leak@T2", "cross_flow@T1-T2"),
-    )
-    assert library_entries(None) is None
+    named = ("pump_lag", "T1.leak", "leak@T2", "T1-T2.cross_flow")
+    assert library_entries(named) == ("pump_lag", "leak@T1", "leak@T2", "cross_flow@T1-T2")
 
 
 def test_check_states_the_volume_and_the_emptying_time_of_each_tank(capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 from fdi_torch.cli import DONE
 from fdi_torch.cli.adoption import write_adopted
 from fdi_torch.cli.gap_text import next_steps, show
-from fdi_torch.cli.options import library_entries, names
+from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.clock import show_clock
 from fdi_torch.config.loaded_recordings import named_recordings
@@ -29,7 +29,7 @@ from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.experiment_design import planned_recording
 from fdi_torch.gap.free_runs.prediction import predict
 from fdi_torch.gap.free_runs.refit import narrowed
-from fdi_torch.jobs.gap import run_gap
+from fdi_torch.jobs.gap import library_entries, run_gap
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     for note in dict.fromkeys(note for r in (*recordings, *holdouts) for note in r.notes):
         screen.note(note)
     show_clock(r.clock_zero for r in recordings)
-    library = library_entries(arguments.library)
+    library = library_entries(names(arguments.library)) or None
     if arguments.step is not None and not arguments.step > 0.0:
         raise ValueError(f"--step: expected a positive number of seconds, got {arguments.step:g}")
     if arguments.adopt:

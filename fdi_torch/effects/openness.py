@@ -1,4 +1,4 @@
-"""The open share of a pipe: plugging in the coordinates of the 2020 paper."""
+"""The open share of a pipe, one minus its plugging: the parameter of the 2020 paper."""
 
 from __future__ import annotations
 

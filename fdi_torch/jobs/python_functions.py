@@ -26,7 +26,7 @@ from fdi_torch.gap.free_runs.prediction import predict as run_freely
 from fdi_torch.gap.free_runs.refit import refit as refitted
 from fdi_torch.jobs import study as study_job
 from fdi_torch.jobs import train as train_job
-from fdi_torch.jobs.gap import one_thread, run_gap
+from fdi_torch.jobs.gap import library_entries, one_thread, run_gap
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
@@ -144,6 +144,8 @@ def gap(
     for name in ("library", "leave_out"):
         if isinstance(settings.get(name), str):
             settings[name] = (settings[name],)
+    if settings.get("library") is not None:
+        settings["library"] = library_entries(settings["library"])
     plant, segments = _plant_and_recordings(plant, recordings, "gap")
     log = free_path(Path(out), "gap")
     answer = run_gap(log, plant, segments, recordings_of(holdouts, plant), Settings(**settings), tell)

@@ -92,14 +92,6 @@ def add_library(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--library", metavar="EFFECT,...", help="effects to search (PLACE.EFFECT at one place), or all")
 
 
-def library_entries(text: str | None) -> tuple[str, ...] | None:
-    """The effects that --library names, those of one place as EFFECT@PLACE; None for the usual ones."""
-    from fdi_torch.parameters import ParameterName
-
-    at = {entry: ParameterName.of_effect(entry) for entry in names(text) if "." in entry}
-    return tuple(f"{at[entry].effect}@{at[entry].place}" if entry in at else entry for entry in names(text)) or None
-
-
 def add_leave_out(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--leave-out", metavar="EFFECT,...", default="", help="effects to leave out of the library")
 
