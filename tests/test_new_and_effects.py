@@ -207,6 +207,8 @@ def test_a_new_monitor_of_a_live_source_has_a_tag_of_every_channel(
     source = load_monitor("monitor.yaml").config.source
     assert source is not None and source.url == "mqtt://localhost/rig"
     assert list(source.tags) == ["Q1", "Q2", "h1", "h2", "h3"] and source.tags["Q1"].unit == "cm^3/s"
+    assert cli.main(["monitor", "--config", "monitor.yaml"]) == cli.MISUSE
+    assert "source: tags.Q1: expected either tag or constant, got none" in capsys.readouterr().err
     assert cli.main(["new", "run", "--recording", "mqtt://localhost/rig"]) == cli.MISUSE
     assert "--recording: expected a file for a run, got mqtt://localhost/rig" in capsys.readouterr().err
 

@@ -81,7 +81,7 @@ def _recording(kind: str, plant: PlantDescription, name: str, recording: str | N
 def _live_source(url: str, plant: PlantDescription) -> list[str]:
     """The entry of a live source, with a tag to be written for each channel."""
     units = plant.channel_units() | plant.output_units()
-    tags = [f"    {name}: {{tag: ..., unit: {display_unit(unit, name)[0] or 1}}}" for name, unit in units.items()]
+    tags = [f"    {name}: {{tag: null, unit: {display_unit(unit, name)[0] or 1}}}" for name, unit in units.items()]
     return [
         "source:",
         f"  url: {url}",
