@@ -11,6 +11,7 @@ import inspect
 import re
 from collections.abc import Iterable, Iterator
 from importlib import import_module
+from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -170,12 +171,19 @@ def plant_file() -> str:
                 "by that name.",
                 *(flow_kind(kind) for kind in FLOW_KINDS),
                 "## Shipped plants",
-                "A name may stand in place of a file: " + ", ".join(f"`{path.stem}`" for path in shipped) + ".",
+                "A name may stand in place of a file; `fdi check --plant NAME` shows sizes and columns.",
+                table(("name", "plant"), ((code(path.stem), introduction(path)) for path in shipped)),
                 "```yaml\n" + (ROOT / "configs/plants/three_tank.yaml").read_text(encoding="utf-8") + "```",
             ]
         )
         + "\n"
     )
+
+
+def introduction(path: Path) -> str:
+    """The comment with which a file begins."""
+    lines = takewhile(lambda line: line.startswith("#"), path.read_text(encoding="utf-8").splitlines())
+    return " ".join(line.lstrip("# ") for line in lines)
 
 
 def flow_kind(kind: type[FlowComponent]) -> str:

@@ -27,12 +27,12 @@ def parse_quantity(text: str, unit: str) -> float:
 
 
 def parse_level_deviation(text: str, name: str) -> float:
-    """A standard deviation of levels, m: '3 mm', or a bare number in m.
+    """A standard deviation of levels, m, from text such as '3 mm'.
 
-    Raises ValueError, naming the option `name`, for text that is not a positive length.
+    Raises ValueError, naming the option `name`, for text that is not a positive length with its unit.
     """
     try:
-        value = parse_quantity(text if text.strip()[-1:].isalpha() else f"{text} m", "m")
+        value = parse_quantity(text, "m")
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
     if not value > 0.0:

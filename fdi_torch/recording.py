@@ -224,9 +224,12 @@ class Recording(Shown):
         first = int((self.time < start).sum())
         last = int((self.time <= stop).sum())
         if last - first < 2:
+            limits = [
+                f"{word} {t:g} s" for word, t in (("after start", start), ("before stop", stop)) if math.isfinite(t)
+            ]
             raise ValueError(
-                f"{self.source}: expected at least two samples between start {start:g} s and stop {stop:g} s, got "
-                f"{max(last - first, 0)} (the recording runs from {self.time[0]:g} s to {self.time[-1]:g} s)"
+                f"{self.source}: expected at least two samples {' and '.join(limits)}, got {max(last - first, 0)} (the "
+                f"recording runs from {self.time[0]:g} s to {self.time[-1]:g} s)"
             )
         return self.stretch(first, last)
 

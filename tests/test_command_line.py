@@ -20,6 +20,7 @@ from fdi_torch import cli
 from fdi_torch.cli.options import LIVE, access_text, overrides
 from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import DiskError, write_text
+from fdi_torch.jobs.gap import library_entries
 
 CSV = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm\n" + "".join(
     f"{t},{50 + t % 7},50,{40 + t % 11},{30 + t % 5},{35 + t % 3}\n" for t in range(50)
@@ -165,11 +166,44 @@ def test_a_file_without_its_option_is_told_the_option(capsys: pytest.CaptureFixt
     assert "run.csv; name it in the file for --config" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (
+            "gap --plant three_tank --recordng a.csv",
+            "unrecognized argument: --recordng; the nearest is '--recording'",
+        ),
+        ("train --confg=a.yaml", "unrecognized argument: --confg; the nearest is '--config'"),
+        ("train --seed one", "argument --seed: expected a whole number, got 'one'"),
+    ],
+)
+def test_a_mistaken_option_is_answered_with_what_was_expected(
+    words: str, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(words.split())
+    assert ended.value.code == cli.MISUSE and told in capsys.readouterr().err
+
+
+def test_an_effect_at_one_place_is_called_as_in_files() -> None:
+    named = ("pump_lag", "T1.leak", "leak@T2", "T1-T2.cross_flow")
+    assert library_entries(named) == ("pump_lag", "leak@T1", "leak@T2", "cross_flow@T1-T2")
+
+
 def test_check_states_the_volume_and_the_emptying_time_of_each_tank(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["check", "--plant", "three_tank"]) == cli.DONE
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     # Torricelli: 2 A sqrt(H) / (C_d a sqrt(2 g)) = 2 * 0.016 / (0.6 * 0.6e-4 * sqrt(2 * 9.81)) = 200.7 s
     assert ["T1", "160", "100", "16", "201"] in rows
+
+
+def test_check_of_a_plant_alone_names_the_columns_that_a_recording_has(
+    rig: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(["check", "--plant", "quadruple_tank"]) == cli.DONE
+    assert capsys.readouterr().out.splitlines()[-1] == "columns of a recording: t_s,v1_V,v2_V,y1_V,y2_V"
+    assert cli.main(["check", "--plant", "three_tank", rig]) == cli.DONE
+    assert "columns of a recording" not in capsys.readouterr().out
 
 
 def test_check_as_json_prints_nothing_else(rig: str, capsys: pytest.CaptureFixture[str]) -> None:

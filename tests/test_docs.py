@@ -145,9 +145,10 @@ def test_every_effect_and_public_name_is_in_the_reference() -> None:
 
 
 @pytest.mark.slow
-def test_the_tutorial_works_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("page", ["tutorial.md", "how-to/weir-and-transfer.md"])
+def test_a_session_works_as_printed(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    run_page(PAGES["docs/tutorial.md"], check)
+    run_page(PAGES[f"docs/{page}"], check)
 
 
 def test_a_site_that_loads_something_from_elsewhere_is_refused(tmp_path: Path) -> None:

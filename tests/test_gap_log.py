@@ -130,8 +130,8 @@ def test_an_ambiguous_answer_writes_the_next_input(tmp_path: Path, capsys: pytes
     assert cli.main(["plan", *planned_words, "--library", "pump_lag,pump_delay"]) == cli.DONE
     limits = json.loads(capsys.readouterr().out)
     assert set(limits["shown"]) == {f"{q}.{e}" for q in ("Q1", "Q2") for e in ("pump_lag", "pump_delay")}
-    assert cli.main(["plan", *planned_words, "--noise", "0"]) == cli.MISUSE
-    assert "--noise: expected a positive standard deviation such as '1 mm', got '0'" in capsys.readouterr().err
+    assert cli.main(["plan", *planned_words, "--noise", "0 mm"]) == cli.MISUSE
+    assert "--noise: expected a positive standard deviation such as '1 mm', got '0 mm'" in capsys.readouterr().err
 
 
 def test_planned_inputs_need_no_readings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -210,6 +210,8 @@ def test_a_gap_is_found_closed_and_adopted_in_python(tmp_path: Path) -> None:
     assert after < 0.5 * before
     name = "drain.discharge_coefficient"
     assert 0.0 < found.narrowed().tolerances[name] < RIG.tolerances[name] == better.tolerances[name]
+    with pytest.raises(ValueError, match=r"gap: expected a setting .* got 'recording'; the nearest is 'recordings'"):
+        fdi_torch.gap(plant="three_tank", recording="run.csv")
     with pytest.raises(ValueError, match=r"gap: expected a setting .* got 'libary'; the nearest is 'library'"):
         fdi_torch.gap(RIG, other, libary=())
 

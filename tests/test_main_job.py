@@ -128,8 +128,10 @@ def test_the_command_prints_a_table_with_units_as_do_inspect_and_the_page(
     changes = [word for change in QUICK for word in ("--set", change)]
     assert main(["train", "--out", str(tmp_path), *changes]) == DONE
     shown = capsys.readouterr()
-    assert "T1.leak.size" in shown.out and "cm^3/s at the mean levels" in shown.out and "log: " in shown.out
-    assert "default 100% done" in shown.err
+    assert "T1.leak.size" in shown.out and "log: " in shown.out
+    assert " instead of 0 (capacity of the hole relative to that of P13), changes the flow by " in shown.out
+    assert " instead of 1 (share of the nominal flow that passes), changes the flow by " in shown.out
+    assert "built-in example: a recording of the plant three_tank" in shown.err and "default 100% done" in shown.err
     rows = [re.split(r"  +", line.strip())[:4] for line in shown.out.splitlines() if " ± " in line]
     assert len(rows) == 5 and all(re.fullmatch(r"\S+ … \S+", row[3]) for row in rows)
     log = str(tmp_path / "default.mcap")

@@ -250,12 +250,30 @@ def test_a_window_longer_than_the_recording_ends_at_its_beginning(
     assert "isolated" in kinds(monitored(["--config", config(tmp_path, window=window)], capsys))
 
 
+@pytest.mark.parametrize(("size", "ends"), [(0.0, True), (0.05, False)])
+def test_a_monitor_without_an_alarm_says_so_at_the_end(
+    size: float, ends: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written(tmp_path / "rig.csv", size)
+    assert main(["monitor", "--config", config(tmp_path)]) == 0
+    assert (capsys.readouterr().out.splitlines()[-1] == "no alarm") == ends
+
+
 def test_a_fault_within_the_part_taken_for_fault_free_is_suspected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     written(tmp_path / "rig.csv", size=0.2, onset=60.0)
     events = monitored(["--config", config(tmp_path)], capsys)
     assert "does the recording start faulty?" in texts(events)
+
+
+@pytest.mark.parametrize("part", [["400 s", "500 s"], ["150 s", "0 s"], ["0 s", "20 s"]])
+def test_a_fault_free_part_that_is_none_is_named(
+    part: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    written(tmp_path / "rig.csv")
+    assert main(["monitor", "--config", config(tmp_path, fault_free=part), "--quiet"]) == 2
+    assert capsys.readouterr().err.startswith(f"fdi monitor: fault_free: {tmp_path}")
 
 
 def test_a_fault_that_was_there_before_the_recording_is_said_to_be(

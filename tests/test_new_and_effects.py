@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -26,6 +27,7 @@ from fdi_torch.config.yaml_files import read_yaml, shipped_plants
 from fdi_torch.effects import EFFECTS, build_network
 from fdi_torch.effects.catalogue import effects
 from fdi_torch.jobs.run_setup import simulate_recording
+from fdi_torch.plant.scales import time_scale
 from fdi_torch.recordings.csv_files import read_header
 
 
@@ -70,7 +72,9 @@ def test_every_template_is_a_file_of_its_kind_for_every_shipped_plant(name: str,
     block, _, estimate = described.partition("\nestimate:")
     paths["run"].write_text(head + "simulate:" + block.replace("\n# ", "\n") + "\nestimate:" + estimate)
     assert len(simulate_recording(load_run(paths["run"]))) == 601
-    assert load_study(paths["study"]).plan.trials == 600
+    study = load_study(paths["study"])
+    assert study.plan.trials == 600 and study.run.config.simulate is not None
+    assert study.run.config.simulate.duration == pytest.approx(600 * time_scale(plant), rel=0.1)
     assert len(load_rehearsal(paths["rehearsal"]).plans) == 2
 
 
@@ -99,12 +103,16 @@ def test_a_file_of_another_kind_is_called_what_it_is(given: str, tmp_path: Path)
             listed_recordings(str(path), load_plant("three_tank"), tmp_path)
 
 
-def test_a_yaml_file_in_place_of_a_recording_is_no_table(tmp_path: Path) -> None:
+def test_a_yaml_file_in_place_of_a_recording_is_no_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "runs.yaml").write_text("recordings: [{file: run.csv}]")
     with pytest.raises(
         ConfigError, match=r"runs\.yaml: expected a recording, got a YAML file; take the entries of its"
     ):
         read_recording("runs.yaml", load_plant("three_tank"), tmp_path)
+    assert (
+        cli.main(["new", "plant", "--recording", str(tmp_path / "runs.yaml"), "--out", str(tmp_path / "a.yaml")]) == 2
+    )
+    assert "runs.yaml: expected a recording, got a YAML file" in capsys.readouterr().err
 
 
 def test_a_spreadsheet_in_place_of_a_yaml_file_is_no_text(tmp_path: Path) -> None:
@@ -168,6 +176,43 @@ def test_what_is_commented_out_in_a_new_file_holds_too(tmp_path: Path) -> None:
     assert plant.channel_units() == {"Q": "V", "v1": "1"} and plant.sensors[-1].unit == "Pa" and plant.effects
 
 
+def test_the_fault_free_part_of_a_new_monitor_fits_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It begins where the recording does, and lasts until white noise at its sampling determines the false alarms."""
+    monkeypatch.chdir(tmp_path)
+    for interval, lasts, start in ((1, 1000, 0), (10, 20000, 0), (10, 20000, 50000)):
+        noise = "{std: {h1: 1 mm, h2: 1 mm, h3: 1 mm}}"
+        changes = {"sample_time": f"{interval} s", "duration": f"{lasts} s", "faults": "{}", "noise": noise}
+        words = [word for key, value in changes.items() for word in ("--set", f"simulate.{key}={value}")]
+        fdi("simulate", "--out", ".", "--replace", *words, "--set", "output.name=run")
+        header, *rows = Path("run.csv").read_text().splitlines()
+        later = [f"{start + float(t):g},{rest}" for t, rest in (row.split(",", 1) for row in rows)]
+        Path("run.csv").write_text("\n".join([header.replace("h1_cm", "level (cm)"), *later]))
+        fdi("new", "monitor", "--recording", "run.csv", "--out", f"m{interval}_{start}.yaml")
+        first, last = load_monitor(f"m{interval}_{start}.yaml").config.fault_free
+        capsys.readouterr()
+        fdi("monitor", "--config", f"m{interval}_{start}.yaml")
+        (learnt, needed), *_ = re.findall(r"learnt from (\S+) s of (\S+) s needed", capsys.readouterr().out)
+        assert first == start and float(learnt) == pytest.approx(last - first, abs=10 * interval)
+        assert (last - first) / min(float(needed), 0.5 * lasts) == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_new_monitor_of_a_live_source_has_a_tag_of_every_channel(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fdi("new", "monitor", "--recording", "mqtt://localhost/rig")
+    assert "next: complete the tags, then fdi monitor" in capsys.readouterr().out
+    source = load_monitor("monitor.yaml").config.source
+    assert source is not None and source.url == "mqtt://localhost/rig"
+    assert list(source.tags) == ["Q1", "Q2", "h1", "h2", "h3"] and source.tags["Q1"].unit == "cm^3/s"
+    assert cli.main(["monitor", "--config", "monitor.yaml"]) == cli.MISUSE
+    assert "source: tags.Q1: expected either tag or constant, got none" in capsys.readouterr().err
+    assert cli.main(["new", "run", "--recording", "mqtt://localhost/rig"]) == cli.MISUSE
+    assert "--recording: expected a file for a run, got mqtt://localhost/rig" in capsys.readouterr().err
+
+
 def test_a_file_that_is_there_is_never_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -199,7 +244,8 @@ def test_what_the_catalogue_says_can_be_written(name: str) -> None:
     assert build_plant(data, "plant").effects[0].effect == name
     ((fault, value),) = yaml.safe_load(f"{{{entry.in_a_run_file}}}").items()
     network = build_network(described, placements_of([fault], described))
-    assert set(parameter_values({fault: value}, network.constants, described)) == {fault}
+    (size,) = parameter_values({fault: value}, network.constants, described).values()
+    assert size != entry.parameters[0].nominal, "an example shows the effect"
 
 
 def test_effects_of_a_plant_are_told_with_places_and_in_full(capsys: pytest.CaptureFixture[str]) -> None:

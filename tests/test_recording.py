@@ -39,7 +39,7 @@ def test_window_keeps_the_clock() -> None:
 
 def test_window_without_samples_says_how_far_the_recording_runs() -> None:
     with pytest.raises(
-        ValueError, match=r"test.csv: expected at least two samples between start 20 s .* from 0 s to 9 s"
+        ValueError, match=r"test.csv: expected at least two samples after start 20 s, got .* from 0 s to 9 s"
     ):
         ramp(10).window(start=20.0)
 

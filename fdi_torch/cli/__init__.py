@@ -25,7 +25,7 @@ from typing import Any, NoReturn
 
 from fdi_torch.disk import sentence
 from fdi_torch.interruption import Terminated, catch_signals
-from fdi_torch.names import unknown
+from fdi_torch.names import nearest, unknown
 
 DONE, MISUSE, NOT_CONVERGED, NOT_EXPLAINED, INTERRUPTED, TERMINATED = 0, 2, 3, 4, 130, 143
 
@@ -170,9 +170,17 @@ def _say_that_it_began(name: str, quiet: bool) -> None:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that names the option for a file without one."""
+    """A parser that names the option for a file without one, and the nearest one of an unknown option."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.register("type", int, _whole_number)
 
     def parse_known_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def]
+        options = [word.partition("=")[0] for word in args if word.startswith("--") and len(word) > 2]
+        for option in options:  # before an argument is missed that it was meant to be
+            if option not in self._option_string_actions:
+                self.error(f"unrecognized argument: {option}{nearest(option, self._option_string_actions)}")
         known, others = super().parse_known_args(args, namespace)
         file = others[0] if others else ""
         option = "--config" if Path(file).suffix in (".yaml", ".yml") else "--recording"
@@ -181,6 +189,13 @@ class _Parser(argparse.ArgumentParser):
         if Path(file).suffix and "--config" in self._option_string_actions:
             self.error(f"unrecognized argument: {file}; name it in the file for --config (fdi new writes one)")
         return known, others
+
+
+def _whole_number(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected a whole number, got '{text}'") from None
 
 
 def options_of(name: str) -> ModuleType:

@@ -20,6 +20,7 @@ from fdi_torch.names import counted
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
 from fdi_torch.plant.scales import emptying_time
 from fdi_torch.quantities import display_unit, significant
+from fdi_torch.recordings.csv_writing import header_of
 
 if TYPE_CHECKING:
     from fdi_torch.config.recording_config import RecordingConfig
@@ -38,6 +39,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             screen.say(f"- {place}")
         screen.say()
     _show_plant(plant, screen)
+    if not recordings:
+        screen.say(f"columns of a recording: {header_of(plant.channel_units(), plant.output_units())}")
     if arguments.picture:
         from fdi_torch.report.schematic import schematic
         from fdi_torch.report.style import save

@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 def _show(entry: Entry, of_plant: bool, screen: Screen) -> None:
     screen.say(f"{entry.name}: {entry.meaning}")
-    screen.say(f"  location: a {' or '.join(entry.kinds)}" + (f": {', '.join(entry.at)}" if of_plant else ""))
+    screen.say(f"  location: {entry.where}" + (f": {', '.join(entry.at)}" if of_plant else ""))
     screen.say(f"  acts {entry.begins}")
     screen.table("", ("parameter", "unit", "nominal", "range", "meaning"), [_row(p) for p in entry.parameters], left=5)
     screen.say(f"  in simulate.faults:     {entry.in_a_run_file}")

@@ -29,7 +29,7 @@ from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.experiment_design import planned_recording
 from fdi_torch.gap.free_runs.prediction import predict
 from fdi_torch.gap.free_runs.refit import narrowed
-from fdi_torch.jobs.gap import run_gap
+from fdi_torch.jobs.gap import library_entries, run_gap
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     for note in dict.fromkeys(note for r in (*recordings, *holdouts) for note in r.notes):
         screen.note(note)
     show_clock(r.clock_zero for r in recordings)
-    library = names(arguments.library) or None
+    library = library_entries(names(arguments.library)) or None
     if arguments.step is not None and not arguments.step > 0.0:
         raise ValueError(f"--step: expected a positive number of seconds, got {arguments.step:g}")
     if arguments.adopt:

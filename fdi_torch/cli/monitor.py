@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         done = run_monitor(monitor_run, callbacks, arguments.follow, arguments.idle, arguments.resume)
     slow = "" if done.spent < done.lasted else "; slower than real time"
     screen.note(f"{done.lasted:g} s of recording processed in {done.spent:.1f} s{slow}; {log_words(done.log)}")
-    if not done.events:
+    if not done.alarms:
         screen.say("no alarm")
     return 0
 

@@ -15,7 +15,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import planned_recordings
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.gap.identifiability import Identifiability, planned_identifiability
-from fdi_torch.jobs.gap import one_thread
+from fdi_torch.jobs.gap import library_entries, one_thread
 from fdi_torch.quantities import parse_level_deviation
 
 
@@ -26,7 +26,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     for note in planned.notes:
         screen.note(note)
     with one_thread():
-        limits = planned_identifiability(plant, planned, noise, names(arguments.library) or None)
+        limits = planned_identifiability(plant, planned, noise, library_entries(names(arguments.library)) or None)
     _show(limits, screen)
     shown = {f"{place}.{name}": residual for (name, place), residual in limits.shown.items()}
     screen.result(

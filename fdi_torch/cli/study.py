@@ -15,6 +15,7 @@ from fdi_torch.config.study_file import load_study
 from fdi_torch.jobs.study import StudyResult, run_study
 from fdi_torch.names import counted
 from fdi_torch.quantities import significant
+from fdi_torch.study.estimators import ESTIMATORS
 from fdi_torch.study.mode_isolation import Isolation
 from fdi_torch.study.summary import Ratio, Score, Summary
 from fdi_torch.tables import in_display_unit
@@ -54,9 +55,9 @@ HEADER = (
     *("coverage", "95 %"),
 )
 LEGEND = (
-    "bias: ± 1.96 of its standard errors; bound: Cramér-Rao bound; linearised: the efficient estimator, which knows "
-    "the truth; coverage: share of trials whose stated 95 % interval contains the truth; 95 %: confidence interval of "
-    "the number before it"
+    "; ".join(f"{name}: {meaning}" for name, meaning in ESTIMATORS.items())
+    + "\nbias: ± 1.96 of its standard errors; bound: Cramér-Rao bound; coverage: share of trials whose stated 95 % "
+    "interval contains the truth; 95 %: confidence interval of the number before it"
 )
 
 

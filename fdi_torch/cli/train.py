@@ -31,6 +31,11 @@ from fdi_torch.report.numbers import HEADER, estimate_cells
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
+    if arguments.config is None:
+        screen.note(
+            "built-in example: a recording of the plant three_tank with four faults is simulated, then diagnosed; "
+            "--config FILE diagnoses yours (fdi new run writes one)"
+        )
     job = load_run(arguments.config, overrides(arguments))
     if job.config.estimate.windows is not None:
         with screen.progress(job.name) as advance:
@@ -131,11 +136,12 @@ def in_words(done: TrainResult) -> list[str]:
     )
     if diagnosis.faults:
         lines.append(diagnosis.statement)
+    changes = "changes" if diagnosis.misfit.explained else "would change"
     for fault in diagnosis.present:
         shown = partial(quantity_text, si_unit=fault.unit, name=fault.name)
-        parts = [f"{shown(fault.value)} instead of {shown(fault.nominal)}"]
+        parts = [f"{shown(fault.value)} instead of {shown(fault.nominal)} ({done.fitting.space[fault.name].meaning})"]
         if fault.flow is not None:
-            parts.append(f"{quantity_text(fault.flow, 'm^3/s', 3)} at the mean levels")
+            parts.append(f"{changes} the flow by {quantity_text(fault.flow, 'm^3/s', 3)} at the mean levels")
         if fault.hole is not None:
             parts.append(f"equivalent to a sharp-edged hole of {1e3 * fault.hole:.3g} mm")
         lines.append(f"- {parameter_words(fault.name)}: " + ", ".join(parts))

@@ -4,6 +4,7 @@ columns of a recording (pumps and sensors as recorded, tanks and pipes as a gues
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from importlib.resources import files
@@ -11,14 +12,17 @@ from itertools import pairwise
 from pathlib import Path
 from string import Template, ascii_uppercase
 from typing import NamedTuple
+from urllib.parse import urlsplit
 
 import torch
 
 from fdi_torch.config.channels import mapped
-from fdi_torch.config.yaml_files import find_data
+from fdi_torch.config.yaml_files import find_data, parse_yaml
+from fdi_torch.live.values import PORTS
 from fdi_torch.plant.components import COMMAND_UNITS
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
-from fdi_torch.quantities import quantity_text, significant, unit_factor
+from fdi_torch.plant.scales import time_scale
+from fdi_torch.quantities import display_unit, quantity_text, significant, unit_factor
 from fdi_torch.recordings.csv_binding import bind_clock
 from fdi_torch.recordings.csv_files import read_csv, read_header
 from fdi_torch.recordings.csv_text import HeaderlessError, header_unit
@@ -27,21 +31,26 @@ from fdi_torch.recordings.database import is_query
 from fdi_torch.recordings.source import ClockSource
 from fdi_torch.units import spelled
 
+FALSE_ALARMS_EVERY, LEARNING = 20000.0, 1000.0
+"""Of a plant with the time scale of three_tank, s. A fault-free part of unknown sampling lasts LEARNING."""
+
 
 def template(kind: str, plant: PlantDescription, plant_file: str, name: str, recording: str | None = None) -> str:
     """The text of a new run, monitor, rehearsal or study.
 
     plant: the plant of the file; plant_file: its entry under the key `plant`; name: of the run. recording: the file
-    that it reads; None for one of the name of the run, whose header is then told.
+    that it reads, of a monitor also the URL of a live source; None for one of the name of the run, whose header is then
+    told. Raises ValueError for a recording that cannot be read.
     """
-    header = header_of(plant.channel_units(), plant.output_units())
-    file = f"{name}.csv             # with the header {header}" if recording is None else f'"{recording}"'
-    indent = "    " if kind == "run" else "  "
-    to_complete = [] if recording is None or is_query(recording) else mapped(find_data(recording, Path.cwd()), plant)
-    columns = to_complete or [
-        "# columns:                # for headers of other names",
-        f"#   {plant.sensors[0].column}: {{column: LT-101, unit: mm}}",
-    ]
+    if recording is not None and urlsplit(recording).scheme in PORTS:
+        if kind != "monitor":
+            raise ValueError(
+                f"--recording: expected a file for a {kind}, got {recording}; only a monitor reads a source"
+            )
+        reading = _live_source(recording, plant)
+    else:
+        reading = _recording(kind, plant, name, recording)
+    every, sampling = (_rounded_up(time * time_scale(plant)) for time in (FALSE_ALARMS_EVERY, 1.0))
     pipe = plant.pipes[0].name if plant.pipes else plant.tanks[0].name
     plugging = f"{pipe}.plugging" if plant.pipes else f"{pipe}.evaporation"
     constant = f"{pipe}.discharge_coefficient" if plant.pipes else f"{pipe}.area"
@@ -50,25 +59,83 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str, rec
     ).substitute(
         plant=plant_file,
         name=name,
-        file=file,
-        columns="\n".join(indent + line for line in columns),
+        reading="\n".join(reading),
+        every=f"{every:.10g}",
+        sampling=f"{sampling:.10g}",
+        duration=f"{600 * sampling:.10g}",
+        fault_free=_fault_free(plant, "\n".join(reading), every) if recording else _usual_part(plant),
         leak=f"{plant.tanks[0].name}.leak",
         plugging=plugging,
         constant=constant,
-        inputs=_inputs(plant),
-        simulated="\n".join(f"# {line}" for line in _inputs(plant).splitlines()),
+        inputs=_inputs(plant, sampling),
+        simulated="\n".join(f"# {line}" for line in _inputs(plant, sampling).splitlines()),
         noise=", ".join(f"{s.column}: {quantity_text(1e-3 * abs(s.gain), s.unit, 3, s.column)}" for s in plant.sensors),
         channels=", ".join(plant.channels()),
         commands=", ".join(_shares(plant, channel, (0.4,))[0] for channel in plant.channels()),
     )
 
 
-def _inputs(plant: PlantDescription) -> str:
+def _recording(kind: str, plant: PlantDescription, name: str, recording: str | None) -> list[str]:
+    """The entry of a recording in a run or monitor, with lines for the channels without a column of their name."""
+    header = header_of(plant.channel_units(), plant.output_units())
+    file = f"{name}.csv             # with the header {header}" if recording is None else f'"{recording}"'
+    to_complete = [] if recording is None or is_query(recording) else mapped(find_data(recording, Path.cwd()), plant)
+    columns = to_complete or [
+        "# columns:                # for headers of other names",
+        f"#   {plant.sensors[0].column}: {{column: LT-101, unit: mm}}",
+    ]
+    if kind == "run":
+        crop = ["# start: 60 s             # the first time that is used; stop: the last"]
+        crop += ["# mask: [[120 s, 130 s]]  # readings in between do not count"]
+        return ["recordings:", f"  - file: {file}", *(f"    {line}" for line in [*crop, *columns])]
+    return ["recording:", f"  file: {file}", *(f"  {line}" for line in columns)]
+
+
+def _live_source(url: str, plant: PlantDescription) -> list[str]:
+    """The entry of a live source, with a tag to be written for each channel."""
+    units = plant.channel_units() | plant.output_units()
+    tags = [f"    {name}: {{tag: null, unit: {display_unit(unit, name)[0] or 1}}}" for name, unit in units.items()]
+    return [
+        "source:",
+        f"  url: {url}",
+        "  tags:                       # the address of each value, and its unit",
+        *tags,
+    ]
+
+
+def _usual_part(plant: PlantDescription) -> str:
+    """A fault-free part for a recording of unknown sampling."""
+    until = _rounded_up(LEARNING * time_scale(plant))
+    return f"[0 s, {until:.10g} s]    # the noise is learnt from it; the first event says how long it must be"
+
+
+def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
+    """The fault-free part for the entry of a recording: by its sampling, and at most half of it."""
+    entry = parse_yaml(reading.encode(), "recording").get("recording")
+    if entry is None or " ..." in reading:  # a live source, or columns that the user must write
+        return _usual_part(plant)
+    from fdi_torch.config.learning_time import learning_time
+    from fdi_torch.config.loaded_recordings import read_recording
+
+    read = read_recording(entry, plant)
+    first, last = float(read.time[0]), float(read.time[-1])
+    enough = _rounded_up(learning_time(read, every))
+    until = first + min(enough, 0.5 * (last - first))
+    return f"[{first:.10g} s, {until:.10g} s]    # the noise is learnt from it; {enough:.10g} s suffice if it is white"
+
+
+def _rounded_up(value: float) -> float:
+    """The value rounded up to two digits."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.ceil(value / unit - 1e-9) * unit
+
+
+def _inputs(plant: PlantDescription, sampling: float) -> str:
     """For each pump and transfer a step up and a step down about half of its range; valves are open."""
     lines = []
     for channel in plant.channels():
         steps = zip((0, 200, 400), _shares(plant, channel, (0.4, 0.5, 0.3)), strict=False)
-        listed = [f"[{t} s, {level}]" for t, level in steps]
+        listed = [f"[{sampling * k:.10g} s, {level}]" for k, level in steps]
         lines.append(f"    {channel}: " + ("1" if len(listed) == 1 else f"{{steps: [{', '.join(listed)}]}}"))
     return "\n".join(lines)
 
@@ -87,6 +154,7 @@ AT_RIM = {"1": 1.0, "V": 10.0, "A": 0.02, "Pa": 9810.0 * HEIGHT}
 READING = re.compile(r"[LHPX]|.*(level|füllstand|niveau|pegel|pressure|druck)", re.IGNORECASE)
 """Tags of levels and pressures (ISA-5.1), letters of levels by custom, and words."""
 COMMAND = re.compile(r".*(pump|valve|ventil|pwm|duty|cmd|command|speed|drehzahl)", re.IGNORECASE)
+PUMPS = "pumps:    # ! the tank that each fills, and its greatest flow; a flow out of a tank belongs under transfers"
 
 
 class _Column(NamedTuple):
@@ -155,7 +223,7 @@ def plant_from_recording(path: Path, name: str) -> str:
             for pipe, a, b in pipes
         ),
         "",
-        *(["pumps:    # ! the tank that each fills, and its greatest flow", *pumps, ""] if pumps else []),
+        *([PUMPS, *pumps, ""] if pumps else []),
         "sensors:  # ! the tank of each, and its gain: reading at the rim divided by height; commands go to pumps",
         *(_sensor(column, tank) for column, tank in zip(sensors, tanks, strict=True)),
         "",

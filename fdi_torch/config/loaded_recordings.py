@@ -235,8 +235,6 @@ def _read(
 ) -> Recording:
     """Read by the file's ending: an MCAP log (also an incomplete one), else CSV or another table."""
     mapping = channel_mapping(config, plant)
-    if path.suffix in YAML_ENDINGS:
-        raise ValueError(f"{path}: expected a recording, got a YAML file; take the entries of its list recordings")
     if is_log(path):
         if config.also or config.tags or config.sheet or not config.header:
             raise ValueError(

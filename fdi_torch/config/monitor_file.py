@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -73,7 +74,8 @@ class MonitorConfig(Strict):
         if data.get("recording") is not None:
             raise ValueError("expected either recording or source, got both; leave one out")
         shared = {key: source[key] for key in ("hold", "start_levels") if key in source}
-        return {**data, "recording": {"file": str(source.get("url")), **shared}}
+        without_credentials = re.sub(r"//[^/]*@", "//", str(source.get("url")))  # about which `source` itself complains
+        return {**data, "recording": {"file": without_credentials, **shared}}
 
 
 @dataclass(frozen=True)

@@ -200,7 +200,11 @@ def find_file(name: str, base: Path, also: Sequence[Path] = ()) -> Path:
 
 
 def find_data(name: str, base: Path) -> Path:
-    """A recording: as `find_file`, and in the folder of the environment variable FDI_TORCH_DATA."""
+    """The path of a recording, searched as by `find_file` and in the folder that the environment variable
+    FDI_TORCH_DATA names. Raises ConfigError if there is none, and for a YAML file.
+    """
+    if Path(name).suffix in YAML_ENDINGS:
+        raise ConfigError([f"{name}: expected a recording, got a YAML file; take the entries of its list recordings"])
     data = os.environ.get("FDI_TORCH_DATA")
     try:
         return find_file(name, base, [Path(data)] if data else [])

@@ -48,7 +48,12 @@ class Entry(Shown):
 
     @property
     def headline(self) -> str:
-        return f"{self.name}, at a {' or a '.join(self.kinds)}: {self.meaning}"
+        return f"{self.name}, at {self.where}: {self.meaning}"
+
+    @property
+    def where(self) -> str:
+        """'a pump or a transfer', 'an outlet'."""
+        return " or ".join(f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}" for kind in self.kinds)
 
     @property
     def begins(self) -> str:
@@ -71,12 +76,14 @@ class Entry(Shown):
 
     @in_its_units
     def _amount(self, parameter: Parameter) -> str:
-        """An example value for a file: a tenth of the range for parameters that are zero at nominal, else the nominal
-        value.
+        """An example value for a file: of the size, and of parameters that are zero at nominal, a tenth of the range
+        away from the nominal value; else that value.
         """
         value = parameter.nominal
-        if value == 0.0 and parameter.name not in (*_ONSETS, "ramp"):
-            value = 0.1 * (parameter.high if abs(parameter.high) < 1e6 else 1.0)
+        if parameter is self.parameters[0] or (value == 0.0 and parameter.name not in (*_ONSETS, "ramp")):
+            up, down = parameter.high - value, value - parameter.low
+            reach = up if up >= down or value == 0.0 else -down
+            value += 0.1 * (reach if abs(reach) < 1e6 else 1.0)
         return quantity_text(value, parameter.unit, 3)
 
     def table(self) -> Table:

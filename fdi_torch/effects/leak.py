@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import torch
 
+from fdi_torch.plant.constants import leak_pipe
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
 from fdi_torch.plant.operating_range import interior_points, onset_grid
 
@@ -25,9 +26,9 @@ class Leak(Effect):
     mistaken_for = ("plugging", "net_outlet", "valve_leak", "unmetered_flow", "cross_flow", "overflow", "evaporation")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        tank = plant.tank(place)
+        tank, reference = plant.tank(place), leak_pipe(plant, place).name
         return (
-            Parameter("size", "1", 0.0, 0.0, 1.0, meaning="capacity of the hole relative to the reference pipe"),
+            Parameter("size", "1", 0.0, 0.0, 1.0, meaning=f"capacity of the hole relative to that of {reference}"),
             Parameter("height", "m", 0.0, 0.0, 0.95 * tank.height, meaning="height of the hole above the floor"),
             Parameter("onset", "s", 0.0, 0.0, meaning="time at which it opens"),
             Parameter("ramp", "s", 0.0, 0.0, meaning="time until fully open"),

@@ -1,4 +1,4 @@
-"""The open share of a pipe: plugging in the coordinates of the 2020 paper."""
+"""The open share of a pipe, one minus its plugging: the parameter of the 2020 paper."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Openness(Effect):
     mistaken_for = ("plugging", "cross_flow")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
-        return (Parameter("size", "1", 1.0, 0.0, 1.0, meaning="share of the nominal flow that passes (1 - b)"),)
+        return (Parameter("size", "1", 1.0, 0.0, 1.0, meaning="share of the nominal flow that passes"),)
 
     def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * p["size"]

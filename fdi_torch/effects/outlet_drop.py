@@ -1,4 +1,4 @@
-"""An outlet above or below the zero of the level."""
+"""An outlet or a crest that lies lower or higher than in the plant file."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, S
 
 
 class OutletDrop(Effect):
-    """The head is x + d: Torricelli's law with the orifice d below the zero of the level, as at the end of a drain
-    hose; negative: above it, without flow at lower levels.
+    """The head is x + d: the law with the orifice or crest d below its height in the plant file, as at the end of a
+    drain hose; negative: above it, without flow at lower levels.
 
     Typical: d of -3 to 10 cm. Nearly the same as another exponent of the head or laminar flow.
     """
@@ -22,7 +22,7 @@ class OutletDrop(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         far = 0.3 * source_height(plant, place)
-        return (Parameter("drop", "m", 0.0, -far, far, meaning="distance below the zero of the level"),)
+        return (Parameter("drop", "m", 0.0, -far, far, meaning="distance below its height in the plant file"),)
 
     def head(self, head: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return head + p["drop"]

@@ -24,7 +24,7 @@ class Plugging(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (
-            Parameter("size", "1", 0.0, -1.0, 1.0, meaning="lost share of the flow (b)", extremes=(1.0,)),
+            Parameter("size", "1", 0.0, -1.0, 1.0, meaning="lost share of the flow", extremes=(1.0,)),
             Parameter("onset", "s", 0.0, 0.0, meaning="time at which it begins"),
             Parameter("ramp", "s", 0.0, 0.0, meaning="time until full size"),
         )

@@ -18,6 +18,7 @@ from fdi_torch.gap.problem import PLAIN, Settings, problem_of
 from fdi_torch.jobs.log_paths import STARTS_OVER
 from fdi_torch.jobs.logged_recordings import log_prediction, log_recording
 from fdi_torch.logbook import RunLog
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
@@ -65,6 +66,12 @@ def run_gap(
             if predicted is not None and predicted.shape == each.outputs.shape:
                 log_prediction(log, each, predicted, group)
     return answer
+
+
+def library_entries(names: Sequence[str]) -> tuple[str, ...]:
+    """The entries of a library: an effect at one place may be called T1.leak, as in files, and is leak@T1."""
+    at = {name: ParameterName.of_effect(name) for name in names if "." in name}
+    return tuple(f"{at[name].effect}@{at[name].place}" if name in at else name for name in names)
 
 
 def groups(holdouts: int, recordings: int = 1) -> tuple[str, ...]:

@@ -19,6 +19,7 @@ from torch import Tensor
 from fdi_torch.amounts import parameter_words
 from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.monitor_file import MonitorRun
+from fdi_torch.config.problems import naming
 from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.jobs.monitor_rows import CLOCK, FROM_SOURCE, event_fields, samples_of_rows
 from fdi_torch.logbook import Listener, RunLog, as_array
@@ -68,7 +69,7 @@ class LoggedMonitor:
         self.run, self.plant, self.log, self.callbacks = run, run.plant, log, callbacks
         self._reported = Counter() if reported is None else reported
         self.state: Any = None
-        self.events, self.spent = 0, 0.0
+        self.events, self.alarms, self.spent = 0, 0, 0.0
         self._ever_suspected: dict[str, None] = {}
         self._present_faults: tuple[tuple[str, float], ...] = ()
         self._first_time: float | None = None
@@ -188,6 +189,7 @@ class LoggedMonitor:
     def _report(self, event: Event, from_source: bool = False) -> None:
         """Log an event and the faults after it, and pass it on unless an earlier log of the run has it."""
         self.events += 1
+        self.alarms += event.kind == "alarm"
         fields = event_fields(event) | {FROM_SOURCE: from_source or None}
         self.log.alarm(event.time, event.kind, " + ".join(event.faults), event.text, **fields)
         self._present_faults = event.believed
@@ -266,7 +268,8 @@ def _positions(clock: Sequence[float], times: Sequence[tuple[float, bool]]) -> l
 
 def _prepare(run: MonitorRun, whole: Recording) -> PreparedMonitor:
     c = run.config
-    part = usable_part(run.plant, fault_free_part(whole, *c.fault_free))
+    with naming("fault_free"):
+        part = usable_part(run.plant, fault_free_part(whole, *c.fault_free))
     # The configured initial levels are valid only if the fault-free part starts with the recording.
     at_start = float(part.time[0]) == float(whole.time[0])
     return prepare_monitor(

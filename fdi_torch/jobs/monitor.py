@@ -45,9 +45,9 @@ IDLE = 60.0
 
 @dataclass(frozen=True)
 class MonitorSummary:
-    """events: their number. lasted: duration of the recording, s. spent: computing time, s. log: path of the log."""
+    """alarms: their number. lasted: duration of the recording, s. spent: computing time, s. log: path of the log."""
 
-    events: int
+    alarms: int
     lasted: float
     spent: float
     log: Path
@@ -94,7 +94,7 @@ def run_monitor(
             monitor.close()
         finally:
             log.result({"events": monitor.events, "faults": monitor.faults()})
-    return MonitorSummary(monitor.events, monitor.lasted, monitor.spent, path)
+    return MonitorSummary(monitor.alarms, monitor.lasted, monitor.spent, path)
 
 
 def _log_to_write(run: MonitorRun, resume: bool) -> tuple[Path, LoggedRun | None]:

@@ -26,7 +26,7 @@ from fdi_torch.gap.free_runs.prediction import predict as run_freely
 from fdi_torch.gap.free_runs.refit import refit as refitted
 from fdi_torch.jobs import study as study_job
 from fdi_torch.jobs import train as train_job
-from fdi_torch.jobs.gap import one_thread, run_gap
+from fdi_torch.jobs.gap import library_entries, one_thread, run_gap
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
@@ -137,14 +137,16 @@ def gap(
     holdouts: recordings on which the corrected model is validated. out: folder of the log. settings: library, leave_out
     (names of effects), step (s), most, named_only, as the options of `fdi gap`. Raises ValueError for other settings.
     """
-    plant, segments = _plant_and_recordings(plant, recordings, "gap")
+    valid_settings = [field.name for field in fields(Settings)]
+    for name in settings:  # first, because without recordings the plant counts as a run
+        if name not in valid_settings:
+            raise ValueError(f"gap: {unknown('a setting', name, [*valid_settings, 'recordings', 'holdouts', 'out'])}")
     for name in ("library", "leave_out"):
         if isinstance(settings.get(name), str):
             settings[name] = (settings[name],)
-    valid_settings = [field.name for field in fields(Settings)]
-    for name in settings:
-        if name not in valid_settings:
-            raise ValueError(f"gap: {unknown('a setting', name, [*valid_settings, 'holdouts', 'out'])}")
+    if settings.get("library") is not None:
+        settings["library"] = library_entries(settings["library"])
+    plant, segments = _plant_and_recordings(plant, recordings, "gap")
     log = free_path(Path(out), "gap")
     answer = run_gap(log, plant, segments, recordings_of(holdouts, plant), Settings(**settings), tell)
     return GapResult(answer, plant, log)

@@ -17,7 +17,8 @@ from fdi_torch.logbook.reader import Run
 
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _PLAIN_TOPIC = re.compile(r"(/[A-Za-z0-9_-]+)+")
-_COMPANIONS = ("_statistic", "_threshold", "_low", "_high")
+_TEST = ("_statistic", "_threshold")
+_BAND = ("_low", "_high")
 _COST = {
     "/estimator/de/generation": ("Search", "generation", ("best_cost", "mean_cost")),
     "/estimator/refine/iteration": ("Refinement", "iteration", ("cost",)),
@@ -107,18 +108,28 @@ def _sensor_plots(fields: Fields) -> list[Panel]:
 
 
 def _residual_plots(fields: Fields) -> list[Panel]:
-    """One plot per sensor: residual with its band, or with the test statistic and threshold of the monitor."""
+    """One plot per sensor, its residual with its band, and one per test statistic of the monitor with its threshold."""
     plots = []
     for topic in fields:
         if not (topic.startswith(("/estimate/", "/observer/")) and topic.endswith("/residual")):
             continue
         present = fields[topic]
         for name, unit in _signals(present):
-            band = [(f"{topic}.{name}_{side}", side) for side in ("low", "high") if f"{name}_{side}" in present]
-            plots.append(_plot(_title(f"{name}: residual", topic, unit), [(f"{topic}.{name}", "residual"), *band]))
-            test = [(f"{topic}.{name}_{k}", k) for k in ("statistic", "threshold") if f"{name}_{k}" in present]
-            plots += [_plot(_title(f"{name}: test statistic", topic, ""), test)] if test else []
+            lines = [(f"{topic}.{name}", "residual"), *_companions(present, topic, name, _BAND)]
+            plots.append(_plot(_title(f"{name}: residual", topic, unit), lines))
+        for name in _tests(present):
+            plots.append(_plot(_title(f"{name}: test statistic", topic, ""), _companions(present, topic, name, _TEST)))
     return plots
+
+
+def _tests(present: Mapping[str, str]) -> list[str]:
+    """What the monitor's statistics are of: a sensor, or all of them by a chart such as cusum."""
+    return [name.removesuffix(_TEST[0]) for name in present if name.endswith(_TEST[0])]
+
+
+def _companions(present: Mapping[str, str], topic: str, name: str, ends: Sequence[str]) -> list[tuple[str, str]]:
+    """Path and label of the fields that are called like another one with these ends."""
+    return [(f"{topic}.{name}{end}", end[1:]) for end in ends if name + end in present]
 
 
 def _input_plots(fields: Fields) -> list[Panel]:
@@ -143,7 +154,8 @@ def _cost_plots(fields: Fields) -> list[Panel]:
 
 def _signals(present: Mapping[str, str]) -> list[tuple[str, str]]:
     """The fields that are signals of their own, with their units."""
-    companions = {name + end for name in present for end in _COMPANIONS}
+    companions = {name + end for name in present for end in _BAND}
+    companions |= {name + end for name in _tests(present) for end in _TEST}
     return [(name, unit) for name, unit in present.items() if name not in _SECONDS and name not in companions]
 
 

@@ -26,7 +26,9 @@ def constant_parameters(plant: PlantDescription) -> Iterator[Parameter]:
         std = tolerances.pop(name, math.inf)  # absolute, m
         yield Parameter(name, "m", start, low, high, std, "level at t = 0")
         capacity = nominal_capacity(plant, leak_pipe(plant, tank.name))
-        yield Parameter(f"{tank.name}.leak_capacity", "m^2.5/s", capacity, meaning="flow of a leak of size 1 at 1 m")
+        yield Parameter(
+            f"{tank.name}.leak_capacity", "m^2.5/s", capacity, meaning="flow of a leak of size 1 at 1 m of head"
+        )
     for component in plant.flow_components():
         for name, unit, role in component.constants():
             value = getattr(component, name)

@@ -50,6 +50,7 @@ class _Drawing:
         self.plant, self.overlay = plant, overlay
         self.places = tank_places(plant)
         self.crossings = self.besides = 0
+        self.ends: list[Point] = []  # of the lines of flow components
         self.blocks: list[TextBlock] = []
         counts = {c.name: len(self.lines(c.name)) for c in plant.components()}
         self.tall = max(TALL, 0.4 + LINE * (1 + max(counts[t.name] for t in plant.tanks)))
@@ -163,18 +164,25 @@ class _Drawing:
         names = [s.name for s in self.plant.sensors if s.tank == sensor.tank]
         heights = [max(0.4, LINE * len(self.lines(name)) + 0.1) for name in names]
         first = min(max(0.85, sum(heights) + 0.2), self.tall - 0.1)
-        centre = (x + 0.5, y + first - sum(heights[: names.index(sensor.name)]))
+        side = -1.0 if self.joined(sensor.tank, 0.5) > self.joined(sensor.tank, -0.5) else 1.0
+        centre = (x + 0.5 * side, y + first - sum(heights[: names.index(sensor.name)]))
         probability = self.overlay.probabilities.get(sensor.name, 0.0)
         if probability > 0.0:
             self.axes.add_patch(Circle(centre, 0.2, facecolor=MARK, alpha=strength(probability), zorder=6))
         colour = self.colour(sensor.name)
         self.axes.add_patch(Circle(centre, 0.085, facecolor=PAPER, edgecolor=colour, lw=1.6, zorder=7))
-        self.words(sensor.name, (centre[0] + 0.12, centre[1] + 0.1), "left", "top")
+        self.words(sensor.name, (centre[0] + 0.12 * side, centre[1] + 0.1), "left" if side > 0.0 else "right", "top")
+
+    def joined(self, tank: str, wall: float) -> int:
+        """Number of lines that meet a wall above the floor, where its sensors are drawn."""
+        x, y = self.corner(tank)
+        return sum(abs(end[0] - x - wall) < 1e-9 and LOWEST < end[1] - y - 1e-9 < self.tall for end in self.ends)
 
     def flow(self, component: FlowComponent) -> None:
         """Draw a flow component as its `sketch` declares: a line along its route with its symbol."""
         sketch = component.sketch()
         points = self.route(component, sketch)
+        self.ends += [points[0], points[-1]]
         self.line(component.name, points, arrow=sketch.arrow)
         start, end = longest_piece(points)
         middle = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2

@@ -17,7 +17,7 @@ from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effect
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number, sentence
 from fdi_torch.report.sections.monitor import rehearsal_tables
-from fdi_torch.report.sections.study import ESTIMATORS
+from fdi_torch.report.sections.study import SHOWN
 from fdi_torch.report.sections.windows import logged_windows
 
 MOST_LISTED = 2  # alarms in the headline
@@ -162,7 +162,7 @@ def study_words(material: Material) -> str:
     if not trials and not settings:
         return ""
     text = counted(trials, "trial") + (f" in {counted(len(settings), 'setting')}" if settings else "")
-    estimator = next((name for name in ESTIMATORS if any(f"{name}.failures" in m for m in settings)), "")
+    estimator = next((name for name in SHOWN if any(f"{name}.failures" in m for m in settings)), "")
     ratios = [
         float(v)
         for m in settings

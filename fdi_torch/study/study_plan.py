@@ -21,9 +21,8 @@ from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings
 from fdi_torch.estimate.objectives import Objective
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.study.estimators import ESTIMATORS, Estimator
 
-Estimator = Literal["free", "boxed", "correlation", "linearised", "search"]
-ESTIMATORS: tuple[Estimator, ...] = ("free", "boxed", "correlation", "linearised", "search")
 SnrDefinition = Literal["variance", "power"]
 
 # Independent random streams of a study.
@@ -71,7 +70,7 @@ class Method:
     the noise-free readings.
     """
 
-    estimators: tuple[Estimator, ...] = ESTIMATORS
+    estimators: tuple[Estimator, ...] = tuple(ESTIMATORS)
     objective: Objective = "correlation"
     search: EvolutionSettings = field(default_factory=lambda: EvolutionSettings(population=40, evaluations=2000))
     search_step: float = 5.0

@@ -92,6 +92,15 @@ def test_a_plot_per_sensor_shows_measured_and_estimated(tmp_path: Path) -> None:
     assert {"/log", "/observer/alarm", "/gap/verdict", "/estimate/final"} <= set(shown)
 
 
+def test_the_statistic_of_a_monitor_is_beside_its_threshold() -> None:
+    panels = foxglove_layout(read_run(DATA / "log_format_1_monitor.mcap"))["configById"].values()
+    plots = {p["title"]: [(line["value"], line["label"]) for line in p["paths"]] for p in panels if "paths" in p}
+    test = [(f"/observer/residual.cusum_{name}", name) for name in ("statistic", "threshold")]
+    assert plots["cusum: test statistic"] == test
+    assert plots["h1: residual, m"] == [("/observer/residual.h1", "residual")]
+    assert sum("cusum" in title for title in plots) == 1
+
+
 def test_recordings_in_groups_have_plots_of_their_own_and_odd_names_none(tmp_path: Path) -> None:
     time, two = np.arange(3.0), np.zeros((3, 2))
     with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:

@@ -185,6 +185,7 @@ def test_a_study_page_shows_settings_and_trials(tmp_path: Path) -> None:
     assert {"trials_1", "errors_2", "isolation"} <= names(made) and ">T1.leak<" in page([made])
     assert "cost, no unit" in page([made]) or ">cost<" in page([made])
     assert ">iterations<" not in page([made]), "the same in all trials"
+    assert "Estimator: free, greatest likelihood without bounds on the parameters." in page([made])
     assert "38 of 40 modes stated correctly; 2 faults missed" in page([made]) and "none (10 %)" in page([made])
 
 

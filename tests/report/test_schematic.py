@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fdi_torch import Plant, Weir
+from fdi_torch import Plant, Transfer, Weir
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.report.rig_layout import tank_places
@@ -46,6 +46,19 @@ def test_tanks_that_a_pipe_levels_stand_side_by_side_whatever_falls_between_them
     weirs = [Weir("over", "A", "C", crest=0.6, width=0.04), Weir("back", "B", "A", crest=0.7, width=0.04)]
     plant = Plant(tanks, pipes, sensors=[Sensor("h", "A")], weirs=weirs)
     assert {name: row for name, (row, _) in tank_places(plant).items()} == {"A": 0, "B": 0, "C": 0, "D": 1}
+
+
+def test_a_sensor_is_drawn_at_the_wall_that_is_free() -> None:
+    """Weir and transfer join the tanks where the sensors of both would be drawn."""
+    plant = Plant(
+        tanks=[Tank("A", 0.1, 1.0), Tank("B", 0.1, 1.0)],
+        pipes=[Pipe("link", "A", "B", 1e-4, 0.6)],
+        weirs=[Weir("edge", "A", "B", crest=0.7, width=0.05)],
+        transfers=[Transfer("back", "B", "A", max_flow=1e-4)],
+        sensors=[Sensor("hA", "A"), Sensor("hB", "B")],
+    )
+    at = {text.get_text(): text.get_position()[0] for text in schematic(plant).axes[0].texts}
+    assert at["hA"] < at["A"] - 0.5 and at["hB"] > at["B"] + 0.5
 
 
 def test_a_chain_is_drawn_in_its_order() -> None:

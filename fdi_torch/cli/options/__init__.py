@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from fdi_torch.logbook import Listener
 
 LIVE = "127.0.0.1:8765"
+RECORDING = "a recording (CSV, Excel, Parquet, Feather, MATLAB, HDF5 or MCAP), or a YAML file with `recordings`"
 
 
 class ShowKeys(argparse.Action):
@@ -78,9 +79,7 @@ def seconds(text: str) -> float:
 
 def add_plant_and_recording(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
-    parser.add_argument(
-        "--recording", metavar="FILE", required=True, help="CSV or MCAP file, or a YAML file with `recordings`"
-    )
+    parser.add_argument("--recording", metavar="FILE", required=True, help=RECORDING)
 
 
 def add_holdout(parser: argparse.ArgumentParser) -> None:
@@ -90,7 +89,7 @@ def add_holdout(parser: argparse.ArgumentParser) -> None:
 
 
 def add_library(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--library", metavar="EFFECT,...", help="effects to search (EFFECT@PLACE for one), or all")
+    parser.add_argument("--library", metavar="EFFECT,...", help="effects to search (PLACE.EFFECT at one place), or all")
 
 
 def add_leave_out(parser: argparse.ArgumentParser) -> None:

@@ -25,7 +25,7 @@ examples:
   fdi gap --plant three_tank --recording run.csv --holdout other.csv   and how far the gap closes on other.csv
   fdi gap --plant rig.yaml --recording run.csv --adopt better.yaml     write the plant file with the causes
   fdi gap --plant rig.yaml --recording run.csv --adopt calibrated.yaml --narrow    calibrate despite disturbed flows
-  fdi gap --plant rig.yaml --recording run.csv --library pump_lag,leak@T1
+  fdi gap --plant rig.yaml --recording run.csv --library pump_lag,T1.leak
   fdi gap --plant rig.yaml --recording runs.yaml --most 8              several recordings together, many causes
 """
 

@@ -21,6 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("kind", choices=("plant", "run", "monitor", "rehearsal", "study"), help="kind of file")
     parser.add_argument("--plant", metavar="NAME|FILE", default="three_tank", help="its plant (three_tank)")
     parser.add_argument(
-        "--recording", metavar="FILE", help="a recording: its columns make the plant; a run or monitor reads it"
+        "--recording",
+        metavar="FILE",
+        help="a recording: its columns make the plant; a run or monitor reads it, a monitor also a URL such as mqtt://HOST",
     )
     parser.add_argument("--out", metavar="FILE", help="the new file (KIND.yaml); existing files are never replaced")

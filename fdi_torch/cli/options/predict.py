@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import add_start_samples, seconds
+from fdi_torch.cli.options import RECORDING, add_start_samples, seconds
 
 STEP, SUMMARY = "diagnose", "run a plant freely along a recording and report the error"
 EXAMPLES = """
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         action="append",
         default=[],
-        help="CSV or MCAP file, or a YAML file with `recordings`; may be repeated",
+        help=f"{RECORDING}; may be repeated",
     )
     parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
     add_start_samples(parser)

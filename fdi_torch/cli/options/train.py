@@ -1,6 +1,7 @@
 """Estimate which faults are present in a recording, how large and how certain; with a log and a picture.
 
-Without --config it runs the built-in example: the paper's Table 3 fault at an SNR of 30 dB, simulated and diagnosed.
+Without --config it runs the built-in example: three tanks with four faults (Table 3 of the 2020 paper),
+simulated and diagnosed.
 """
 
 from __future__ import annotations

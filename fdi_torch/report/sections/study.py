@@ -20,10 +20,12 @@ from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import axis, number, percent, shown_unit
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.style import MARK, MODEL, SOFT, logarithmic, panel
+from fdi_torch.study.estimators import ESTIMATORS, Estimator
 
 TRIAL, SUMMARY = "/study/trial", "/study/summary"
 MOST_PANELS, MOST_GROUPS, MOST_ROWS = 9, 40, 30
-ESTIMATORS = ("free", "boxed", "correlation", "search")
+SHOWN: tuple[Estimator, ...] = ("free", "boxed", "correlation", "search")
+"""Of the estimators that a log has, the first of these is shown."""
 MAIN = {"over_bound": "error over the Cramér-Rao bound", "coverage": "coverage of the 95 % interval"}
 _OWN = ("t", "trial", "trials", "group", "seed", "status")
 
@@ -42,12 +44,16 @@ def summary_section(material: Material) -> Section | None:
     shown = table(header, rows)
     if len(rows) <= MOST_ROWS:
         return Section("Settings", [shown])
-    estimator = next((name for name in ESTIMATORS if any(key.startswith(f"{name}.") for key in names)), "")
+    estimator = next((name for name in SHOWN if any(key.startswith(f"{name}.") for key in names)), None)
     main = [
         [_main_words(row[0]), *row[1:]] for row in rows if row[0].startswith(f"{estimator}.") and _main_words(row[0])
     ]
     blocks = [table(header, [rows[0], *main]), folded(f"All {len(rows)} numbers of each setting", shown, printed=False)]
-    return Section("Settings", [f"Estimator: {estimator}.", *blocks] if main else blocks[1:])
+    return Section("Settings", [_estimator_words(estimator), *blocks] if main and estimator else blocks[1:])
+
+
+def _estimator_words(name: Estimator) -> str:
+    return f"Estimator: {name}, {ESTIMATORS[name]}."
 
 
 def _label_and_scale(material: Material, name: str) -> tuple[str, float]:
@@ -68,7 +74,7 @@ def _main_words(name: str) -> str:
 def error_section(material: Material) -> Section | None:
     """Absolute error of every trial in each parameter, with the Cramér-Rao bound."""
     trials = [m for m in material.of(TRIAL) if isinstance(m.get("truth"), list)]
-    estimator = next((name for name in ESTIMATORS if trials and name in trials[0]), None)
+    estimator = next((name for name in SHOWN if trials and name in trials[0]), None)
     if estimator is None:
         return None
     groups = list(dict.fromkeys(str(m.get("group", "")) for m in trials))[:MOST_GROUPS]
@@ -87,8 +93,8 @@ def error_section(material: Material) -> Section | None:
             logarithmic(figure.axes[0])
         figure.axes[0].plot(range(len(groups)), bounds, "_", color=MARK, ms=22, mew=2.0)
         pictures.append(Picture(f"errors_{i + 1}", figure))
-    words = f"Estimator: {estimator}. Each point is a trial, blue their root mean square, orange its Cramér-Rao bound."
-    return Section("Errors", [words, pictures])
+    words = "Each point is a trial, blue their root mean square, orange its Cramér-Rao bound."
+    return Section("Errors", [f"{_estimator_words(estimator)} {words}", pictures])
 
 
 def _unit_of(material: Material, name: str) -> tuple[str, float]:
@@ -141,7 +147,8 @@ def trials_section(material: Material) -> Section | None:
         pictures.append(Picture(f"trials_{k + 1}", figure))
     ended = table(["setting", "trials", *(status or "ended" for status in statuses)], rows)
     blocks: list[Any] = [folded("How the trials ended", ended)]
-    blocks += [pictures] if pictures else []
+    blocks += ["Each point is a trial, blue their median.", pictures] if pictures else []
+    blocks += ["The cost is the negative logarithm of the likelihood."] if "cost" in varying else []
     return Section("Trials", blocks)
 
 

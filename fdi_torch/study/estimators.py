@@ -1,0 +1,15 @@
+"""The estimators that a study compares, by name, with their meanings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+Estimator = Literal["free", "boxed", "correlation", "linearised", "search"]
+ESTIMATORS: Mapping[Estimator, str] = {
+    "free": "greatest likelihood without bounds on the parameters",
+    "boxed": "greatest likelihood within the bounds",
+    "correlation": "greatest correlation of readings and model, the objective of the 2020 paper",
+    "linearised": "the efficient estimator, which knows the truth",
+    "search": "the best of the global search, not refined",
+}
