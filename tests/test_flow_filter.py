@@ -169,7 +169,7 @@ def test_the_start_tells_how_many_false_alarms_are_possible_if_one_is_expected()
     for whitening in (known, noise.whitening):
         detector = make_detector("cusum", 20_000.0, 1.0, 3, torch.Generator().manual_seed(0), learnt=whitening)
         text = false_alarm_rate_text(replace(noise, whitening=whitening), detector, 20_000.0)
-        found = re.search(r"expect one false alarm in 20000 s \(95 %: 0 to (\d+)\)", text)
+        found = re.search(r"expect one false alarm in 20000 s \(0 to (\d+) with a probability of 95 %\)", text)
         assert found is not None
         most.append(int(found[1]))
     assert most[0] == poisson.ppf(0.975, 1.0)

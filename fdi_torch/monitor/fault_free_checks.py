@@ -96,8 +96,8 @@ def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -
     needed = seconds * design.learning_factor(RATE_FACTOR)
     fewest, most = (design.count_quantile(every, p) for p in (0.025, 0.975))
     text = (
-        f"the noise is learnt from {seconds:.4g} s of {needed:.4g} s needed; expect one false alarm in {every:.5g} s "
-        f"(95 %: {fewest} to {most})"
+        f"the noise is learnt from {quantity_text(seconds, 's')} of {quantity_text(needed, 's')} needed; expect one "
+        f"false alarm in {quantity_text(every, 's', 5)} ({fewest} to {most} with a probability of 95 %)"
     )
     if noise.whitening.flows is None:
         text += ", if no random flow is slow: to model these, install a C++ compiler or the extra fdi_torch[compiler]"

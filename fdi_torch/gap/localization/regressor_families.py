@@ -18,6 +18,7 @@ from torch import Tensor
 from fdi_torch.gap.localization.regressors import relay
 
 PHASES = 24  # of a period, at which pulses begin and end
+LONGEST = PHASES // 2
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class Pulses:
     """Periodic pulses: draws by a timer, a float valve, a pump that cycles.
 
     time (K,): s. factor (K,). frequencies (F,): Hz. Each pulse has a frequency, a phase at its begin, and the share of
-    the period that it lasts; both are multiples of 1/PHASES.
+    the period that it lasts, up to a half; both are multiples of 1/PHASES. A longer one is a constant less a pulse.
     """
 
     time: Tensor
@@ -101,7 +102,7 @@ class Pulses:
     frequencies: Tensor
 
     def __len__(self) -> int:
-        return len(self.frequencies) * PHASES * (PHASES - 1)
+        return len(self.frequencies) * PHASES * LONGEST
 
     @property
     def spacing(self) -> Tensor:
@@ -110,8 +111,8 @@ class Pulses:
 
     def parameters(self, i: int) -> Tensor:
         """Frequency, begin and share of the i-th pulse, (3,)."""
-        k, rest = divmod(i, PHASES * (PHASES - 1))
-        begin, length = divmod(rest, PHASES - 1)
+        k, rest = divmod(i, PHASES * LONGEST)
+        begin, length = divmod(rest, LONGEST)
         return self.time.new_tensor([float(self.frequencies[k]), begin / PHASES, (length + 1) / PHASES])
 
     def possible(self, parameters: Tensor) -> Tensor:
@@ -136,7 +137,7 @@ class Pulses:
         sums = torch.stack([weights.new_zeros(PHASES, weights.shape[1]).index_add_(0, p, weights) for p in phases])
         sums = torch.nn.functional.pad(torch.cat([sums, sums], dim=1).cumsum(dim=1), (0, 0, 1, 0))
         begins = torch.arange(PHASES).unsqueeze(1)
-        return (sums[:, begins + torch.arange(1, PHASES)] - sums[:, begins]).flatten(0, 2)
+        return (sums[:, begins + torch.arange(1, LONGEST + 1)] - sums[:, begins]).flatten(0, 2)
 
 
 @dataclass(frozen=True)
