@@ -131,7 +131,10 @@ def _without_outliers(
 def _examined(
     plant: PlantDescription, recordings: Sequence[Recording], trusted: bool
 ) -> tuple[list[Recording], list[StuckSegment]]:
-    """The recordings without readings of stuck sensors, and these. Raises ValueError for a faulty recording."""
+    """The recordings without readings of stuck sensors, and when each of these is stuck.
+
+    Raises ValueError for a faulty recording.
+    """
     checked = [usable(plant, replace(r, trusted=r.trusted or trusted), effects=True) for r in recordings]
     return [f.recording for f in checked], [s for f in checked for s in f.stuck]
 
