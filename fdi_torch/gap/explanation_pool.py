@@ -206,7 +206,7 @@ class ExplanationPool:
         return factor * expected.gain + expected.prior + parent.log_evidence - best > math.log(RARE)
 
     def _improves(self, fit: Fit, costs: Mapping[Key, float]) -> bool:
-        """Whether a fit is likelier, by chi-square and prior odds, than every explanation with only some of its effects.
+        """Whether a fit is likelier, by chi-square and prior odds, than every explanation with fewer of its effects.
 
         costs: chi-square of each fit under sensor noise alone; under any other noise the gain would be smaller.
         """
