@@ -114,7 +114,7 @@ def _free_form(posterior: Posterior, reach: OperatingRange) -> Fit | None:
     # The free functions shall explain what the drift of a sensor would absorb.
     fitter = with_disturbances(best.explanation.fitter, best.fit, replace(best.unknown.noise, wander=None))
     placements = [p for p in best.fit.candidate.placements if (p.effect.name, p.location) in best.causes]
-    return fitted_free_form(fitter, best.fit, placements, best.unknown.location, best.unknown.periods, reach)
+    return fitted_free_form(fitter, best.fit, placements, best.unknown, reach)
 
 
 def recalibrate(data: DataSet) -> tuple[Fitter, Fit, list[float]]:

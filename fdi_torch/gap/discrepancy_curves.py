@@ -18,7 +18,8 @@ from torch import Tensor
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.free_form import UNIT, free_form, is_free_coefficient
-from fdi_torch.gap.free_form_coefficients import coefficients_of, fitted_coefficients
+from fdi_torch.gap.free_form_coefficients import Coefficients, coefficients_of, fitted_coefficients
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor, Tank
 from fdi_torch.plant.effect import Placement, Stage
 from fdi_torch.plant.flow_component import FlowComponent
@@ -57,25 +58,32 @@ def curves_at(fitter: Fitter, fit: Fit, place: str, reach: OperatingRange) -> li
     shown itself.
     """
     here = tuple(p for p in fit.candidate.placements if p.location == place)
-    contains_free_form = any(p.effect.name.startswith("free_") for p in here)
-    free = here if contains_free_form else _of_stage(free_form(place, fitter.data.plant, reach), here)
-    if contains_free_form:
-        coefficients, effect = fitted_coefficients(fitter, fit, free), None
-    else:
-        coefficients = coefficients_of(fitter, fit, free, reach, returned=here)
-        effect = _effect(fitter, fit, place, here) if here else None
-    names = coefficients.names
+    if any(p.effect.name.startswith("free_") for p in here):
+        coefficients = fitted_coefficients(fitter, fit, here)
+        stages = dict.fromkeys(p.effect.stage for p in here)  # a tank has an inflow and a cross-section
+        groups = [tuple(p for p in here if p.effect.stage is stage) for stage in stages]
+        return [curve for group in groups for curve in _curves(fitter, fit, group, coefficients, None)]
+    free = _of_stage(free_form(place, fitter.data.plant, reach), here)
+    coefficients = coefficients_of(fitter, fit, free, reach, returned=here)
+    return _curves(fitter, fit, free, coefficients, _effect(fitter, fit, place, here) if here else None)
+
+
+def _curves(
+    fitter: Fitter, fit: Fit, free: Sequence[Placement], coefficients: Coefficients, effect: Tensor | None
+) -> list[Curve]:
+    """The curves of free functions of one stage, and of the influence (X,) of named effects."""
+    place, prefixes = free[0].location, {p.prefix for p in free}
+    own = [i for i, name in enumerate(coefficients.names) if ParameterName.parse(name).prefix in prefixes]
+    names, covariance = [coefficients.names[i] for i in own], coefficients.covariance[own][:, own]
     units = _local(fitter, fit, place, free, [{n: UNIT if n == one else 0.0 for n in names} for one in names]) / UNIT
     quantity, quantity_unit = _quantity(fitter, free, place)
     curves = []
     for variable, unit, x in (*_phases(fitter, free, place), *_variables(fitter, fit, place)):
         at, mean = _bins(x)
         free_mean = mean @ units.T
-        error = torch.sqrt(torch.einsum("km,mn,kn->k", free_mean, coefficients.covariance, free_mean).clamp(min=0.0))
-        along = mean @ effect if effect is not None else None
-        curves.append(
-            Curve(place, variable, unit, quantity, quantity_unit, at, free_mean @ coefficients.values, error, along)
-        )
+        error = torch.sqrt(torch.einsum("km,mn,kn->k", free_mean, covariance, free_mean).clamp(min=0.0))
+        along, function = mean @ effect if effect is not None else None, free_mean @ coefficients.values[own]
+        curves.append(Curve(place, variable, unit, quantity, quantity_unit, at, function, error, along))
     return curves
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy
 from fdi_torch.parameters import Parameter, ParameterName
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription, Sensor
@@ -137,11 +138,15 @@ def free_form(
 
 
 def fitted_free_form(
-    fitter: Fitter, fit: Fit, effects: Sequence[Placement], place: str, periods: Sequence[float], reach: OperatingRange
+    fitter: Fitter, fit: Fit, effects: Sequence[Placement], unknown: LocalizedDiscrepancy, reach: OperatingRange
 ) -> Fit:
-    """Fit the free discrepancy of one place together with some effects of a fit."""
+    """Fit free functions for an unknown discrepancy together with some effects of a fit."""
     plant = fitter.data.plant
-    placements = free_form(place, plant, reach, periods)
+    placements = [
+        p
+        for p in free_form(unknown.location, plant, reach, unknown.periods)
+        if ("area" if p.effect.stage is Stage.STORAGE else "flow") in unknown.quantities
+    ]
     start = {p.full_name(c.name): 0.0 for p in placements for c in p.effect.parameters(p.location, plant)}
     start |= fit.values_of(effects)
     return fitter.fit(Candidate((*effects, *placements), (start,)), fit)

@@ -102,7 +102,15 @@ class EvaluatedDiscrepancy:
             fit,
             self.noise,
             self.estimate,
+            self._quantities,
         )
+
+    @property
+    def _quantities(self) -> frozenset[str]:
+        """What the regressors in use change; those of the cross-section are the first ones of a tank."""
+        areas = self.regression.at(self.location)[0][0].areas
+        of_area, of_flow = self.regressed.used.tensor_split([0 if areas is None else len(areas)])
+        return frozenset(name for name, used in (("area", of_area), ("flow", of_flow)) if bool(used.any()))
 
 
 def gain_of(discrepancy: EvaluatedDiscrepancy | LocalizedDiscrepancy) -> float:

@@ -61,7 +61,7 @@ class LocalizedDiscrepancy:
     predicted (S, C): the readings with it; None of a random process. size: norm of the part of it that no parameter of
     the fit explains, in units of the sensor noise. selection: its regressors; None of a random process. fit, noise: the
     fit refitted, and the most likely disturbance noise, with the discrepancy. estimate: of the fit's parameters beside
-    it.
+    it. quantities: what it changes, of 'area' (of a tank) and 'flow' (or the reading of a sensor).
     """
 
     location: str
@@ -75,6 +75,7 @@ class LocalizedDiscrepancy:
     fit: Fit
     noise: StateNoise
     estimate: Estimate
+    quantities: frozenset[str] = frozenset({"flow"})
 
     @property
     def pulses(self) -> tuple[tuple[float, float], ...]:
