@@ -233,6 +233,8 @@ def test_a_leak_at_the_floor_and_a_plugged_outlet_without_a_valve_are_one_cause(
     assert equivalence_class(plugged, plant, {"OUT2.plugging.size": 0.4}) == {plugged}
     pipe = ("plugging", "P13")
     assert equivalence_class(pipe, plant, {"P13.plugging.size": -0.4}) == {pipe}
+    for other in (("openness", "P13"), ("net_outlet", "OUT2")):
+        assert equivalence_class(other, plant, {}) == {other, ("plugging", other[1])}
     (outlet,) = (p for p in plant.pipes if p.name == "OUT2")
     with_valve = replace(plant, pipes=tuple(replace(p, valve="v") if p is outlet else p for p in plant.pipes))
     assert equivalence_class(plugged, with_valve, {}) == {plugged} and equivalence_class(leak, with_valve, {}) == {leak}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 
 from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
@@ -23,6 +25,11 @@ class NetOutlet(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("size", "1", 1.0, -1.0, 2.0, meaning="net outflow relative to the outlet's law"),)
+
+    def equivalents(
+        self, place: str, plant: PlantDescription, values: Mapping[str, float]
+    ) -> tuple[tuple[str, str], ...]:
+        return (("plugging", place),)
 
     def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * p["size"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 
 from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
@@ -21,6 +23,11 @@ class Openness(Effect):
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("size", "1", 1.0, 0.0, 1.0, meaning="share of the nominal flow that passes"),)
+
+    def equivalents(
+        self, place: str, plant: PlantDescription, values: Mapping[str, float]
+    ) -> tuple[tuple[str, str], ...]:
+        return (("plugging", place),)
 
     def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * p["size"]

@@ -19,6 +19,7 @@ from fdi_torch.gap.diagnosis_result import DiagnosisResult, unexplained_chi_squa
 from fdi_torch.gap.free_form import discrepancy_tables
 from fdi_torch.gap.holdout import HeldOut
 from fdi_torch.gap.identifiability import unsearched_twins
+from fdi_torch.gap.library import equivalence_class
 from fdi_torch.gap.preprocess.outliers import SensorOutliers
 from fdi_torch.gap.screening import options_of
 from fdi_torch.parameters import ParameterName
@@ -101,11 +102,14 @@ def _periods(result: DiagnosisResult) -> list[str]:
 
 def _twins_outside_library(result: DiagnosisResult) -> list[str]:
     """Effects that were not searched and would explain the readings about as well as a cause of the answer."""
-    best, fitter = result.posterior.best, result.fitter
-    excluded = {p.effect.name for p in result.library} | {e.name for e in EFFECTS if e.quantizes}
-    present = {p.prefix for p in fitter.data.nominal_effects}
-    further = all_placements(fitter.data.plant, [e for e in EFFECTS if e.name not in excluded])
-    options = options_of([p for p in further if p.prefix not in present], fitter, result.reach)
+    best, fitter, plant = result.posterior.best, result.fitter, result.fitter.data.plant
+    searched = {(p.effect.name, p.location) for p in (*result.library, *fitter.data.nominal_effects)}
+    further = [
+        p
+        for p in all_placements(plant, [e for e in EFFECTS if not e.quantizes])
+        if not searched & equivalence_class((p.effect.name, p.location), plant, {})
+    ]
+    options = options_of(further, fitter, result.reach)
     if best.unknown or not options:
         return []
     twins = {
