@@ -103,6 +103,8 @@ def _periods(result: DiagnosisResult) -> list[str]:
 def _twins_outside_library(result: DiagnosisResult) -> list[str]:
     """Effects that were not searched and would explain the readings about as well as a cause of the answer."""
     best, fitter, plant = result.posterior.best, result.fitter, result.fitter.data.plant
+    if best.unknown:
+        return []
     searched = {(p.effect.name, p.location) for p in (*result.library, *fitter.data.nominal_effects)}
     further = [
         p
@@ -110,7 +112,7 @@ def _twins_outside_library(result: DiagnosisResult) -> list[str]:
         if not searched & equivalence_class((p.effect.name, p.location), plant, {})
     ]
     options = options_of(further, fitter, result.reach)
-    if best.unknown or not options:
+    if not options:
         return []
     twins = {
         f"{p.effect.name} at {p.location}": unsearched_twins(fitter, best.fit, p, options, CERTAIN)

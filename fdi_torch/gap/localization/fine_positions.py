@@ -127,7 +127,7 @@ class Positions:
         (moved,) = at(best.unsqueeze(0))
         moved = replace(
             moved,
-            choices=position.choices * 2 ** (HALVINGS * len(best)),
+            choices=position.choices + len(family) * 2 ** (HALVINGS * len(best)),
             frequency=float(best[0]) if isinstance(family, Pulses) else None,
         )
         return discrepancy.with_column(columns(best.unsqueeze(0))[..., 0], moved)
