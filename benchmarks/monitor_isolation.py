@@ -3,7 +3,8 @@
 With `--oracle`, each of its answers is compared with two posteriors on the same samples: over the same suspects if
 onset, course (sudden or growing) and the number of faults are known, and over the injected faults if their sizes are
 known too. What remains is what the readings do not decide. With `--from-prior N`, N faults and their sizes are
-drawn from the prior of the monitor, so that its probabilities must be the frequencies with which it is right. With
+drawn from the prior of the monitor, so that its probabilities must be the frequencies with which it is right; with
+`--growing` beside it the times of their growth, and with `--growing S` they reach these sizes within S seconds. With
 `--listed K` beside it, each monitor has K suspects only, and each second fault is none of them.
 """
 
@@ -24,7 +25,7 @@ from fdi_torch.estimate.evidence import posterior
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.hypothesis import Hypothesis
 from fdi_torch.monitor.hypothesis_fit import Prior, fit
-from fdi_torch.monitor.monitor_settings import LOOKBACK
+from fdi_torch.monitor.monitor_settings import LOOKBACK, usual_settings
 from fdi_torch.monitor.monitor_setup import PreparedMonitor, fault_free_part, prepare_monitor
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverWindow, no_change
 from fdi_torch.monitor.samples import Samples, samples_of_recording
@@ -82,7 +83,7 @@ def known_onset_posterior(
     monitor, believed, observer = prepared.monitor, prepared.believed, prepared.monitor.observer
     hypotheses = [Hypothesis((fault.size,), case.ramp > 0.0) for fault in monitor.faults]
     starts = torch.cat([believed, believed.new_tensor([case.onset])]).repeat(len(hypotheses), 1)
-    prior, posteriors = Prior(monitor.space.names, len(hypotheses)), []
+    prior, posteriors = Prior(monitor.space.names, len(hypotheses), monitor.settings.growth_times), []
     for window in windows(prepared, samples, case, times):
         base = 0.5 * float(observer.white_innovations(window, believed, no_change(believed)).square().sum())
         fits = fit(observer, window, believed, hypotheses, starts, base, prior, known_onset=True)
@@ -206,16 +207,25 @@ RANGES = {
 
 
 def cases_from_prior(
-    seed: int, learn: float, count: int, ramp: float = 0.0
+    seed: int, learn: float, count: int, growth: float | None = 0.0
 ) -> tuple[list[Case], dict[str, tuple[float, float]]]:
-    """Faults with sizes from a monitor's prior, and the ranges that this monitor has. ramp: duration of growth, s."""
+    """Faults with sizes from a monitor's prior, and the ranges that this monitor has.
+
+    growth: duration of growth, s; if None, the time in which a fault passes through its range is drawn from the prior
+    too, and the recording ends with this time.
+    """
+    times = usual_settings(load_plant("three_tank")).growth_times
     ranges = {f: RANGES[f.partition(".")[2]] for f in SIZES if " " not in f}
     rng, names, drawn = np.random.default_rng(seed), list(ranges), []
     for i in range(count):
         fault = names[rng.integers(len(names))]
-        size = rng.uniform(*ranges[fault]) - fault.endswith(".factor")
+        size, ramp, lasts = rng.uniform(*ranges[fault]) - fault.endswith(".factor"), growth, 1600.0
+        if ramp is None:
+            size = ranges[fault][size > 0.0] - fault.endswith(".factor")
+            ramp = float(np.exp(rng.uniform(*np.log(times))))
+            lasts = min(ramp, lasts)
         kind, share, onset = list(KINDS)[i % 3], size / SIZES[fault], learn + 300.0
-        drawn.append(Case(fault, ramp, kind, learn, onset, onset + 1600.0, True, 1000 * seed + i, share))
+        drawn.append(Case(fault, ramp, kind, learn, onset, onset + lasts, True, 1000 * seed + i, share))
     return drawn, ranges
 
 
@@ -228,13 +238,13 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1, help="only each n-th case")
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--from-prior", type=int, default=0, help="draw that many cases from the monitor's prior")
-    parser.add_argument("--growing", action="store_true", help="these grow to their size in 1500 s")
+    parser.add_argument("--growing", type=float, nargs="?", default=0.0, help="these grow, to their size in so many s")
     parser.add_argument("--listed", type=int, default=0, help="number of suspects, beside --from-prior")
     parser.add_argument("--oracle", action="store_true", help="compare with posteriors for known onsets and sizes")
     parser.add_argument("--show", action="store_true", help="print the events")
     a = parser.parse_args()
     if a.from_prior:
-        chosen, ranges = cases_from_prior(a.seed, a.learn, a.from_prior, GROWTH * a.growing)
+        chosen, ranges = cases_from_prior(a.seed, a.learn, a.from_prior, a.growing)
     else:
         chosen, ranges = cases(a.seed, a.learn, a.faults, a.kinds)[a.first :: a.every], {}
     total: dict[str, float] = defaultdict(float)

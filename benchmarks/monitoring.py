@@ -13,6 +13,7 @@ from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.hypothesis import Fault
 from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.monitor import Monitor
+from fdi_torch.monitor.monitor_settings import usual_settings
 from fdi_torch.monitor.monitor_setup import usual_faults
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow
@@ -45,8 +46,9 @@ def isolation(observer: ObserverBank, window: ObserverWindow, slow: bool) -> dic
     """Every fault alone, sudden; or sudden and slow, alone and in pairs."""
     believed, count = observer.space.nominal(), len(observer.space)
     faults = [Fault(column) for column in range(count)]
+    growth_times = usual_settings(observer.network.description).growth_times if slow else None
     (spent,) = seconds_in_rounds(
-        [lambda: isolate(observer, window, believed, faults, slow, 2 if slow else 1, flows=True)]
+        [lambda: isolate(observer, window, believed, faults, growth_times, 2 if slow else 1, flows=True)]
     )
     what = "sudden or slow, one or two" if slow else "sudden, one"
     return {"what": f"isolation, {count} faults, {what}", "samples": len(window), "seconds": spent}

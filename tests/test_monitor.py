@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
@@ -55,6 +56,7 @@ FAULTS = [Fault(column) for column in range(5)]
 INPUTS = torch.tensor([50e-6, 50e-6], dtype=torch.float64)
 REST = equilibrium(NETWORK, INPUTS)
 STD = 1e-3
+GROWTH_TIMES = (100.0, 10_000.0)  # s
 Truth = Callable[[float], Tensor]
 
 
@@ -257,10 +259,49 @@ def test_an_incipient_fault_is_distinguished_from_a_sudden_one() -> None:
 
     samples = recorded(truth, 260)
     run_monitor = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening)
-    best = isolate(run_monitor, from_rest(samples), SPACE.nominal(), FAULTS, incipient=True, deepest=1)[0]
+    best = isolate(run_monitor, from_rest(samples), SPACE.nominal(), FAULTS, GROWTH_TIMES, deepest=1)[0]
     assert best.hypothesis.columns == (4,) and best.hypothesis.incipient
     assert float(best.value[4]) == pytest.approx(1e-4 * 159.0, rel=0.05)
     assert abs(best.onset - 100.0) < 10.0
+
+
+@pytest.mark.parametrize("rate", [1e-4, -3e-4])
+def test_the_evidence_of_a_growing_fault_is_the_integral_over_its_onset_and_the_time_it_grows_for(rate: float) -> None:
+    """Against sums over a grid. A time to pass through the range in either direction is log-uniform; the onset is
+    uniform.
+    """
+
+    def truth(time: float) -> Tensor:
+        return SPACE.vector({"h3.sensor_bias.bias": rate * max(time - 100.0, 0.0)})
+
+    observer, window = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening), from_rest(recorded(truth, 200))
+    nominal, hypothesis, prior = SPACE.nominal(), Hypothesis((4,), True), Prior(SPACE.names, 1, GROWTH_TIMES)
+    high = SPACE.parameters[4].high
+    start = torch.cat([nominal, nominal.new_tensor([100.0])])[None]
+    start[0, 4] = 99.0 * rate
+    [fitted] = fit(observer, window, nominal, [hypothesis], start, 0.0, prior)
+
+    onsets = torch.linspace(fitted.onset - 4.0 * fitted.onset_std, fitted.onset + 4.0 * fitted.onset_std, 81)
+    times = high / abs(rate) * torch.linspace(-0.7, 0.7, 161, dtype=torch.float64).exp()
+    onset, time = torch.meshgrid(onsets.to(times), times, indexing="ij")
+    theta = nominal.repeat(onset.numel(), 1)
+    theta[:, 4] = (math.copysign(high, rate) * (199.0 - onset) / time).flatten()
+    changes = ChangeHypotheses(theta, onset.flatten(), torch.ones(onset.numel(), dtype=torch.bool))
+    cost = 0.5 * observer.white_innovations(window, nominal, changes).square().sum((1, 2)).reshape(onset.shape)
+    lowest = float(cost.min())
+    density = torch.exp(lowest - cost) / 199.0 / (2.0 * math.log(GROWTH_TIMES[1] / GROWTH_TIMES[0]))
+    integral = torch.trapezoid(torch.trapezoid(density, times.log()), onsets.to(times))
+    assert fitted.evidence - prior(hypothesis) == pytest.approx(float(integral.log()) - lowest, abs=0.1)
+
+
+def test_a_growing_fault_that_no_reading_shows_is_not_likelier_than_before() -> None:
+    """The gain of a pump at rest, with an onset at any time."""
+    samples = recorded(lambda t: SPACE.nominal(), 200, inputs=INPUTS * torch.tensor([1.0, 0.0]))
+    observer, nominal = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening), SPACE.nominal()
+    hypothesis, prior = Hypothesis((3,), True), Prior(SPACE.names, 1, GROWTH_TIMES)
+    starts = torch.cat([nominal.repeat(3, 1), nominal.new_tensor([[5.0], [100.0], [197.0]])], dim=1)
+    for fitted in fit(observer, from_rest(samples), nominal, [hypothesis] * 3, starts, 0.0, prior):
+        assert -2.0 < fitted.evidence + fitted.misfit - prior(hypothesis) <= 0.0
 
 
 def test_two_simultaneous_faults_are_isolated_together() -> None:
@@ -268,7 +309,7 @@ def test_two_simultaneous_faults_are_isolated_together() -> None:
         return SPACE.vector({"T1.leak.size": 0.05, "h3.sensor_bias.bias": 0.01} if time > 100.0 else {})
 
     run_monitor = ObserverBank(NETWORK, SPACE, noise().gain, noise().whitening)
-    best = isolate(run_monitor, from_rest(recorded(truth, 260)), SPACE.nominal(), FAULTS, incipient=False, deepest=2)[0]
+    best = isolate(run_monitor, from_rest(recorded(truth, 260)), SPACE.nominal(), FAULTS, deepest=2)[0]
     assert best.hypothesis.columns == (0, 4)
     for column, size in ((0, 0.05), (4, 0.01)):
         assert abs(float(best.value[column]) - size) < 4 * float(best.std[column])
@@ -292,7 +333,7 @@ def test_standard_errors_are_those_of_repeated_runs() -> None:
     pulls = []
     for seed in range(8):
         samples = recorded(step_to("T3.leak.size", 0.05, 60.0), 140, seed=seed)
-        best = isolate(run_monitor, from_rest(samples), SPACE.nominal(), FAULTS[1:2], incipient=False, deepest=1)[0]
+        best = isolate(run_monitor, from_rest(samples), SPACE.nominal(), FAULTS[1:2], deepest=1)[0]
         pulls.append((float(best.value[1]) - 0.05) / float(best.std[1]))
     assert 0.5 < float(torch.tensor(pulls).square().mean().sqrt()) < 1.7  # 8 runs: 95 % within 0.5 to 1.5
 
@@ -570,7 +611,7 @@ def test_a_jump_of_a_reading_is_found_wherever_it_lies_between_the_tried_onsets(
     eye, zeros = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     whitening = Whitening(zeros, eye[:0].unsqueeze(1), eye / (1.3 * STD), 500, zeros)
     observer = ObserverBank(NETWORK, SPACE, hand_gain(0.8 * eye), whitening)
-    fits = isolate(observer, from_rest(samples), believed, faults_of(SPACE.names), incipient=False)
+    fits = isolate(observer, from_rest(samples), believed, faults_of(SPACE.names))
     assert [SPACE.names[c] for c in fits[0].hypothesis.columns] == ["h3.sensor_bias.bias"]
     assert abs(fits[0].onset - (onset - 0.5)) < 1.0
 

@@ -56,7 +56,7 @@ def test_no_explanation_has_more_simultaneous_faults_than_allowed_however_often_
     bank, window = monitor().observer, from_rest(recorded(truth, 260))
     fits: list[HypothesisFit] = []
     for _ in range(2):
-        fits = isolate(bank, window, SPACE.nominal(), FAULTS, incipient=False, deepest=2, earlier=fits)
+        fits = isolate(bank, window, SPACE.nominal(), FAULTS, deepest=2, earlier=fits)
         assert max(len(f.hypothesis.sizes) for f in fits) == 2
 
 
@@ -117,7 +117,7 @@ def test_misfits_of_two_isolations_of_one_window_are_those_of_the_same_noise() -
     watch, nominal = monitor(), SPACE.nominal()
     window = from_rest(recorded(step_to("T3.leak.size", 0.05, 60.0), 140))
     for faults in (FAULTS[1:2], FAULTS[2:]):
-        best = isolate(watch.observer, window, nominal, faults, incipient=False, deepest=1)[0]
+        best = isolate(watch.observer, window, nominal, faults, deepest=1)[0]
         assert best.fits == (faults == FAULTS[1:2])
         onset = torch.tensor([best.onset], dtype=torch.float64)
         lane = ChangeHypotheses(best.value[None], onset, torch.tensor([best.hypothesis.incipient]))

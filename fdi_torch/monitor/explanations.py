@@ -10,11 +10,9 @@ from torch import Tensor
 from fdi_torch.monitor.alarm_state import State
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit, credible_set, merged
 from fdi_torch.monitor.isolation import SMALLEST_PROBABILITY, isolate
-from fdi_torch.monitor.monitor_settings import MonitorSettings
+from fdi_torch.monitor.monitor_settings import GROWING_WINDOWS, MonitorSettings
 from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
 from fdi_torch.monitor.observer_bank import ObserverBank
-
-GROWING_WINDOWS = 8.0  # longest windows over which one straight line describes a fault that grows
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ class Explainer:
                 window,
                 believed,
                 self.faults,
-                s.incipient,
+                s.growth_times,
                 s.together,
                 state.healthy,
                 earlier,

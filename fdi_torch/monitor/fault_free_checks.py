@@ -73,7 +73,7 @@ def fault_warnings(
     observer = ObserverBank(network, space, gain, whitening, step)
     steady = [fault for fault in faults if not fault.shape]
     first, _ = observer.first_state(samples, believed)
-    best = isolate(observer, ObserverWindow(samples, first, 1), believed, steady, incipient=False, deepest=1)[0]
+    best = isolate(observer, ObserverWindow(samples, first, 1), believed, steady, deepest=1)[0]
     columns = best.hypothesis.columns
     if not best.fits or not columns or best.probability < CONVINCING or best.onset_std == 0.0:
         return []

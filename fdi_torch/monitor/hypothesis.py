@@ -61,9 +61,14 @@ class Hypothesis:
         return tuple(c for c in self.columns if c not in self.shape)
 
     @property
+    def new(self) -> list[int]:
+        """The sizes of faults that do not recover."""
+        return [c for c in self.sizes if c not in self.recovered]
+
+    @property
     def count(self) -> int:
         """Number of faults that change, where simultaneous recoveries count as one."""
-        return len(set(self.sizes) - set(self.recovered)) + bool(self.recovered)
+        return len(self.new) + bool(self.recovered)
 
     def with_fault(self, fault: Fault) -> Hypothesis:
         """The same with a further fault at the same onset."""

@@ -33,12 +33,14 @@ ITERATIONS = 12
 class Prior:
     """Prior odds of a hypothesis.
 
-    names: of the parameter space. single_changes: number of possible single changes. unlisted: columns of faults that
-    are not on the list; unlisted_changes: number of possible changes of these.
+    names: of the parameter space. single_changes: number of possible single changes. growth_times: shortest and
+    longest time in which a growing fault passes through its range, s. unlisted: columns of faults that are not on the
+    list; unlisted_changes: number of possible changes of these.
     """
 
     names: tuple[str, ...]
     single_changes: int
+    growth_times: tuple[float, float] | None = None
     unlisted: Container[int] = ()
     unlisted_changes: int = 0
 
@@ -46,9 +48,18 @@ class Prior:
         """Log of the odds against no change."""
         if any(c in self.unlisted for c in hypothesis.columns):
             return math.log(ODDS.unknown / self.unlisted_changes)
-        new = [c for c in hypothesis.sizes if c not in hypothesis.recovered]
-        places = len({ParameterName.parse(self.names[c]).place for c in new}) + bool(hypothesis.recovered)
+        places = len({ParameterName.parse(self.names[c]).place for c in hypothesis.new}) + bool(hypothesis.recovered)
         return log_prior(hypothesis.count, places, max(self.single_changes, 1))
+
+    def growth(self, shares: Tensor, age: float) -> float:
+        """Log density of the shares of their ranges that growing faults have reached at this age (s); 0 if uniform.
+
+        share = age / T, and the time T in which a fault passes through its range is log-uniform. Where T would be
+        longer than the longest time, the density is constant.
+        """
+        assert self.growth_times is not None, "expected times of growth for a growing fault"
+        shortest, longest = self.growth_times
+        return -float((shares.clamp(min=age / longest) * math.log(longest / shortest)).log().sum())
 
 
 def no_change_fit(observer: ObserverBank, window: ObserverWindow, believed: Tensor, base: Tensor) -> HypothesisFit:
@@ -128,6 +139,9 @@ def fit(
     level, limit = float(window.readings), _noise_limit(observer, window)
     held = free & held_back(refined.theta, final.gradient, low, high)
     slope = torch.where(held, final.gradient.abs(), 0.0)
+    change, age = theta - fixed, window.samples.time[-1] - theta[:, -1]
+    room = torch.where(change > 0.0, high - fixed, fixed - low)
+    share = (torch.maximum(change.abs(), std) / room).nan_to_num(0.0).clamp(max=1.0)
     return [
         HypothesisFit(
             hypothesis,
@@ -138,6 +152,7 @@ def fit(
             base
             - float(final.cost[i])
             + prior(hypothesis)
+            + (prior.growth(share[i, hypothesis.new], float(age[i])) if hypothesis.incipient else 0.0)
             + _log_occam_factor(final.curvature[i], slope[i], width, free[i], hypothesis),
             float(final.cost[i]),
             level,
@@ -157,7 +172,7 @@ def _log_occam_factor(curvature: Tensor, slope: Tensor, width: Tensor, free: Ten
 
     Independent faults have independent onsets; each further fault therefore costs as much as an onset of its own.
     """
-    chosen, further = free.nonzero().flatten(), len(set(hypothesis.sizes) - set(hypothesis.recovered)) - 1
+    chosen, further = free.nonzero().flatten(), len(hypothesis.new) - 1
     onset = log_volume(curvature[-1:, -1:], width[-1:])
     return log_volume(curvature[chosen][:, chosen], width[chosen], slope[chosen]) + max(further, 0) * onset
 

@@ -27,7 +27,7 @@ def isolate(
     window: ObserverWindow,
     believed: Tensor,
     faults: Sequence[Fault],
-    incipient: bool = True,
+    growth_times: tuple[float, float] | None = None,
     deepest: int = DEEPEST,
     healthy: Tensor | None = None,
     earlier: Sequence[HypothesisFit] = (),
@@ -37,14 +37,16 @@ def isolate(
     """Fits of all single changes, of the best ones combined with a further fault, and of no change, likeliest first.
 
     All faults of a hypothesis share one onset, and a window holds one change. believed (P,): parameters before the
-    change. healthy (P,): the same without faults; if given, recovery of the faults in `believed` is a hypothesis too.
+    change. growth_times: shortest and longest time in which a growing fault passes through its range, s; None if all
+    are sudden. healthy (P,): the same without faults; if given, recovery of the faults in `believed` is a hypothesis.
     earlier: previous fits of the same change, used as further initial guesses. flows: whether random flows are learnt
     from the window too; the misfits of two calls are then not those of the same noise. unlisted: faults that are not on
     the list; together they are one explanation.
     """
-    manners = (False, True) if incipient else (False,)
+    manners = (False, True) if growth_times else (False,)
     outside = [f.size for f in unlisted]
-    prior = Prior(observer.space.names, len(faults) * len(manners), outside, len(outside) * len(manners))
+    counts = len(faults) * len(manners), len(outside) * len(manners)
+    prior = Prior(observer.space.names, counts[0], growth_times, outside, counts[1])
     plain = [Hypothesis((f.size,), late) for late in manners for f in (*faults, *unlisted) if not f.shape]
     oscillating = [Hypothesis(f.columns, shape=f.shape) for f in faults if f.shape]
     base = observer.white_innovations(window, believed, no_change(believed))

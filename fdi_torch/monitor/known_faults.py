@@ -36,7 +36,7 @@ def size_change(
     if not known:
         return None
     window = state.window(start)
-    fits = isolate(observer, window, state.believed, known, incipient=False, deepest=len(known), healthy=state.healthy)
+    fits = isolate(observer, window, state.believed, known, deepest=len(known), healthy=state.healthy)
     best = next(f for f in fits if f.hypothesis.columns)
     near_nominal = (best.value - state.healthy).abs() <= 3.0 * best.std
     changed = (best.value - state.believed).abs() > 3.0 * best.std
@@ -47,7 +47,7 @@ def size_change(
         return None
     new = [f for f in faults if f.size not in off]
     if new:
-        rival = isolate(observer, window, state.believed, new, incipient=False, deepest=1)[0]
+        rival = isolate(observer, window, state.believed, new, deepest=1)[0]
         if (best.misfit - rival.misfit) / rival.misfit_ratio > STRONG_EVIDENCE:
             return None
     return best

@@ -8,6 +8,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
 
 LOOKBACK, CONFIRM, LONGEST = 300.0, 60.0, 1000.0  # in units of the plant's time scale
+GROWING_WINDOWS = 8.0  # longest windows over which one straight line describes a fault that grows
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,14 @@ class MonitorSettings:
                 "expected lookback > 0, confirm >= 0, revise > 1 and longest >= lookback, "
                 f"got {self.lookback:g} s, {self.confirm:g} s, {self.revise:g}, {self.longest:g} s; change them"
             )
+
+    @property
+    def growth_times(self) -> tuple[float, float] | None:
+        """Shortest and longest time in which a growing fault passes through its range, s; None if all are sudden.
+
+        Faster growth looks sudden, and a straight line does not describe slower growth.
+        """
+        return (self.lookback, GROWING_WINDOWS * self.longest) if self.incipient else None
 
 
 def usual_settings(plant: PlantDescription) -> MonitorSettings:
