@@ -143,7 +143,9 @@ def scored_oracle(case: Case, posteriors: Sequence[Mapping[str, float]], known: 
 
 
 def scored(case: Case, events: Sequence[Event]) -> dict[str, float]:
-    """Counts of events after the onset. "Nothing beside": the observer uses one fault at most."""
+    """Counts of events after the onset. "Nothing beside": the observer uses one fault at most. Means of the run: the
+    events of one run are not independent, and a few runs have most of them.
+    """
     count: dict[str, float] = defaultdict(float)
     count["runs"], count["early"] = 1, sum(e.kind == "alarm" and e.time < case.onset for e in events)
     count["detected"] = any(e.kind == "alarm" and e.time >= case.onset for e in events)
@@ -165,6 +167,8 @@ def scored(case: Case, events: Sequence[Event]) -> dict[str, float]:
             count["sizes"] += 1
             count["sizes within three standard errors"] += abs(size.size - case.size_at(e.time)) <= 3.0 * size.std
     count["runs with nothing beside"] = count["events"] == count["nothing beside"]
+    for name in ("top", "top by its own probability"):
+        count[f"{name}, mean of the run"] = count[name] / max(count["events"], 1.0)
     return count
 
 
