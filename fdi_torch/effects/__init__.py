@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import replace
-from difflib import get_close_matches
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from fdi_torch.names import shortened, unknown
+from fdi_torch.names import nearest, shortened, unknown
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.description import PlantDescription, with_tolerances
 from fdi_torch.plant.effect import Effect, Placement, fits, place_kind, place_kinds_of
@@ -45,11 +44,11 @@ EFFECTS: tuple[Effect, ...] = tuple(
 
 
 def effect(name: str) -> Effect:
-    """The effect of that name. Raises ValueError, with the nearest known name, for an unknown one."""
+    """The effect of that name. Raises ValueError, with similar names, for an unknown one."""
     by_name = {e.name: e for e in EFFECTS}
     if name not in by_name:
-        near = get_close_matches(name, by_name, n=1, cutoff=0.0)[0]
-        raise ValueError(f"expected an effect of the library, got '{name}'; the nearest is '{near}'")
+        near = nearest(name, by_name) or "; fdi effects lists them"
+        raise ValueError(f"expected an effect of the library, got '{shortened(name)}'{near}")
     return by_name[name]
 
 
