@@ -63,6 +63,18 @@ def test_an_input_stands_no_longer_than_was_said(plant: PlantDescription, tmp_pa
     assert torch.isnan(short.inputs[:, 0]).tolist() == [False, False, True, False, False, True]
 
 
+def test_an_input_is_not_held_over_rows_that_are_missing(plant: PlantDescription, tmp_path: Path) -> None:
+    """Nobody knows when the command changed between 2 s and 9 s; the recording is cut there."""
+    text = PLAIN.replace("3,30,50,503", "9,30,50,503").replace("4,30,80", "10,30,80").replace("5,30,80", "11,30,80")
+    whole = read(plant, tmp_path, text)
+    assert len(whole.known_segments()) == 1
+    (advice,) = (f.text for f in check_recording(whole, plant).findings if f.kind == "gap")
+    assert "in it Q changes, nobody knows when: columns: {Q: {held: 3 s}} cuts the recording there" in advice
+    cut = read(plant, tmp_path, text, columns={"Q": {"held": "3 s"}})
+    assert [part.time.tolist() for part in cut.known_segments()] == [[0.0, 1.0], [9.0, 10.0, 11.0]]
+    assert len(read(plant, tmp_path, text, columns={"Q": {"held": "7 s"}}).known_segments()) == 1
+
+
 def test_a_bad_value_ends_the_one_before(plant: PlantDescription, tmp_path: Path) -> None:
     recording = read(plant, tmp_path, MIXED.replace("1,,,501", "1,I/O Timeout,,501"), columns=HELD)
     assert torch.isnan(recording.inputs[:, 0]).tolist() == [False, True, True, False, False, False]

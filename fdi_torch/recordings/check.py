@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fdi_torch.names import counted
+from fdi_torch.names import counted, listed
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
@@ -70,6 +70,7 @@ def check_recording(recording: Recording, plant: PlantDescription) -> RecordingC
         findings=(
             *(ChannelFinding("read", "t", note) for note in recording.notes),
             *_clock_findings(time, steps, interval),
+            *_gaps(recording, time, steps, interval),
             *_missing_inputs(recording),
             *_constant_inputs(recording),
             *undersampled_inputs(recording, plant),
@@ -111,19 +112,32 @@ def _clock_findings(time: Tensor, steps: Tensor, interval: float) -> Iterator[Ch
             "in which zone, as in columns: {t: {zone: Europe/Berlin}}"
         )
         yield ChannelFinding("clock", "t", text, {"after": float(time[jump[0]])})
-    gaps = (steps > GAP_STEPS * interval).nonzero().flatten()
-    if len(gaps):
-        longest = int(gaps[steps[gaps].argmax()])
-        text = (
-            f"{counted(len(gaps), 'gap')} longer than {GAP_STEPS:g} sampling intervals ({interval:g} s), the longest "
-            f"of {float(steps[longest]):g} s after {float(time[longest]):g} s"
-        )
-        yield ChannelFinding("gap", "t", text, {"count": len(gaps), "longest": float(steps[longest])})
     usual = steps[steps <= GAP_STEPS * interval]
     jitter = float((usual - interval).abs().max()) if len(usual) else 0.0
     if jitter > JITTER_SHARE * interval:
         text = f"the sampling interval of {interval:g} s varies by up to {jitter:.3g} s"
         yield ChannelFinding("clock", "t", text, {"interval": interval, "jitter": jitter})
+
+
+def _gaps(recording: Recording, time: Tensor, steps: Tensor, interval: float) -> Iterator[ChannelFinding]:
+    """Long gaps between samples, and the held inputs that change in them."""
+    gaps = (steps > GAP_STEPS * interval).nonzero().flatten()
+    if not len(gaps):
+        return
+    longest = int(gaps[steps[gaps].argmax()])
+    text = (
+        f"{counted(len(gaps), 'gap')} longer than {GAP_STEPS:g} sampling intervals ({interval:g} s), the longest "
+        f"of {float(steps[longest]):g} s after {float(time[longest]):g} s"
+    )
+    before, after = (recording.inputs[torch.searchsorted(recording.time, time[gaps + k])] for k in (0, 1))
+    moved = ((before != after) & torch.isfinite(before) & torch.isfinite(after)).any(dim=0).tolist()
+    if recording.hold == "zero_order" and any(moved):
+        names = [name for name, moves in zip(recording.input_names, moved, strict=True) if moves]
+        fix = ", ".join(f"{name}: {{held: {GAP_STEPS * interval:g} s}}" for name in names)
+        where = "in it" if len(gaps) == 1 else "in one of them"
+        text += f"; {where} {listed(names)} {'changes' if len(names) == 1 else 'change'}, nobody knows when: "
+        text += f"columns: {{{fix}}} cuts the recording there"
+    yield ChannelFinding("gap", "t", text, {"count": len(gaps), "longest": float(steps[longest])})
 
 
 def _constant_inputs(recording: Recording) -> Iterator[ChannelFinding]:
