@@ -7,14 +7,14 @@ import sys
 from collections.abc import Sequence
 
 from fdi_torch.parameters import ParameterName
-from fdi_torch.quantities import display_unit, significant
+from fdi_torch.quantities import display_unit, displayed_words, significant
 
 RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def effect_words(effect: str, place: str) -> str:
-    """'pump lag at Q1', from the effect's name in files, pump_lag."""
-    return f"{effect.replace('_', ' ')} at {place}"
+    """'pump lag at Q1', from the effect's name in files, pump_lag; of a transfer, 'transfer lag at recycle'."""
+    return f"{displayed_words(f'{place}.{effect}', effect.replace('_', ' '))} at {place}"
 
 
 def parameter_words(name: str) -> str:

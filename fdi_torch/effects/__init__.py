@@ -75,11 +75,16 @@ def build_network(plant: PlantDescription, placements: Iterable[Placement] = ())
 
 
 def units_for_display(plant: PlantDescription) -> dict[str, str]:
-    """The plant's units, and by full name those of parameters that are readings of a sensor with a unit of its own.
+    """The plant's units, and by full name those of parameters that are readings of a sensor with a unit of its own; and
+    the words for the effects of pumps at other components, such as 'transfer gain' for 'recycle.pump_gain'.
 
     Readings in % have no dimension, as factors have none: a parameter is a reading if its unit follows the sensor's.
     """
     units = dict(plant.units)
+    for component in (c for c in plant.flow_components() if c.place_kind != "pump"):
+        of_pumps = (name for name in component.accepts if name.startswith("pump_"))
+        words = {name: name.replace("pump", component.place_kind, 1).replace("_", " ") for name in of_pumps}
+        units |= {f"{component.name}.{name}": text for name, text in words.items()}
     for sensor in plant.sensors:
         if (own := plant.units.get(sensor.column)) is None:
             continue
