@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fdi_torch import Plant, Pump, Sensor, Tank, Transfer
-from fdi_torch.amounts import estimate_words, parameter_words, rounded, sized_words, with_error
+from fdi_torch.amounts import estimate_words, faults_in_words, parameter_words, rounded, sized_words, with_error
 from fdi_torch.effects import units_for_display
 from fdi_torch.monitor.events import Event, Explanation, Size, headline
 from fdi_torch.quantities import displayed_in
@@ -24,6 +24,11 @@ def test_names_of_parameters_in_words() -> None:
     assert parameter_words("T1.leak.size") == "leak at T1"
     assert parameter_words("P13.laminar_flow.transition_head") == "laminar flow at P13"
     assert parameter_words("T1.area") == "area of T1" and parameter_words("gravity") == "gravity"
+
+
+def test_faults_of_one_kind_are_listed_together() -> None:
+    names = ["A.leak.size", "B.leak.size", "Q.pump_gain.factor", "A.sensor_bias.bias"]
+    assert faults_in_words(names) == ["leak at A and B", "pump gain at Q", "sensor bias at A"]
 
 
 def test_a_fault_of_a_transfer_is_not_called_one_of_a_pump() -> None:
