@@ -15,7 +15,12 @@ RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 def effect_words(effect: str, place: str) -> str:
     """'pump lag at Q1', from the effect's name in files, pump_lag; of a transfer, 'transfer lag at recycle'."""
-    return f"{displayed_words(f'{place}.{effect}', effect.replace('_', ' '))} at {place}"
+    return f"{kind_words(effect, place)} at {place}"
+
+
+def kind_words(effect: str, place: str) -> str:
+    """An effect without its place: 'pump lag'."""
+    return displayed_words(f"{place}.{effect}", effect.replace("_", " "))
 
 
 def faults_in_words(names: Sequence[str]) -> list[str]:
