@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fdi_torch.names import counted, listed
+from fdi_torch.names import counted
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
@@ -25,7 +25,7 @@ HOUR = 3600.0  # s
 GAP_STEPS = 3.0
 """A gap is a sampling interval longer than this many usual ones."""
 JITTER_SHARE = 0.05
-DOUBTS = ("clock", "constant", "range", "unit", "undersampled", "on change")
+DOUBTS = ("clock", "constant", "held", "range", "unit", "undersampled", "on change")
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def check_recording(recording: Recording, plant: PlantDescription) -> RecordingC
         findings=(
             *(ChannelFinding("read", "t", note) for note in recording.notes),
             *_clock_findings(time, steps, interval),
-            *_gaps(recording, time, steps, interval),
+            *_changes_in_gaps(recording),
             *_missing_inputs(recording),
             *_constant_inputs(recording),
             *undersampled_inputs(recording, plant),
@@ -105,13 +105,21 @@ def _summary(name: str, role: str, unit: str, values: Tensor, masked: int) -> Ch
 
 
 def _clock_findings(time: Tensor, steps: Tensor, interval: float) -> Iterator[ChannelFinding]:
-    jump = ((steps - HOUR).abs() <= GAP_STEPS * interval).nonzero().flatten()
+    jump = _jumps_by_an_hour(steps, interval).nonzero().flatten()
     if len(jump):
         text = (
             f"jumps by an hour after {float(time[jump[0]]):g} s: where this is local time and summer time begins, say "
             "in which zone, as in columns: {t: {zone: Europe/Berlin}}"
         )
         yield ChannelFinding("clock", "t", text, {"after": float(time[jump[0]])})
+    gaps = (steps > GAP_STEPS * interval).nonzero().flatten()
+    if len(gaps):
+        longest = int(gaps[steps[gaps].argmax()])
+        text = (
+            f"{counted(len(gaps), 'gap')} longer than {GAP_STEPS:g} sampling intervals ({interval:g} s), the longest "
+            f"of {float(steps[longest]):g} s after {float(time[longest]):g} s"
+        )
+        yield ChannelFinding("gap", "t", text, {"count": len(gaps), "longest": float(steps[longest])})
     usual = steps[steps <= GAP_STEPS * interval]
     jitter = float((usual - interval).abs().max()) if len(usual) else 0.0
     if jitter > JITTER_SHARE * interval:
@@ -119,25 +127,27 @@ def _clock_findings(time: Tensor, steps: Tensor, interval: float) -> Iterator[Ch
         yield ChannelFinding("clock", "t", text, {"interval": interval, "jitter": jitter})
 
 
-def _gaps(recording: Recording, time: Tensor, steps: Tensor, interval: float) -> Iterator[ChannelFinding]:
-    """Long gaps between samples, and the held inputs that change in them."""
-    gaps = (steps > GAP_STEPS * interval).nonzero().flatten()
-    if not len(gaps):
+def _jumps_by_an_hour(steps: Tensor, interval: float) -> Tensor:
+    """Which steps of the time, s, may be due to the beginning of summer time."""
+    return (steps - HOUR).abs() <= GAP_STEPS * interval
+
+
+def _changes_in_gaps(recording: Recording) -> Iterator[ChannelFinding]:
+    """Held inputs that change while rows are missing."""
+    steps, interval = torch.diff(recording.time), recording.interval
+    gap = (steps > GAP_STEPS * interval) & ~_jumps_by_an_hour(steps, interval)
+    if recording.hold != "zero_order":
         return
-    longest = int(gaps[steps[gaps].argmax()])
-    text = (
-        f"{counted(len(gaps), 'gap')} longer than {GAP_STEPS:g} sampling intervals ({interval:g} s), the longest "
-        f"of {float(steps[longest]):g} s after {float(time[longest]):g} s"
-    )
-    before, after = (recording.inputs[torch.searchsorted(recording.time, time[gaps + k])] for k in (0, 1))
-    moved = ((before != after) & torch.isfinite(before) & torch.isfinite(after)).any(dim=0).tolist()
-    if recording.hold == "zero_order" and any(moved):
-        names = [name for name, moves in zip(recording.input_names, moved, strict=True) if moves]
-        fix = ", ".join(f"{name}: {{held: {GAP_STEPS * interval:g} s}}" for name in names)
-        where = "in it" if len(gaps) == 1 else "in one of them"
-        text += f"; {where} {listed(names)} {'changes' if len(names) == 1 else 'change'}, nobody knows when: "
-        text += f"columns: {{{fix}}} cuts the recording there"
-    yield ChannelFinding("gap", "t", text, {"count": len(gaps), "longest": float(steps[longest])})
+    for name, values in zip(recording.input_names, recording.inputs.T, strict=True):
+        change = torch.diff(values)
+        moved = (gap & torch.isfinite(change) & (change != 0.0)).nonzero().flatten()
+        if len(moved):
+            start = float(recording.time[moved[0]])
+            text = (
+                f"changes in the gap after {start:g} s, nobody knows when; it counts as unchanged until the gap ends, "
+                f"unless the recording is cut there: columns: {{{name}: {{held: {GAP_STEPS * interval:g} s}}}}"
+            )
+            yield ChannelFinding("held", name, text, {"after": start, "count": len(moved)})
 
 
 def _constant_inputs(recording: Recording) -> Iterator[ChannelFinding]:
