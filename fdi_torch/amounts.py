@@ -6,15 +6,30 @@ import math
 import sys
 from collections.abc import Sequence
 
+from fdi_torch.names import listed
 from fdi_torch.parameters import ParameterName
-from fdi_torch.quantities import display_unit, significant
+from fdi_torch.quantities import display_unit, displayed_words, significant
 
 RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def effect_words(effect: str, place: str) -> str:
-    """'pump lag at Q1', from the effect's name in files, pump_lag."""
-    return f"{effect.replace('_', ' ')} at {place}"
+    """'pump lag at Q1', from the effect's name in files, pump_lag; of a transfer, 'transfer lag at recycle'."""
+    return f"{kind_words(effect, place)} at {place}"
+
+
+def kind_words(effect: str, place: str) -> str:
+    """An effect without its place: 'pump lag'."""
+    return displayed_words(f"{place}.{effect}", effect.replace("_", " "))
+
+
+def faults_in_words(names: Sequence[str]) -> list[str]:
+    """Faults by the names of their parameters, each effect with all of its places: 'leak at T1 and T2'."""
+    places: dict[str, list[str]] = {}
+    for name in names:
+        at = ParameterName.parse(name)
+        places.setdefault(parameter_words(name).removesuffix(at.place), []).append(at.place)
+    return [f"{words}{listed(at)}" for words, at in places.items()]
 
 
 def parameter_words(name: str) -> str:

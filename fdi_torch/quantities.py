@@ -87,13 +87,20 @@ def quantity_text(value: float, si_unit: str, digits: int = 4, name: str = "") -
     return f"{significant(scale * value, digits)} {unit}".rstrip()
 
 
+def displayed_words(name: str, otherwise: str) -> str:
+    """The words for an effect at a place, 'back.pump_gain', in this context; `otherwise` if it has none of its own."""
+    return _DISPLAYED.get().get(name, otherwise)
+
+
 def displayed_units() -> Mapping[str, str]:
     """The units for display of this context."""
     return _DISPLAYED.get()
 
 
 def display_in(units: Mapping[str, str]) -> None:
-    """Set the units for display in this context: SI unit, or name of a channel or parameter -> unit."""
+    """Set the units for display in this context: SI unit, or name of a channel or parameter -> unit; and the words for
+    effects: place and name of an effect -> words.
+    """
     _DISPLAYED.set(dict(units))
 
 

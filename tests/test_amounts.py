@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from fdi_torch.amounts import estimate_words, parameter_words, rounded, sized_words, with_error
+from fdi_torch import Plant, Pump, Sensor, Tank, Transfer
+from fdi_torch.amounts import estimate_words, faults_in_words, parameter_words, rounded, sized_words, with_error
+from fdi_torch.effects import units_for_display
 from fdi_torch.monitor.events import Event, Explanation, Size, headline
 from fdi_torch.quantities import displayed_in
 from fdi_torch.tables import Table
@@ -22,6 +24,21 @@ def test_names_of_parameters_in_words() -> None:
     assert parameter_words("T1.leak.size") == "leak at T1"
     assert parameter_words("P13.laminar_flow.transition_head") == "laminar flow at P13"
     assert parameter_words("T1.area") == "area of T1" and parameter_words("gravity") == "gravity"
+
+
+def test_faults_of_one_kind_are_listed_together() -> None:
+    names = ["A.leak.size", "B.leak.size", "Q.pump_gain.factor", "A.sensor_bias.bias"]
+    assert faults_in_words(names) == ["leak at A and B", "pump gain at Q", "sensor bias at A"]
+
+
+def test_a_fault_of_a_transfer_is_not_called_one_of_a_pump() -> None:
+    tanks, pumps = [Tank("A", area="200 cm^2", height="60 cm")], [Pump("Q", "A", max_flow="6 l/min")]
+    transfers = [Transfer("back", "A", "outside", max_flow="2 l/min")]
+    plant = Plant(tanks, pumps=pumps, transfers=transfers, sensors=[Sensor("hA", "A")])
+    with displayed_in(units_for_display(plant)):
+        assert parameter_words("back.pump_gain.factor") == "transfer gain at back"
+        assert parameter_words("back.actuator_stuck.onset") == "actuator stuck at back"
+        assert parameter_words("Q.pump_gain.factor") == "pump gain at Q"
 
 
 def test_a_monitor_says_faults_as_pages_do() -> None:

@@ -308,6 +308,21 @@ def test_quiet_shows_no_progress_but_complaints(capsys: pytest.CaptureFixture[st
     assert capsys.readouterr().err == "stuck\n"
 
 
+def test_a_long_line_is_folded_on_a_terminal_only(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As the lines of a monitor: further lines begin below the text, and no word is cut."""
+    line = "   400.0 s  notice  watches for leak at A and B, plugging at link and drain, pump gain at Q"
+    Screen().say(line, indent=20)
+    assert capsys.readouterr().out == f"{line}\n"
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "60")
+    Screen().say(line, indent=20)
+    first, second = capsys.readouterr().out.splitlines()
+    assert first == "   400.0 s  notice  watches for leak at A and B, plugging at"
+    assert second == f"{'':20}link and drain, pump gain at Q"
+
+
 def test_json_has_null_where_a_number_is_not_finite(capsys: pytest.CaptureFixture[str]) -> None:
     Screen(json=True).result({"a": float("nan"), "b": float("inf")})
     assert json.loads(capsys.readouterr().out) == {"a": None, "b": None}

@@ -197,7 +197,7 @@ def test_constants_to_calibrate_by_pattern() -> None:
     [
         ({"T1.leak.size": "3 cm"}, "simulate.faults.T1.leak.size: expected a quantity in 1"),
         ({"T1.leak.size": 1.5}, r"simulate.faults.T1.leak.size: expected a size from 0 to 1, got 1.5"),
-        ({"T9.area": "3 cm^2"}, "simulate.faults: expected a parameter of the plant .* the nearest is 'T3.area'"),
+        ({"T9.area": "3 cm^2"}, "simulate.faults: expected a parameter of the plant .* the nearest are 'T1.area', 'T2"),
     ],
 )
 def test_impossible_faults_are_refused(faults: dict[str, Any], sentence: str) -> None:

@@ -189,6 +189,35 @@ def test_a_killed_run_of_a_source_with_dates_is_resumed_with_its_time_origin(
     assert [time for time, *_ in told(logged_events_as_told(log))] == [time for time, *_ in told(whole)]
 
 
+def test_samples_of_a_run_that_is_killed_while_it_learns_are_kept(
+    tmp_path: Path,
+    running: Broker,
+    when_subscribed: WhenSubscribed,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path = live_config(tmp_path, running.port, session="watch")
+    words = ["--config", path, "--idle", "1.5"]
+    thread = when_subscribed(running.port, lambda rig: rig.send(MESSAGES[:100]))
+    with monkeypatch.context() as patch:
+
+        def killed(self: object, whole: object) -> None:
+            raise KeyboardInterrupt
+
+        patch.setattr("fdi_torch.jobs.logged_monitor.LoggedMonitor.learn", killed)
+        assert main(["monitor", *words, "--json", "--quiet"]) == INTERRUPTED
+    thread.join()
+    [kept] = (tmp_path / "logs").glob("*.learning")
+    kept.write_bytes(kept.read_bytes() + b"[null,[[1.0,")  # the kill may come while a line is written
+    rig = Rig(running.port)
+    rig.send(MESSAGES[100:])
+    resumed = monitored([*words, "--resume"], capsys)
+    rig.close()
+    whole = monitored(["--config", config(tmp_path, recording={"file": str(written(tmp_path / "all.csv"))})], capsys)
+    assert told(resumed) == told(whole)
+    assert not kept.exists()
+
+
 def logged_events_as_told(log: Path) -> list[dict[str, object]]:
     return [json.loads(str(event["details"])) for event in logged_events(log)]
 

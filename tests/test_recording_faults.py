@@ -51,6 +51,18 @@ def chain(count: int) -> PlantDescription:
     )
 
 
+@pytest.mark.parametrize(("pipe", "duration", "seed"), [("PT0", 600.0, 3), ("PT1", 1200.0, 5)])
+def test_a_thorough_examination_finds_a_swap_beside_a_plugged_pipe(pipe: str, duration: float, seed: int) -> None:
+    """Neither the swap nor an effect alone explains the recording; both together do."""
+    plant = chain(2)
+    sound = recorded(plant, random_steps(plant, duration, seed=seed), {f"{pipe}.plugging.size": 0.3}, seed)
+    swapped = replace(sound, outputs=sound.outputs[:, [1, 0]])
+    assert examined(plant, sound, thorough=True).fault is None
+    assert examined(plant, swapped).fault is None
+    found = examined(plant, swapped, thorough=True).fault
+    assert found and "h0 and h1 seem to be swapped" in found.text
+
+
 def fits_with_all_sensors_stuck(count: int, monkeypatch: pytest.MonkeyPatch) -> int:
     """Fits that the examination of a chain takes where no sensor moves."""
     plant, fits = chain(count), 0

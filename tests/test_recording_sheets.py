@@ -14,7 +14,7 @@ from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.check import check_recording
+from fdi_torch.recordings.check import check_recording, data_warnings
 from fdi_torch.recordings.csv_growing import GrowingCsv
 from fdi_torch.recordings.source import ChannelSource
 
@@ -61,6 +61,22 @@ def test_a_held_input_is_what_a_file_with_every_cell_says(plant: PlantDescriptio
 def test_an_input_stands_no_longer_than_was_said(plant: PlantDescription, tmp_path: Path) -> None:
     short = read(plant, tmp_path, MIXED, columns=HELD | {"Q": {"held": "1 s"}})
     assert torch.isnan(short.inputs[:, 0]).tolist() == [False, False, True, False, False, True]
+
+
+def test_an_input_is_not_held_over_rows_that_are_missing(plant: PlantDescription, tmp_path: Path) -> None:
+    """Nobody knows when the command changed between 2 s and 9 s; the recording is cut there."""
+    text = PLAIN.replace("3,30,50,503", "9,30,50,503").replace("4,30,80", "10,30,80").replace("5,30,80", "11,30,80")
+    whole = read(plant, tmp_path, text)
+    assert len(whole.known_segments()) == 1
+    (warning,) = data_warnings(whole, plant)
+    assert warning.startswith("Q: changes in the gap after 2 s, nobody knows when")
+    assert warning.endswith("unless the recording is cut there: columns: {Q: {held: 3 s}}")
+    (tmp_path / "flow.csv").write_text("t_s,Q_l_min\n0,60\n5,30\n11,30\n")
+    levels = "\n".join(",".join(cell for k, cell in enumerate(row.split(",")) if k != 1) for row in text.split())
+    assert not data_warnings(read(plant, tmp_path, levels, also=["flow.csv"]), plant)  # it says when
+    cut = read(plant, tmp_path, text, columns={"Q": {"held": "3 s"}})
+    assert [part.time.tolist() for part in cut.known_segments()] == [[0.0, 1.0], [9.0, 10.0, 11.0]]
+    assert len(read(plant, tmp_path, text, columns={"Q": {"held": "7 s"}}).known_segments()) == 1
 
 
 def test_a_bad_value_ends_the_one_before(plant: PlantDescription, tmp_path: Path) -> None:

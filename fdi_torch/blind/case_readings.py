@@ -1,8 +1,8 @@
-"""Simulation of cases and the readings of their sensors, with the laws of deviations at these.
+"""Simulation of cases and of their sensors' readings, with the equations of deviations that sit at sensors.
 
-A law maps a signal sampled at `time` (T,) s, one column per lane. A sensor law acts on the true level (T, n) m, before
-noise; a readout law on the noisy reading. Between samples a level is taken to run straight: inputs switch at samples
-only.
+Such an equation, a law, maps a signal sampled at the times `time` (T,), s; each lane is a column. A sensor law acts on
+the true level (T, n), m, before noise; a readout law acts on the noisy reading. Inputs switch at samples only, so that
+a level is interpolated linearly between samples.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 def _show_event(event: Event, screen: Screen, publish: Publish) -> None:
     moment, onset = (clock_text(t) if t is not None else "" for t in (event.time, event.onset))
     if event.announced:
-        screen.say(event.line)
+        screen.say(event.line, indent=len(event.head))
     data = {"format": FORMAT, **event.to_dict()}
     data |= {"clock": moment, "onset_clock": onset or None} if moment else {}
     screen.line(orjson.dumps(data).decode())

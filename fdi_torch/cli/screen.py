@@ -10,6 +10,7 @@ import io
 import math
 import os
 import sys
+import textwrap
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -70,10 +71,16 @@ class Screen:
         self._out = _Results(width=None if sys.stdout.isatty() else ENDLESS, highlight=False, soft_wrap=True)
         self._err = _Output(stderr=True, highlight=False, soft_wrap=True)
 
-    def say(self, text: str = "") -> None:
-        """Print a line of the result; not with JSON."""
-        if not self.json:
-            self._out.print(_shown(text))
+    def say(self, text: str = "", indent: int = 0) -> None:
+        """Print a line of the result; not with JSON. indent: of the further lines into which a terminal folds it, if it
+        has room for them."""
+        if self.json:
+            return
+        folded = [text]
+        if indent and self._out.is_terminal and self._out.width > 2 * indent:
+            folded = textwrap.wrap(text, self._out.width, subsequent_indent=" " * indent, break_on_hyphens=False)
+        for line in folded:
+            self._out.print(_shown(line))
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> None:
         """Print a table whose first `left` columns are left-aligned; not with JSON.

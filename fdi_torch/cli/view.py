@@ -24,7 +24,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
     with bound(Path(arguments.folder), arguments.port) as (address, serve):
         with suppress(KeyboardInterrupt, Terminated):  # the usual ends
-            screen.say(f"logs of {arguments.folder}: {address} (only users of this machine can read it)")
+            screen.say(f"folder {arguments.folder}: {address} (only users of this machine can read it)")
             screen.note("Ctrl-C ends it")
             screen.result({"format": "fdi_torch.view/1", "address": address})
             if arguments.open:

@@ -151,8 +151,8 @@ def _shares(plant: PlantDescription, channel: str, shares: Sequence[float]) -> l
 HEIGHT = 0.6  # m, of a tank that is still to be measured
 AT_RIM = {"1": 1.0, "V": 10.0, "A": 0.02, "Pa": 9810.0 * HEIGHT}
 """What a sensor reads at the rim, by the unit of its reading: 100 %, 10 V, 20 mA, water."""
-READING = re.compile(r"[LHPX]|.*(level|füllstand|niveau|pegel|pressure|druck)", re.IGNORECASE)
-"""Tags of levels and pressures (ISA-5.1), letters of levels by custom, and words."""
+READING = re.compile(r"[LHX]|P[A-Z]|.*(level|füllstand|niveau|pegel|pressure|druck)", re.IGNORECASE)
+"""Tags of levels and pressures (ISA-5.1: PT, PI; P-101 is a pump), letters of levels by custom, and words."""
 COMMAND = re.compile(r".*(pump|valve|ventil|pwm|duty|cmd|command|speed|drehzahl)", re.IGNORECASE)
 PUMPS = "pumps:    # ! the tank that each fills, and its greatest flow; a flow out of a tank belongs under transfers"
 
@@ -256,7 +256,8 @@ def _pump(column: _Column, tank: str) -> str:
     if column.kind == "1":
         fields.append("gain: 6 l/min")
     elif column.kind != "m^3/s":
-        fields.append(f"gain: {significant(6.0 * per_unit / (column.highest or 1.0), 3)} l/min/{column.unit}")
+        largest = 5.9 * per_unit / (column.highest or 1.0)  # rounded, the highest command stays below the greatest flow
+        fields.append(f"gain: {significant(largest, 3)} l/min/{column.unit}")
     return _line(column, fields, "command")
 
 

@@ -75,7 +75,9 @@ class ColumnConfig(Strict):
     constant: Amount | None = Field(None, description="the value of an input that was not recorded")
     recorded: bool = Field(True, description="false for an output that is missing in the file")
     held: HeldFor = Field(
-        0.0, description="time for which an input is held over empty cells: 15 s, or always (until the next value)"
+        0.0,
+        description="time for which an input is held over empty cells and missing rows: 15 s, or always (until the "
+        "next value)",
     )
     words: Annotated[dict[str, Amount | None], BeforeValidator(_words)] = Field(
         default_factory=dict, description="meaning of words: {OPEN: 1, CLOSED: 0, -9999: null}; null: a bad reading"

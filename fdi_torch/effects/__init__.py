@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from dataclasses import replace
-from difflib import get_close_matches
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from fdi_torch.names import shortened, unknown
+from fdi_torch.names import nearest, shortened, unknown
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.description import PlantDescription, with_tolerances
 from fdi_torch.plant.effect import Effect, Placement, fits, place_kind, place_kinds_of
@@ -45,11 +44,11 @@ EFFECTS: tuple[Effect, ...] = tuple(
 
 
 def effect(name: str) -> Effect:
-    """The effect of that name. Raises ValueError, with the nearest known name, for an unknown one."""
+    """The effect of that name. Raises ValueError, with similar names, for an unknown one."""
     by_name = {e.name: e for e in EFFECTS}
     if name not in by_name:
-        near = get_close_matches(name, by_name, n=1, cutoff=0.0)[0]
-        raise ValueError(f"expected an effect of the library, got '{name}'; the nearest is '{near}'")
+        near = nearest(name, by_name) or "; fdi effects lists them"
+        raise ValueError(f"expected an effect of the library, got '{shortened(name)}'{near}")
     return by_name[name]
 
 
@@ -76,11 +75,16 @@ def build_network(plant: PlantDescription, placements: Iterable[Placement] = ())
 
 
 def units_for_display(plant: PlantDescription) -> dict[str, str]:
-    """The plant's units, and by full name those of parameters that are readings of a sensor with a unit of its own.
+    """The plant's units, and by full name those of parameters that are readings of a sensor with a unit of its own; and
+    the words for the effects of pumps at other components, such as 'transfer gain' for 'recycle.pump_gain'.
 
     Readings in % have no dimension, as factors have none: a parameter is a reading if its unit follows the sensor's.
     """
     units = dict(plant.units)
+    for component in (c for c in plant.flow_components() if c.place_kind != "pump"):
+        of_pumps = (name for name in component.accepts if name.startswith("pump_"))
+        words = {name: name.replace("pump", component.place_kind, 1).replace("_", " ") for name in of_pumps}
+        units |= {f"{component.name}.{name}": text for name, text in words.items()}
     for sensor in plant.sensors:
         if (own := plant.units.get(sensor.column)) is None:
             continue

@@ -1,4 +1,4 @@
-"""A pump or valve with a limited slew rate."""
+"""A pump, transfer or valve with a limited slew rate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pump or valve that is stuck."""
+"""A pump, transfer or valve that is stuck."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pump whose delivery is a nonlinear function of its command."""
+"""A pump or transfer whose delivery is a nonlinear function of its command."""
 
 from __future__ import annotations
 

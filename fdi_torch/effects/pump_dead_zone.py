@@ -1,4 +1,4 @@
-"""A pump that does not start at small commands."""
+"""A pump or transfer that does not start at small commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pump with dead time."""
+"""A pump or transfer with dead time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pump that delivers more or less than its nominal flow."""
+"""A pump or transfer that delivers more or less than its nominal flow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pump that follows its command with a first-order lag."""
+"""A pump or transfer that follows its command with a first-order lag."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pump whose delivery is shifted by a constant flow."""
+"""A pump or transfer whose delivery is shifted by a constant flow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pump whose delivery oscillates."""
+"""A pump or transfer whose delivery oscillates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A pump whose greatest flow is below its nominal limit."""
+"""A pump or transfer whose greatest flow is below its nominal limit."""
 
 from __future__ import annotations
 

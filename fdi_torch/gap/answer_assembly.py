@@ -139,7 +139,9 @@ def _identifiability(result: DiagnosisResult) -> dict[str, Any]:
 
 
 def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
-    """Causes with parameters and standard errors; those that the readings show have none."""
+    """Causes with parameters and standard errors. A cause that is read off the readings, such as their rounding, has no
+    standard error.
+    """
     fitter, fit = result.fitter, result.effects_fit
     plant, stds = fitter.data.plant, standard_errors(fitter, fit)
     causes = []

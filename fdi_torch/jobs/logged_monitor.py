@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fdi_torch.amounts import parameter_words
+from fdi_torch.amounts import faults_in_words
 from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.config.problems import naming
@@ -109,7 +109,8 @@ class LoggedMonitor:
         self.callbacks.ready(prepared)
         self._now = config.fault_free[1]
         self._report(Event(self._now, "watching", prepared.false_alarm_text))
-        self.notice(self._watched_faults_text(prepared, whole))
+        for text in self._watched_faults_texts(prepared, whole):
+            self.notice(text)
         part = fault_free_part(whole, *config.fault_free)
         for warning in (*data_warnings(part, self.plant), *prepared.warnings):
             self.notice(warning)
@@ -170,16 +171,16 @@ class LoggedMonitor:
         """Time from the first sample to the last, s."""
         return 0.0 if self._first_time is None else self._now - self._first_time
 
-    def _watched_faults_text(self, prepared: PreparedMonitor, whole: Recording) -> str:
+    def _watched_faults_texts(self, prepared: PreparedMonitor, whole: Recording) -> tuple[str, ...]:
         """The watched faults, and which of them the inputs of the fault-free part cannot distinguish."""
         names = [self.space.names[fault.size] for fault in prepared.monitor.faults]
-        text = f"watches for {', '.join(map(parameter_words, names))}"
+        text = f"watches for {', '.join(faults_in_words(names))}"
         part = fault_free_part(whole, *self.run.config.fault_free)
         try:
             report = diagnosability(self.plant, names, part, prepared.noise.reading_std, start="free")
         except ValueError as error:
-            return f"{text}; which of them can be isolated is unknown: {error}"
-        return "; ".join([text, *report.groups])
+            return text, f"which of them can be isolated is unknown: {error}"
+        return text, *report.groups
 
     def _start(self, samples: Samples) -> Any:
         if isinstance(self.monitor, WindowMonitor):

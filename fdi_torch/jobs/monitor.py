@@ -23,6 +23,7 @@ from fdi_torch.config.growing_recordings import Row, growing_rows
 from fdi_torch.config.live_source import LiveRows
 from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor_file import MonitorRun
+from fdi_torch.jobs.learning_items import LearningItems
 from fdi_torch.jobs.log_paths import RESUMES, expect_unfinished, free_path, partial_path
 from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.monitor_rows import (
@@ -69,8 +70,8 @@ def run_monitor(
     if not follow:
         callbacks.tell(0.0, "reading")
     whole = None if follow else read_recording(run.config.recording, run.plant, run.base, run.given)
-    earlier = logged_items(unfinished, run) if follow and unfinished is not None else []
-    origin = logged_origin(unfinished) if unfinished is not None else None
+    kept = LearningItems(path) if run.config.source is not None else None
+    earlier, origin = _earlier(run, unfinished, kept, resume) if follow else ([], None)
     messages = unfinished.messages([ALARM]) if unfinished is not None else ()
     reported = Counter(event_key(message.payload) for message in messages)
     zeros: list[float] = []
@@ -85,7 +86,7 @@ def run_monitor(
         monitor = LoggedMonitor(run, log, callbacks, reported)
         try:
             if whole is None:
-                _follow(monitor, callbacks, source, earlier, zeros)
+                _follow(monitor, callbacks, source, earlier, zeros, kept)
             else:
                 show_clock([whole.clock_zero])
                 if run.config.recording.every > 1:  # the inputs' mean until the next kept sample is known only then
@@ -103,6 +104,21 @@ def _log_to_write(run: MonitorRun, resume: bool) -> tuple[Path, LoggedRun | None
     return expect_unfinished(folder, run.name, run.text) if resume else (free_path(folder, run.name), None)
 
 
+def _earlier(
+    run: MonitorRun, unfinished: LoggedRun | None, kept: LearningItems | None, resume: bool
+) -> tuple[list[Row | str], float | None]:
+    """The items of a run to be resumed, and time 0 of its source: from its log, or kept while it learnt."""
+    items = logged_items(unfinished, run) if unfinished is not None else []
+    origin = logged_origin(unfinished) if unfinished is not None else None
+    if kept is not None and resume:
+        learning, zero = kept.read()
+        if len(learning) > len(items):
+            return learning, zero
+    if kept is not None:
+        kept.remove()
+    return items, origin
+
+
 def _source(
     run: MonitorRun, idle: float | None, origin: float | None, earlier_rows: Sequence[Row], zeros: list[float]
 ) -> Iterator[Row | str]:
@@ -118,12 +134,17 @@ def _follow(
     source: Iterator[Row | str],
     earlier: Sequence[Row | str],
     zeros: list[float],
+    kept: LearningItems | None,
 ) -> None:
-    """Process samples as they come, after waiting for the end of the fault-free part."""
+    """Process samples as they come, after waiting for the end of the fault-free part.
+
+    kept: where the items of a live source are until the log has them.
+    """
     run = monitor.run
     batches = LiveBatches(resumed_items(earlier, source) if rows_in(earlier) else source)
     callbacks.tell(None, "waiting for samples")
-    first = _until_fault_free_part_ends(run, callbacks, batches)
+    received = batches if kept is None else kept.keeping(batches, lambda: getattr(source, "origin", None))
+    first = _until_fault_free_part_ends(run, callbacks, received)
     zero = source.origin if isinstance(source, LiveRows) else next(iter(zeros), None)
     show_clock([zero])
     monitor.learn(fault_free_recording(rows_in(first), run))
@@ -135,6 +156,9 @@ def _follow(
         notices = delay_watch.received([row[0] for row in rows]) if rows else []
         if monitor.process_items([*notices, *batch]):
             delay_watch.clock_jumped()
+        if kept is not None and batch is first:
+            monitor.log.flush()
+            kept.remove()
         if rows:
             monitor.process_items(delay_watch.processed(rows[-1][0]))
             callbacks.tell(
@@ -143,7 +167,7 @@ def _follow(
 
 
 def _until_fault_free_part_ends(
-    run: MonitorRun, callbacks: MonitorCallbacks, batches: LiveBatches[Row | str]
+    run: MonitorRun, callbacks: MonitorCallbacks, batches: Iterator[list[Row | str]]
 ) -> list[Row | str]:
     """Rows and notices up to the end of the fault-free part, or of the file."""
     items: list[Row | str] = []

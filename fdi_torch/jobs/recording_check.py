@@ -18,7 +18,7 @@ def checked(config: RecordingConfig, plant: PlantDescription, base: Path) -> tup
     """A recording and its check: readings beyond the tanks, which make the rest meaningless, come first."""
     whole = read_recording(config, plant, base)
     check = check_recording(whole, plant)
-    examinations = [examined(plant, part) for part in whole.known_segments()]
+    examinations = [examined(plant, part, thorough=True) for part in whole.known_segments()]
     problems = [_slip(", ".join(e.fault.channels), e.fault.text) for e in examinations if e.fault]
     problems += [
         ChannelFinding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop})

@@ -152,11 +152,16 @@ class Event:
     believed: tuple[tuple[str, float], ...] = field(default=())
 
     @property
-    def line(self) -> str:
-        """Time, clock time if the recording has one, kind and text."""
+    def head(self) -> str:
+        """Time, clock time if the recording has one, and kind: the part of the line before the text."""
         moment = f"{clock}  " if (clock := clock_text(self.time)) else ""
+        return f"{self.time:10.1f} s  {moment}{self.kind:<11} "
+
+    @property
+    def line(self) -> str:
+        """Head, text and clock time of the onset if the recording has one."""
         onset = "" if self.onset is None or self.kind == "followed" else clock_text(self.onset)
-        return f"{self.time:10.1f} s  {moment}{self.kind:<11} {self.text}{f' (began {onset})' if onset else ''}"
+        return f"{self.head}{self.text}{f' (began {onset})' if onset else ''}"
 
     @property
     def best(self) -> Explanation | None:

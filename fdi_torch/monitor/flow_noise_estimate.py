@@ -100,10 +100,11 @@ def _likeliest(
 def _with_likeliest_time(
     solved: Callable[[StateNoise], Likelihood], start: StateNoise, interval: float, times: Sequence[float]
 ) -> Likelihood:
-    """The most likely noise over all correlation times: by a climb from the best of `times` (in sampling intervals) and
-    that of `start`, and the parabola through its last three points.
+    """The most likely noise over all correlation times.
 
-    solved: the most likely noise with the correlation time of a first guess.
+    The search climbs on a grid of correlation times, from the best of `times` (in sampling intervals) and that of
+    `start`, and ends at the maximum of a parabola through the last three points. solved: the most likely noise among
+    those with the correlation time of its argument.
     """
     first = _exponent(start.correlation_time / interval)
     found = {first: solved(start)}

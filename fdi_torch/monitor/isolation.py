@@ -88,11 +88,12 @@ def isolate(
 def _with_flows_of_window(
     observer: ObserverBank, window: ObserverWindow, believed: Tensor, ranked: Sequence[HypothesisFit], prior: Prior
 ) -> tuple[ObserverBank, list[HypothesisFit]]:
-    """The fits again, with random flows learnt from the window too: a short fault-free part leaves them uncertain.
+    """The fits repeated with random flows that are learnt from the window too, because a short fault-free part leaves
+    them uncertain.
 
-    Those whose odds may rise above the smallest that counts, if the flows halve the differences of log evidence, are
-    fitted with the flows that are most likely under the likeliest hypothesis. The evidence of each plausible one then
-    gains what flows of its own add to the likelihood.
+    First, the hypotheses are fitted with the flows that are most likely under the likeliest one, apart from those that
+    stay below SMALLEST_PROBABILITY even if the flows halve the differences of log evidence. Then the evidence of each
+    plausible hypothesis is raised by the log-likelihood that flows learnt under it add.
     """
     observer, _ = observer.learning_from(window, believed, changes_of(ranked[:1]))
     base = observer.white_innovations(window, believed, no_change(believed))
@@ -140,8 +141,9 @@ ALL_SETS = 4  # with more known faults than this, not every set of them is tried
 
 
 def recovery_hypotheses(believed: Tensor, healthy: Tensor, faults: Sequence[Fault]) -> list[Hypothesis]:
-    """Hypotheses that known faults recovered: every set of them, or only one, all but one and all if there are many.
+    """Hypotheses, each of which says that some of the known faults recovered.
 
+    They cover every set of up to ALL_SETS known faults. Of more faults, one, all but one, or all of them recover.
     believed, healthy (P,): a fault is known where the two differ.
     """
     known = [f for f in faults if bool((believed != healthy)[list(f.columns)].any())]

@@ -25,7 +25,7 @@ HOUR = 3600.0  # s
 GAP_STEPS = 3.0
 """A gap is a sampling interval longer than this many usual ones."""
 JITTER_SHARE = 0.05
-DOUBTS = ("clock", "constant", "range", "unit", "undersampled", "on change")
+DOUBTS = ("clock", "constant", "held", "range", "unit", "undersampled", "on change")
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,7 @@ def check_recording(recording: Recording, plant: PlantDescription) -> RecordingC
         findings=(
             *(ChannelFinding("read", "t", note) for note in recording.notes),
             *_clock_findings(time, steps, interval),
+            *_changes_in_gaps(recording),
             *_missing_inputs(recording),
             *_constant_inputs(recording),
             *undersampled_inputs(recording, plant),
@@ -104,7 +105,7 @@ def _summary(name: str, role: str, unit: str, values: Tensor, masked: int) -> Ch
 
 
 def _clock_findings(time: Tensor, steps: Tensor, interval: float) -> Iterator[ChannelFinding]:
-    jump = ((steps - HOUR).abs() <= GAP_STEPS * interval).nonzero().flatten()
+    jump = _jumps_by_an_hour(steps, interval).nonzero().flatten()
     if len(jump):
         text = (
             f"jumps by an hour after {float(time[jump[0]]):g} s: where this is local time and summer time begins, say "
@@ -124,6 +125,29 @@ def _clock_findings(time: Tensor, steps: Tensor, interval: float) -> Iterator[Ch
     if jitter > JITTER_SHARE * interval:
         text = f"the sampling interval of {interval:g} s varies by up to {jitter:.3g} s"
         yield ChannelFinding("clock", "t", text, {"interval": interval, "jitter": jitter})
+
+
+def _jumps_by_an_hour(steps: Tensor, interval: float) -> Tensor:
+    """Which steps of the time, s, may be due to the beginning of summer time."""
+    return (steps - HOUR).abs() <= GAP_STEPS * interval
+
+
+def _changes_in_gaps(recording: Recording) -> Iterator[ChannelFinding]:
+    """Held inputs that change while rows are missing."""
+    steps, interval = torch.diff(recording.time), recording.interval
+    gap = (steps > GAP_STEPS * interval) & ~_jumps_by_an_hour(steps, interval)
+    if recording.hold != "zero_order":
+        return
+    for name, values in zip(recording.input_names, recording.inputs.T, strict=True):
+        change = torch.diff(values)
+        moved = (gap & torch.isfinite(change) & (change != 0.0)).nonzero().flatten()
+        if len(moved):
+            start = float(recording.time[moved[0]])
+            text = (
+                f"changes in the gap after {start:g} s, nobody knows when; it counts as unchanged until the gap ends, "
+                f"unless the recording is cut there: columns: {{{name}: {{held: {GAP_STEPS * interval:g} s}}}}"
+            )
+            yield ChannelFinding("held", name, text, {"after": start, "count": len(moved)})
 
 
 def _constant_inputs(recording: Recording) -> Iterator[ChannelFinding]:

@@ -4,14 +4,13 @@ configuration.
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isnan
 from pathlib import Path
 
-from fdi_torch.names import nearest, shortened
+from fdi_torch.names import nearest, shortened, similar
 from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_cells import BAD, GOOD_WORDS, Columns, Rule
 from fdi_torch.recordings.csv_text import Heading, header_unit
@@ -135,9 +134,8 @@ def _find_column(path: Path, header: Sequence[str], name: str, column: str | Non
     if matches:
         return matches[0]
     names = {pair[0]: h for h, pair in names_and_units if pair}
-    longer = [h for h in header if h.lower().startswith(requested.lower())] if len(requested) > 1 else []
-    similar = longer or difflib.get_close_matches(requested, [*header, *names], n=1, cutoff=0.5)
-    hint = f"; the nearest is '{shortened(names.get(similar[0], similar[0]))}'" if similar else ""
+    near = similar(requested, [*header, *names])
+    hint = f"; the nearest is '{shortened(names.get(near[0], near[0]))}'" if near else ""
     without = ", or give the time between its rows: columns: {t: {period: 50 ms}}" if name == "t" else ""
     raise ValueError(
         f"{path}: expected a column for {name} ('{requested}' or '{requested}_UNIT'), got "

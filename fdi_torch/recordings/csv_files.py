@@ -24,7 +24,7 @@ from fdi_torch.recordings.csv_binding import Bound, bind, bind_clock, columns_of
 from fdi_torch.recordings.csv_cells import Columns, parse_carefully, parse_fast
 from fdi_torch.recordings.csv_tags import read_tags
 from fdi_torch.recordings.csv_text import heading_of, names_in, open_csv
-from fdi_torch.recordings.sheets import Sheet, in_order, informative_rows, merge_sheets
+from fdi_torch.recordings.sheets import Sheet, in_order, informative_rows, merge_sheets, without_missing_rows
 from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource, clock_in, file_sha256
 from fdi_torch.recordings.time_stamps import StampReader, from_zone, offset_of_zone
 from fdi_torch.units import spelled
@@ -90,7 +90,7 @@ def read_csv_files(
     since_1970 = any(p.stamps for p in parts) or float(seconds[0]) > SINCE_1970
     return Recording(
         time=torch.from_numpy(np.round(seconds - seconds[0], 6) if since_1970 else seconds),
-        inputs=torch.from_numpy(commands[rows]),
+        inputs=torch.from_numpy(without_missing_rows(seconds, commands[rows], list(hold_times.values()))),
         outputs=torch.from_numpy(readings[rows]),
         input_names=tuple(inputs),
         output_names=tuple(outputs),

@@ -22,8 +22,8 @@ from fdi_torch.sample_noise import sample_noise
 
 @dataclass(frozen=True)
 class ChannelFinding:
-    """kind: read, clock, gap, constant, constant input, clipped, frozen, quantised, range, rim, unit, missing, on
-    change, undersampled, unknown, stuck or slip. values: the numbers stated in `text`, by name, SI.
+    """kind: read, clock, gap, constant, constant input, clipped, frozen, quantised, held, range, rim, unit, missing,
+    on change, undersampled, unknown, stuck or slip. values: the numbers stated in `text`, by name, SI.
     """
 
     kind: str

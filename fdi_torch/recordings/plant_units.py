@@ -14,7 +14,7 @@ absolute scale: a valve that hardly opens looks like tanks that are too small.
 
 An unusual plant is not mistaken for a wrong unit: a leak or a plugged pipe changes a coefficient of the balance by some
 factor, but rarely by one that is close to the ratio of two units. What has one channel alone is left to
-`gap.preprocess.channel_assignment`, where effects of the plant compete.
+`gap.preprocess.recording_faults`, where effects of the plant compete.
 """
 
 from __future__ import annotations

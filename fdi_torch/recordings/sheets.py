@@ -167,6 +167,13 @@ def informative_rows(inputs: np.ndarray, outputs: np.ndarray, hold: Hold) -> np.
     return informative & np.logical_or.accumulate(read) & (number <= (number[read][-1] if read.any() else -1))
 
 
+def without_missing_rows(seconds: np.ndarray, inputs: np.ndarray, hold_times: Sequence[float]) -> np.ndarray:
+    """Inputs (R, M) with NaN in a row after which no row comes for longer than an input is held, s (0: for ever)."""
+    wait = np.diff(seconds, append=seconds[-1:])
+    most = np.array([time * (1.0 + HELD_MARGIN) if time > 0.0 else np.inf for time in hold_times])
+    return np.where(wait[:, None] > most, np.nan, inputs)
+
+
 def fill_held(seconds: np.ndarray, column: np.ndarray, hold_time: float, hold: Hold) -> np.ndarray:
     """An input (R,) with empty cells filled by the last value, for at most `most` s.
 

@@ -205,7 +205,7 @@ def _recordings_in_words(runs: Sequence[Material]) -> str:
 def _recordings(run: Material) -> str:
     data = run.about("data")
     names = dict.fromkeys(Path(path).name for key, path in data.items() if key.endswith(".path"))
-    return ", ".join(names) or "simulated"
+    return ", ".join(names) or run.about("config").get("recording.file", "simulated")  # of a followed file or source
 
 
 def _first(texts: Sequence[str]) -> str:

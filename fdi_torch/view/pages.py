@@ -47,7 +47,7 @@ def address(path: str, **values: str | Sequence[str]) -> str:
 
 def list_page(folder: str, entries: Sequence[Entry], kinds: Sequence[str], query: Query, total: int) -> str:
     """The list of logs with a filter; ticked logs are compared."""
-    title = f"Logs in {clean(folder)}"
+    title = f"Folder {clean(folder)}"
     shown = f"{len(entries)} of {total} logs" if len(entries) != total else counted(total, "log")
     content = [tag("h1", title), tag("h2", shown), tag("section", _filter(kinds, query), _choice(entries, query))]
     if not total:

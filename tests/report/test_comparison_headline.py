@@ -96,6 +96,13 @@ def test_runs_of_different_recordings_are_not_ranked(tmp_path: Path) -> None:
     assert differ == "They differ in the recording (simulated: other readings)."
 
 
+def test_a_live_source_is_not_called_simulated(tmp_path: Path) -> None:
+    live = {"recording.file": "mqtt://broker/rig"}
+    a = write_fit(tmp_path / "a.mcap", 0.004, config=live)
+    b = write_fit(tmp_path / "b.mcap", 0.001, level=0.2)
+    assert sentences(a, b)[-1].startswith("They differ in the recording (mqtt://broker/rig; simulated)")
+
+
 def test_settings_are_told_in_words(tmp_path: Path) -> None:
     ours = {"plant.effects": [{"effect": "leak", "location": "T1"}], "seed": 1, "step": None, "sha256": "abc"}
     a = write_fit(tmp_path / "a.mcap", 0.001, config={"seed": 2})

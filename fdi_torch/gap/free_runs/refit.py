@@ -3,8 +3,9 @@
 A cause that was adopted early was fitted while others were missing. No effect is searched here. A parameter with a
 tolerance stays near its value in the plant file; one without is free.
 
-`fit_by_continuation` finds a first trajectory where a sharp bend prevents it: rims and roots are first smoothed as for
-steps WIDENINGS times as long, and each solution is the start of the next (continuation: Allgower and Georg, 1990).
+Near a kink of the equations, such as a rim or the root of a small head, the fit may fail to find a first trajectory.
+`fit_by_continuation` then smooths the kinks more strongly, as for steps that are WIDENINGS times as long, and lets each
+solution start the next, less smoothed one (continuation: Allgower and Georg, 1990).
 """
 
 from __future__ import annotations

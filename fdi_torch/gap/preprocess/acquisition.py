@@ -61,8 +61,11 @@ class CheckedRecording:
     fault: RecordingFault | None
 
 
-def examined(plant: PlantDescription, recording: Recording) -> CheckedRecording:
-    """Check a recording, whose inputs are known, for stuck sensors and recording faults."""
+def examined(plant: PlantDescription, recording: Recording, thorough: bool = False) -> CheckedRecording:
+    """Check a recording, whose inputs are known, for stuck sensors and recording faults.
+
+    thorough: also for a recording fault beside an effect of the plant, which takes some seconds.
+    """
     plant = _with_recorded_sensors(plant, recording)
     if len(recording) < FEWEST or not plant.sensors:
         return CheckedRecording(recording, (), None)
@@ -74,7 +77,9 @@ def examined(plant: PlantDescription, recording: Recording) -> CheckedRecording:
     remaining, fault = without(recording, stuck), None
     # One value throughout may also be due to small noise, or to an end of the range.
     constant = [s for s in plant.sensors if len(remaining.valid_readings(s.column).unique()) == 1]
-    while not recording.trusted and (fault := recording_fault(plant, remaining, tuple(s.column for s in constant))):
+    while not recording.trusted and (
+        fault := recording_fault(plant, remaining, tuple(s.column for s in constant), thorough)
+    ):
         silent = [s for s in constant if s.column in fault.channels]
         if not (fault.silent and silent):
             break

@@ -39,6 +39,25 @@ class Correction:
 
 
 @dataclass(frozen=True)
+class WeighedFault:
+    """A fault of a recording, and the fit to the corrected recording. prior: log prior probability less the cost."""
+
+    fault: RecordingFault
+    fitted: BlockwiseFit
+    prior: float
+
+    @property
+    def weight(self) -> float:
+        """Log posterior weight, not normalised."""
+        return self.prior + self.fitted.log_likelihood
+
+    @property
+    def most(self) -> float:
+        """The weight of a fit whose residuals are sensor noise only."""
+        return self.prior + self.fitted.most
+
+
+@dataclass(frozen=True)
 class CorrectedFits:
     """A recording and its corrections. as_is: fit without one. prior: log prior probability of one fault.
 
@@ -64,12 +83,12 @@ class CorrectedFits:
         """The plant fitted to a corrected recording. noise: as in `Correction`."""
         return blockwise_fit(self._blocked(corrected, noise), base=self.as_is)
 
-    def weighed(self, correction: Correction) -> tuple[float, RecordingFault]:
-        """The log posterior weight of a correction by fits, not normalised, and its fault."""
+    def weighed(self, correction: Correction) -> WeighedFault:
+        """A fault, weighed by fits of the corrected recording."""
         fitted = self.fit(correction.recording, correction.noise)
         while better := correction.refined(fitted):
             correction, fitted = better, self.fit(better.recording, better.noise)
-        return self.prior + fitted.log_likelihood - correction.cost, correction.fault
+        return WeighedFault(correction.fault, fitted, self.prior - correction.cost)
 
     def first_order_gain(self, correction: Correction) -> float:
         """Gain in log posterior weight to first order in the constants.

@@ -3,9 +3,10 @@
     P(fault) = sum of the weights of all faults / (that sum + weights of the unchanged recording)
 
 The unchanged recording is explained without an effect and with one or two effects of the library, so that an unusual
-plant is not mistaken for a wrong recording (two pumps that lag alike look like a late clock). A fault is reported if
-P(fault) exceeds 95 %. Single effects are fitted first, because in most recordings one of them explains the gap so well
-that no fault need be tried.
+plant is not mistaken for a wrong recording (two pumps that lag alike look like a late clock). Single effects are fitted
+first, because in most recordings one of them explains the gap so well that no fault need be tried. A thorough
+examination explains the recording with the likeliest fault undone by a single effect as well, because channels can be
+swapped where a pipe is plugged. A fault is reported if P(fault) exceeds 95 %.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import chain, islice
-from operator import itemgetter
 
 import torch
 
@@ -42,11 +42,12 @@ RIVALS, MOST_EFFECTS = 6, 2
 
 
 def recording_fault(
-    plant: PlantDescription, recording: Recording, constant: tuple[str, ...] = ()
+    plant: PlantDescription, recording: Recording, constant: tuple[str, ...] = (), thorough: bool = False
 ) -> RecordingFault | None:
     """The likeliest fault of a recording, or None if faults have less than 95 % together.
 
     constant: columns of sensors that never move although noise should move them. They may also be clipped throughout.
+    thorough: try the likeliest fault beside an effect of the plant too, even if the fault alone gains nothing.
     """
     noise = noise_of(plant, recording)
     as_is = blockwise_fit(blocked_recording(plant, recording, noise))
@@ -56,28 +57,38 @@ def recording_fault(
     if most < as_is.log_likelihood:
         return None
     fits = CorrectedFits(plant, recording, as_is, prior, noise)
-    corrections = suspected(fits, constant)
+    corrections = suspected(fits, constant, thorough)
     if not corrections:
         return None
-    silent = {c for _, each in corrections if each.fault.silent for c in each.fault.channels}
-    target = as_is.log_likelihood + corrections[0][0] - SURE
-    others = _weights_with_effects(as_is, {s.name for s in plant.sensors if s.column in silent}, target)
+    silent_columns = {c for _, each in corrections if each.fault.silent for c in each.fault.channels}
+    silent = {s.name for s in plant.sensors if s.column in silent_columns}
+    others = _weights_with_effects(as_is, silent, as_is.log_likelihood + corrections[0][0] - SURE)
     rivals = [as_is.log_likelihood]
     for rival in islice(others, RIVALS):
         rivals.append(rival)
         if most < rival:
             return None
     faults = [fits.weighed(correction) for _, correction in corrections]
-    total = torch.logsumexp(torch.tensor([weight for weight, _ in faults]), 0)
+    weights = [fault.weight for fault in faults]
+    best = faults[weights.index(max(weights))]
+    if thorough and _log_odds(weights, rivals) <= SURE < best.most - max(rivals):
+        beside = _weights_with_effects(best.fitted, silent, max(rivals) + SURE - best.prior)
+        weights += [best.prior + weight for weight in islice(beside, RIVALS)]
     for rival in chain([-math.inf], others):
         rivals.append(rival)
-        if float(total - torch.logsumexp(torch.tensor(rivals), 0)) <= SURE:
+        if _log_odds(weights, rivals) <= SURE:
             return None
-    return max(faults, key=itemgetter(0))[1]
+    return best.fault
+
+
+def _log_odds(weights: list[float], rivals: list[float]) -> float:
+    """Log posterior odds of some hypotheses against their rivals, from log weights."""
+    for_them, against = (torch.logsumexp(torch.tensor(each), 0) for each in (weights, rivals))
+    return float(for_them - against)
 
 
 def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str], target: float) -> Iterator[float]:
-    """Log weights of the uncorrected recording with one and with two effects of the library, by a greedy search.
+    """Log weights of a recording, fitted as it is, with one and with two effects of the library, by a greedy search.
 
     excluded: places at which no effect is tried. target: log-likelihood below which an effect changes no decision.
     """

@@ -32,14 +32,16 @@ DECADES = (-3, -2, -1, 1, 2, 3)
 """Powers of ten by which a unit can be wrong; millimetres instead of metres at most."""
 
 
-def suspected(fits: CorrectedFits, constant: Collection[str]) -> list[tuple[float, Correction]]:
+def suspected(fits: CorrectedFits, constant: Collection[str], thorough: bool) -> list[tuple[float, Correction]]:
     """All corrections that are worth a fit, with their gain in log posterior weight to first order, the largest first.
 
-    constant: columns of sensors that never move.
+    constant: columns of sensors that never move. thorough: the likeliest is worth a fit even without a gain, because
+    the plant may have an effect as well.
     """
     alternatives = chain(_units(fits), _swaps(fits), clock_offsets(fits), silent_sensors(fits, constant))
     likeliest = [max(((fits.first_order_gain(c), c) for c in each), key=itemgetter(0)) for each in alternatives if each]
-    return sorted((item for item in likeliest if item[0] > 0.0), key=itemgetter(0), reverse=True)
+    ranked = sorted(likeliest, key=itemgetter(0), reverse=True)
+    return [item for item in ranked if item[0] > 0.0] or (ranked[:1] if thorough else [])
 
 
 def _units(fits: CorrectedFits) -> Iterator[list[Correction]]:

@@ -7,6 +7,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from fdi_torch.amounts import kind_words
 from fdi_torch.clock import clock_unit
 from fdi_torch.gap.verdict_words import (
     FORMAT_1,
@@ -143,8 +144,8 @@ def _chance(place: Mapping[str, Any]) -> str:
 
 
 def _cause_rows(cause: Mapping[str, Any]) -> list[list[str]]:
-    effect, location = str(cause["effect"]).replace("_", " "), str(cause["location"])
-    rows = []
+    location = str(cause["location"])
+    effect, rows = kind_words(str(cause["effect"]), location), []
     for name, amount in (cause.get("parameters") or {}).items():
         full = f"{location}.{cause['effect']}.{name}"
         unit, scale = shown_unit(str(amount.get("unit", "")), full)

@@ -20,6 +20,7 @@ from fdi_torch.report.style import MARK, MODEL
 
 RESIDUAL, ALARM = "/observer/residual", "/observer/alarm"
 _SUFFIXES = ("_statistic", "_threshold")
+NAMES = {"all": "all sensors", "cusum": "CUSUM", "fixed": "fixed threshold"}
 
 
 def residual_section(material: Material) -> Section | None:
@@ -45,7 +46,7 @@ def statistic_section(material: Material) -> Section | None:
         limit = columns.get(f"{channel}_threshold")
         lines = [Line("statistic", time, columns[name], MODEL)]
         lines += [] if limit is None else [Line("threshold", time, limit, MARK, dashed=True)]
-        title = f"Test statistic, {'all sensors' if channel == 'all' else channel}"
+        title = f"Test statistic, {NAMES.get(channel, channel)}"
         chart = Chart(title, "time, s", "statistic (no unit)", lines, log=True, events=alarms, clock="monitor")
         pictures.append(signals(f"observer_statistic_{k + 1}", chart))
     words = "Vertical lines: alarms. Dashed: thresholds." if alarms else "Dashed: thresholds. No alarm was raised."

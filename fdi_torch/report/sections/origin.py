@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fdi_torch.amounts import kind_words
 from fdi_torch.estimate.misfit import NOT_ESTABLISHED
 from fdi_torch.names import counted
 from fdi_torch.parameters import ParameterName
@@ -73,10 +74,10 @@ def marks_of(material: Material) -> dict[str, list[str]]:
         if finding.present:
             unit, scale = shown_unit(finding.unit)
             size = "" if math.isnan(finding.size) else f" {number(scale * finding.size, 3)} {unit}".rstrip()
-            marks.setdefault(finding.location, []).append(f"{finding.effect.replace('_', ' ')}{size}")
+            marks.setdefault(finding.location, []).append(f"{kind_words(finding.effect, finding.location)}{size}")
     for combination in combinations_of(material, "not_isolated"):
         for fault in map(ParameterName.of_effect, combination.parameters):
-            marks.setdefault(fault.place, []).append(f"{fault.effect.replace('_', ' ')}, not isolated")
+            marks.setdefault(fault.place, []).append(f"{kind_words(fault.effect, fault.place)}, not isolated")
     return marks
 
 
