@@ -24,12 +24,12 @@ from fdi_torch.gap.localization.regressors import (
     backlashes,
     fatigues,
     finer,
-    hinges,
     lagged,
     lags_and_decays,
     rate_limits,
     relay,
     relay_thresholds,
+    smooth_function,
     steps_in_value,
     stictions,
 )
@@ -58,14 +58,14 @@ class SignalRanges:
         )
         return low, max(high, low + 1e-9 * (max(abs(low), abs(high)) or 1.0))
 
-    def hinges(self, s: Signals, name: str, count: int) -> list[Tensor]:
-        return hinges(s[name], self(name), 2 * count)
+    def smooth_function(self, s: Signals, name: str, count: int) -> list[Tensor]:
+        return smooth_function(s[name], self(name), 2 * count)
 
     def steps_in_value(self, s: Signals, name: str, count: int) -> list[Tensor]:
         return steps_in_value(s[name], self(name), 3 * count)
 
     def kinks(self, s: Signals, name: str, count: int, factor: Tensor | None = None) -> Breakpoints:
-        """Kinks on a grid that is FINER times as fine as that of `hinges` with this `count`."""
+        """Kinks on a grid that is FINER times as fine as that of `smooth_function` with this `count`."""
         return self._breakpoints(s, name, 2 * FINER * count, factor, jump=False)
 
     def jumps(self, s: Signals, name: str, count: int, factor: Tensor | None = None) -> Breakpoints:
@@ -90,7 +90,7 @@ class SignalRanges:
         return Curves(torch.stack(backlashes(s[name], self(name), finer(BACKLASH_BANDS, FINER))))
 
 
-# Local signals (K,), step lengths (K,) s -> regressors (K,) each
+# Local signals (K,), step lengths (K,) s -> regressors (K,), or of several coefficients with one variance (N, K)
 RegressorFunction = Callable[[Signals, Tensor, SignalRanges], list[Tensor]]
 FineRegressor = Breakpoints | Relays | Curves | Pulses
 FineRegressors = list[FineRegressor]
@@ -129,7 +129,7 @@ def discrepancy_model_at(place: str, plant: PlantDescription) -> DiscrepancyMode
 
 def reading_regressors(s: Signals, step: Tensor, ends: SignalRanges, scale: float) -> list[Tensor]:
     """Regressors of a sensor's discrepancy. step: sampling intervals, s. scale: time scale of the plant."""
-    regressors = [*ends.hinges(s, "reading", 12), s["reading"] * s["time"] / ends("time")[1]]
+    regressors = [*ends.smooth_function(s, "reading", 12), s["reading"] * s["time"] / ends("time")[1]]
     lag = lagged(s["reading"], step, scale * LAGS[0]) - s["reading"]
     regressors += [lag * (s["time"] / ends("time")[1] - j / RAMPS).clamp(min=0.0) for j in range(RAMPS)]  # clock drift
     return [*regressors, *lags_and_decays(s["reading"], step, scale), *backlashes(s["reading"], ends("reading"))]
@@ -154,9 +154,9 @@ def _commanded(component: FlowComponent, plant: PlantDescription) -> Discrepancy
         }
 
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        regressors = [*ends.hinges(s, "command", 9), *_of_actuator(s["flow"], step, ends("flow"), scale)]
+        regressors = [*ends.smooth_function(s, "command", 9), *_of_actuator(s["flow"], step, ends("flow"), scale)]
         regressors += [s["flow"] * j for j in ends.steps_in_value(s, "below", 9)]
-        regressors += [s["flow"] * b for b in ends.hinges(s, "level", 6)]
+        regressors += [s["flow"] * b for b in ends.smooth_function(s, "level", 6)]
         return [*regressors, *fatigues(s["flow"], step, ends("flow"), scale)]
 
     def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
@@ -194,13 +194,13 @@ def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyMo
         return here | ({"opening": trajectory.commands[_actuator(plant, name)]} if has_valve else {})
 
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        regressors = [*ends.hinges(s, "root", 16), *ends.hinges(s, "head", 12)]
+        regressors = [*ends.smooth_function(s, "root", 16), *ends.smooth_function(s, "head", 12)]
         regressors += lags_and_decays(s["flow"], step, scale)
         regressors += [s["flow"] * j for j in ends.steps_in_value(s, "root", 24)]
         regressors += [s["flow"] * on for _, on in ends.relays(s, "root")]
         if has_valve:
             of_valve = _of_actuator(s["opening"], step, ends("opening"), scale)
-            regressors += [s["root"] * r for r in (*ends.hinges(s, "opening", 9), *of_valve)]
+            regressors += [s["root"] * r for r in (*ends.smooth_function(s, "opening", 9), *of_valve)]
         return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
 
     def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
@@ -228,7 +228,7 @@ def _pair(place: str, plant: PlantDescription) -> DiscrepancyModel:
         return {"head": head, "root": _root(head)}
 
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        return [*ends.hinges(s, "head", 10), *ends.hinges(s, "root", 10)]
+        return [*ends.smooth_function(s, "head", 10), *ends.smooth_function(s, "root", 10)]
 
     def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
         return [ends.kinks(s, "head", 10), ends.kinks(s, "root", 10)]
@@ -244,7 +244,7 @@ def _tank(place: str, plant: PlantDescription) -> DiscrepancyModel:
         return {"level": level, "rate": trajectory.still[tank], "one": torch.ones_like(level)}
 
     def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        regressors = [*ends.hinges(s, "level", 12), *ends.steps_in_value(s, "level", 24)]
+        regressors = [*ends.smooth_function(s, "level", 12), *ends.steps_in_value(s, "level", 24)]
         for low, on in ends.relays(s, "level"):  # a constant draw, an orifice at the floor, and one at that height
             regressors += [on, on * _root(s["level"]), on * _root((s["level"] - low).clamp(min=0.0))]
         # No short lags: a short lag of the level is its rate, which the balance explains already.
@@ -252,7 +252,7 @@ def _tank(place: str, plant: PlantDescription) -> DiscrepancyModel:
         return [*regressors, *backlashes(s["level"], ends("level"))]
 
     def areas(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        return [s["rate"] * b for b in ends.hinges(s, "level", 12)]
+        return [s["rate"] * b for b in ends.smooth_function(s, "level", 12)]
 
     def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
         relays = [ends.fine_relays(s, "level"), ends.fine_relays(s, "level", _root(s["level"]))]

@@ -23,7 +23,7 @@ from fdi_torch.gap.localization.localized_discrepancy import (
     unexplained_norm,
 )
 from fdi_torch.gap.localization.single_regressor_gain import largest_influence
-from fdi_torch.gap.localization.sparse_regression import SparseFit, column_costs
+from fdi_torch.gap.localization.sparse_regression import SparseFit, regressor_costs
 from fdi_torch.gap.localization.whitened_discrepancy import WhitenedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import LinearParameters, estimate_disturbances, with_disturbances
 from fdi_torch.gap.trajectory_problem import SHARE
@@ -88,13 +88,13 @@ class EvaluatedDiscrepancy:
 
     def localized(self, fitter: Fitter) -> LocalizedDiscrepancy:
         """The result. fitter: that of the explanation, whose sensor noise is the unit of the size."""
-        explained, at, used, fit = self.explained, self.discrepancy, self.regressed.used, self.regression.fit
+        explained, at, fit = self.explained, self.discrepancy, self.regression.fit
         size = unexplained_norm(fitter, fit.space, fit.theta, at.linearised.jacobian[0], explained)
         return LocalizedDiscrepancy(
             self.location,
             self.gain,
             self.log_likelihood,
-            int(used.sum()),
+            self.regressed.parameters,
             explained,
             at.linearised.readings[0] + explained,
             size,
@@ -146,13 +146,13 @@ class Ascent:
         fit = regression.fit
         under = with_disturbances(self.fitter, fit, noise, discrepancy.linearised)
         if start is None:
-            nothing = torch.zeros(len(discrepancy.columns), dtype=torch.bool)
+            nothing = torch.full_like(discrepancy.choices, math.inf)
             positions = Positions(regression, place, under, discrepancy, nothing, self.generator)
             discrepancy = positions.with_best_frequency(discrepancy, nothing)
             discrepancy = positions.best(discrepancy, nothing) or discrepancy
         whitened = WhitenedDiscrepancy(under, fit, discrepancy)
-        costs = column_costs(discrepancy.choices, self.largest)
-        regressed = whitened.sparse_fit(costs, start, exchanges=exchanges)
+        costs = regressor_costs(discrepancy.choices, self.largest)
+        regressed = whitened.sparse_fit(discrepancy.regressor, costs, start, exchanges=exchanges)
         without = log_likelihood(under, fit, discrepancy.linearised) + noise.log_prior() - self.base
         return EvaluatedDiscrepancy(place, noise, under, regression, discrepancy, whitened, regressed, without)
 
@@ -215,9 +215,9 @@ class Ascent:
         The estimated noise falls only after most of them were added, so that each alone seems to gain little. least:
         gain that matters; where random flows are far too small, hundreds of regressors do not reach it.
         """
-        at, used = current.discrepancy, current.regressed.used
-        positions = Positions(current.regression, current.location, current.under, at, used, self.generator)
-        while finer := positions.best(current.discrepancy, current.regressed.used):
+        at, precision = current.discrepancy, current.regressed.precision
+        positions = Positions(current.regression, current.location, current.under, at, precision, self.generator)
+        while finer := positions.best(current.discrepancy, current.regressed.precision):
             extended = self._changed(current, finer)
             gain = extended.gain - current.gain
             if gain < CONVERGED or current.gain + MOST_REGRESSORS * gain < least:
@@ -226,7 +226,8 @@ class Ascent:
         return current
 
     def _with_finer_frequency(self, current: EvaluatedDiscrepancy) -> EvaluatedDiscrepancy:
-        at, others = current.discrepancy, current.regressed.used & ~current.discrepancy.sinusoids
+        at = current.discrepancy
+        others = torch.where(at.sinusoids, math.inf, current.regressed.precision)
         if at.frequency is None:
             return current
         positions = Positions(current.regression, current.location, current.under, at, others, self.generator)
@@ -235,7 +236,8 @@ class Ascent:
     def _changed(self, current: EvaluatedDiscrepancy, discrepancy: Discrepancy) -> EvaluatedDiscrepancy:
         """The same with a discrepancy that differs in some columns."""
         whitened = current.whitened.with_columns(discrepancy.columns)
-        regressed = whitened.sparse_fit(column_costs(discrepancy.choices, self.largest), current.regressed.precision)
+        costs = regressor_costs(discrepancy.choices, self.largest)
+        regressed = whitened.sparse_fit(discrepancy.regressor, costs, current.regressed.precision)
         return replace(current, discrepancy=discrepancy, whitened=whitened, regressed=regressed)
 
     def _with_likely_noise(self, current: EvaluatedDiscrepancy, climb: bool) -> EvaluatedDiscrepancy:

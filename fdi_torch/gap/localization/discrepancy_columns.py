@@ -61,12 +61,14 @@ class Selection:
 class Discrepancy:
     """Influence of a component's regressors on the readings, columns (S, C, M), about a linearised trajectory.
 
-    choices (M,): number of regressors among which each was selected. frequency: of the sinusoids, Hz, or None if there
+    regressor (M,): which one each column belongs to; columns of one regressor have coefficients of the same variance.
+    choices (M,): number of regressors among which it was selected. frequency: of the sinusoids, Hz, or None if there
     are none. sinusoids (M,) bool: which columns they are. positions: of the last columns.
     """
 
     columns: Columns
     linearised: Linearised
+    regressor: Tensor
     choices: Tensor
     frequency: float | None
     sinusoids: Tensor
@@ -77,6 +79,7 @@ class Discrepancy:
         return replace(
             self,
             columns=Columns((*self.columns.blocks, column.unsqueeze(-1))),
+            regressor=torch.cat([self.regressor, self.regressor[-1:] + 1]),
             choices=torch.cat([self.choices, self.choices.new_tensor([position.choices])]),
             sinusoids=torch.cat([self.sinusoids, self.sinusoids.new_zeros(1)]),
             positions=(*self.positions, position),

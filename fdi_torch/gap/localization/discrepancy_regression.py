@@ -46,12 +46,14 @@ BATCH = 64  # regressors whose influence is computed, or whitened, together
 class Regressors:
     """Regressors of one component along one recording of K steps; of a sensor, along its K samples.
 
-    functions (M, K): of local variables, in m^3/s, or in the sensor's unit. fine: kinks, jumps and relays on finer
-    grids. in_time (T, K): functions of the time (K,) times `factor` (K,). frequencies (F,): of sinusoids and pulses,
-    Hz. areas (A, K): of a tank, changes of its level rate, m/s; otherwise None.
+    functions (M, K): of local variables, in m^3/s, or in the sensor's unit. widths: coefficients of each regressor
+    among the areas and functions. fine: kinks, jumps and relays on fine grids. in_time (T, K): functions of the time
+    (K,) times `factor` (K,). frequencies (F,): of sinusoids and pulses, Hz. areas (A, K): of a tank, changes of its
+    level rate, m/s; otherwise None.
     """
 
     functions: Tensor
+    widths: tuple[int, ...]
     fine: FineRegressors
     in_time: Tensor
     time: Tensor
@@ -152,12 +154,14 @@ class DiscrepancyRegression:
         if len(self.frequencies):
             frequency = float(self.frequencies[0])
             columns = Columns((grid, self.sinusoids(place, self.frequencies[:1])[..., 0, :]))
-        count = len(columns)
-        choices, sinusoids = grid.new_full((count,), count), torch.arange(count) >= grid.shape[-1]
+        count, widths = len(columns), regressors[0].widths
+        singles = [1] * (count - sum(widths))
+        regressor = torch.repeat_interleave(torch.tensor([*widths, *singles]))
+        choices, sinusoids = grid.new_full((count,), float(regressor[-1]) + 1.0), torch.arange(count) >= grid.shape[-1]
         # A sinusoid is one of those of all frequencies: 1 / (2 dt) over the width sqrt(2 pi) s of the posterior,
         # s = sqrt(6 / G) / (2 pi T) with a gain of G nats (Rife and Boorstyn, 1974), is 2 S if it is just worth it.
         choices[sinusoids] *= 2 * len(grid)
-        discrepancy = Discrepancy(columns, linearised, choices, frequency, sinusoids)
+        discrepancy = Discrepancy(columns, linearised, regressor, choices, frequency, sinusoids)
         for position in positions:
             discrepancy = discrepancy.with_column(self.column(place, position), position)
         return discrepancy
@@ -235,10 +239,13 @@ class DiscrepancyRegression:
         ends, regressors = SignalRanges(signals), []
         for piece, s in zip(self.pieces, signals, strict=True):
             step, factor = piece.engine.experiment.steps, s[component.in_time]
-            functions, fine = torch.stack(component.flows(s, step, ends)), component.fine(s, step, ends)
-            areas = torch.stack(component.areas(s, step, ends)) if component.areas else None
-            in_time = factor * self._functions_of_time(piece, piece.middle)
-            regressors.append(Regressors(functions, fine, in_time, piece.middle, factor, self.frequencies, areas))
+            functions, widths = _stacked(component.flows(s, step, ends))
+            areas, of_areas = _stacked(component.areas(s, step, ends)) if component.areas else (None, ())
+            fine, in_time = component.fine(s, step, ends), factor * self._functions_of_time(piece, piece.middle)
+            widths = of_areas + widths
+            regressors.append(
+                Regressors(functions, widths, fine, in_time, piece.middle, factor, self.frequencies, areas)
+            )
         return regressors
 
     def _of_sensor(self, sensor: Sensor) -> tuple[list[Regressors], Linearised]:
@@ -255,10 +262,10 @@ class DiscrepancyRegression:
             first += len(nodes)
         ends, scale, regressors = SignalRanges(signals), time_scale(self.fitter.data.plant), []
         for piece, s in zip(self.pieces, signals, strict=True):
-            functions = reading_regressors(s, piece.engine.experiment.sample_intervals, ends, scale)
+            functions, widths = _stacked(reading_regressors(s, piece.engine.experiment.sample_intervals, ends, scale))
             fine, in_time = fine_reading_regressors(s, ends), self._functions_of_time(piece, s["time"])
-            one, columns = torch.ones_like(s["time"]), torch.stack(functions)
-            regressors.append(Regressors(columns, fine, in_time, s["time"], one, self.frequencies))
+            one = torch.ones_like(s["time"])
+            regressors.append(Regressors(functions, widths, fine, in_time, s["time"], one, self.frequencies))
         return regressors, self.engine.linearise(self.theta, levels)
 
     def _rate_changes(self, piece: RecordingLinearisation, component: DiscrepancyModel, flows: Tensor) -> Tensor:
@@ -276,6 +283,12 @@ class DiscrepancyRegression:
 
     def tank(self, name: str) -> int:
         return [t.name for t in self.fitter.data.plant.tanks].index(name)
+
+
+def _stacked(regressors: Sequence[Tensor]) -> tuple[Tensor, tuple[int, ...]]:
+    """Regressors (K,) or (N, K) as one tensor (M, K), and the number of coefficients of each."""
+    each = [torch.atleast_2d(r) for r in regressors]
+    return torch.cat(each), tuple(map(len, each))
 
 
 def _concatenated(shared: Sequence[Tensor], per_recording: Sequence[Tensor]) -> Tensor:

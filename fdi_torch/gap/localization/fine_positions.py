@@ -38,7 +38,7 @@ from fdi_torch.gap.localization.single_regressor_gain import (
     strengths_of,
     whitened_residual,
 )
-from fdi_torch.gap.localization.sparse_regression import COLLINEAR, VISIBLE, column_costs
+from fdi_torch.gap.localization.sparse_regression import COLLINEAR, VISIBLE, regressor_costs
 from fdi_torch.simulate.joint_collocation import with_blanks
 
 TRIED = 8  # positions, or frequencies, with the largest estimated gains, whose gains are computed exactly
@@ -52,8 +52,9 @@ class Positions:
     """All positions of a kink, a jump, a relay or a step in time at a place, and all frequencies of its sinusoids,
     under one noise.
 
-    under: fitter with the disturbance noise. used (M,): the regressors of the discrepancy that are selected already.
-    The strength of each position is computed with these present; regressors that are added later only reduce it.
+    under: fitter with the disturbance noise. precision (M,): of the columns of the discrepancy, infinite for those that
+    are not used. The strength of each position is computed with these present; regressors that are added later only
+    reduce it.
     """
 
     def __init__(
@@ -62,13 +63,19 @@ class Positions:
         place: str,
         under: Fitter,
         discrepancy: Discrepancy,
-        used: Tensor,
+        precision: Tensor,
         generator: torch.Generator,
     ) -> None:
         self.regression, self.place, self.under, self.fit = regression, place, under, regression.fit
         self._residual = whitened_residual(under, self.fit, discrepancy.linearised)
-        basis = parameter_basis(under, self.fit, discrepancy.linearised, discrepancy.columns[used])
+        basis = self._basis(discrepancy, precision)
         self._signs = self._weights(random_signs(self._residual, generator), basis)
+
+    def _basis(self, discrepancy: Discrepancy, precision: Tensor) -> Tensor:
+        """What the parameters of the fit, and the columns in use, explain."""
+        used = torch.isfinite(precision)
+        columns = discrepancy.columns[used]
+        return parameter_basis(self.under, self.fit, discrepancy.linearised, columns, precision[used])
 
     @cached_property
     def _strengths(self) -> list[Tensor]:
@@ -81,12 +88,12 @@ class Positions:
     @cached_property
     def _costs(self) -> list[float]:
         """Cost of one more regressor of each family, nats."""
-        return column_costs(torch.tensor(self._choices, dtype=torch.float64), largest_influence(self.under)).tolist()
+        return regressor_costs(torch.tensor(self._choices, dtype=torch.float64), largest_influence(self.under)).tolist()
 
-    def best(self, discrepancy: Discrepancy, used: Tensor) -> Discrepancy | None:
+    def best(self, discrepancy: Discrepancy, precision: Tensor) -> Discrepancy | None:
         """The discrepancy with the regressor that explains most in addition to those used, or None if none is worth
-        its selection."""
-        basis = parameter_basis(self.under, self.fit, discrepancy.linearised, discrepancy.columns[used])
+        its selection. precision (M,): of its columns."""
+        basis = self._basis(discrepancy, precision)
         products = position_products(self.regression, self.place, self._weights(self._residual, basis))
         gains = [gains_of(p[:, 0], strength) for p, strength in zip(products, self._strengths, strict=True)]
         highest = [
@@ -135,7 +142,7 @@ class Positions:
     def _exact_gains(self, columns: Tensor, basis: Tensor) -> Tensor:
         """Gains (M,) of influences (S, C, M) in addition to those in the basis."""
         white = without(basis, self.under.whiten(columns).flatten(0, 1))
-        return gains_of((white.T @ self._residual).squeeze(1), white.square().sum(dim=0))
+        return gains_of((white[: len(self._residual)].T @ self._residual).squeeze(1), white.square().sum(dim=0))
 
     def _weights(self, white: Tensor, basis: Tensor) -> list[Tensor]:
         """Whitened columns (S C + P, W), less what the basis explains of these, as weights (W, K) of a regressor along
@@ -145,13 +152,13 @@ class Positions:
             return inflow_weights(self.regression, self.place, adjoints)
         return [adjoints.readings[piece.rows, channel].T for piece in self.regression.pieces]
 
-    def with_best_frequency(self, discrepancy: Discrepancy, used: Tensor) -> Discrepancy:
+    def with_best_frequency(self, discrepancy: Discrepancy, precision: Tensor) -> Discrepancy:
         """The discrepancy with the frequency at which its sinusoids explain most beside the other regressors that it
-        uses; the same if it has no sinusoids. used (M,): as given at the construction, without sinusoids.
+        uses; the same if it has no sinusoids. precision (M,): as given at the construction, without sinusoids.
         """
         if discrepancy.frequency is None:
             return discrepancy
-        basis = parameter_basis(self.under, self.fit, discrepancy.linearised, discrepancy.columns[used])
+        basis = self._basis(discrepancy, precision)
         weights = self._weights(self._residual, basis)
 
         def estimated(frequencies: Tensor, harmonics: slice) -> Tensor:
@@ -164,7 +171,7 @@ class Positions:
             columns = self.regression.sinusoids(self.place, frequencies)[..., harmonics]
             white = without(basis, self.under.whiten(columns.flatten(2)).flatten(0, 1))
             white = white.unflatten(1, columns.shape[2:]).transpose(0, 1)  # (F, S C + P, W)
-            return _reductions(white.mT @ self._residual, white.mT @ white)
+            return _reductions(white[:, : len(self._residual)].mT @ self._residual, white.mT @ white)
 
         # Without harmonics: a third of a frequency would explain as much by its third harmonic.
         fundamental, whole = slice(None, None, HARMONICS), slice(None)

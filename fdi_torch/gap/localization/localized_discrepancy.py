@@ -57,7 +57,7 @@ class LocalizedDiscrepancy:
     """A discrepancy at one component, in addition to a fit.
 
     gain: in log evidence against the fit alone, without prior odds. log_likelihood: gain in it against the fit alone,
-    by this number of parameters. explained: its influence on the readings (S, C); none of a random process.
+    by this effective number of parameters. explained: its influence on the readings (S, C); none of a random process.
     predicted (S, C): the readings with it; None of a random process. size: norm of the part of it that no parameter of
     the fit explains, in units of the sensor noise. selection: its regressors; None of a random process. fit, noise: the
     fit refitted, and the most likely disturbance noise, with the discrepancy. estimate: of the fit's parameters beside
@@ -67,7 +67,7 @@ class LocalizedDiscrepancy:
     location: str
     gain: float
     log_likelihood: float
-    parameters: int
+    parameters: float
     explained: Tensor
     predicted: Tensor | None
     size: float

@@ -1,6 +1,6 @@
 """Candidate regressors of a discrepancy: signals along a recording, many more than a discrepancy needs.
 
-- Functions of a local variable: hinges (piecewise linear) and steps.
+- Functions of a local variable: constant, linear, smooth, and steps.
 - Functions with memory: lags, delays, backlash, stiction, rate limits, relays, decays after a change.
 - Functions of time: steps, ramps, sinusoids, and periodic pulses (`regressor_families.py`).
 
@@ -37,10 +37,14 @@ SAMPLES_A_STEP = 9  # fewest samples per step function of time
 HARMONICS = 3  # of a dominant frequency of the residual
 
 
-def hinges(x: Tensor, ends: tuple[float, float], count: int) -> list[Tensor]:
-    """1, x - low, and max(x - c, 0) for `count` - 2 values c between the ends."""
-    at = torch.linspace(*ends, count, dtype=x.dtype).tolist()
-    return [torch.ones_like(x), x - at[0], *((x - c).clamp(min=0.0) for c in at[1:-1])]
+def smooth_function(x: Tensor, ends: tuple[float, float], count: int) -> list[Tensor]:
+    """1, x - low, and max(x - c, 0) for `count` - 2 values c between the ends, (count - 2, K).
+
+    The last have coefficients of a common variance, so that their sum is an integrated random walk, whose most likely
+    course is a smoothing spline (Wahba, 1978).
+    """
+    at = torch.linspace(*ends, count, dtype=x.dtype)[1:-1]
+    return [torch.ones_like(x), x - ends[0], (x - at.unsqueeze(1)).clamp(min=0.0)]
 
 
 def steps_in_value(x: Tensor, ends: tuple[float, float], count: int) -> list[Tensor]:

@@ -25,7 +25,7 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.component_regressors import discrepancy_model_at
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.regressor_families import Pulses
-from fdi_torch.gap.localization.sparse_regression import column_costs
+from fdi_torch.gap.localization.sparse_regression import regressor_costs
 from fdi_torch.plant.description import OUTSIDE
 from fdi_torch.simulate.linearised import Linearised
 
@@ -103,7 +103,7 @@ class SingleRegressorGains:
 def _largest_gain(products: Tensor, choices: int, largest: float) -> SingleRegressorGain:
     """Largest gain among regressors. products (M, 1 + SIGNS): with the residual and random signs. choices: number of
     regressors among which one is selected."""
-    (cost,) = column_costs(torch.tensor([float(choices)]), largest).tolist()
+    (cost,) = regressor_costs(torch.tensor([float(choices)]), largest).tolist()
     return SingleRegressorGain(float(gains_of(products[:, 0], strengths_of(products[:, 1:])).max()), cost)
 
 
@@ -140,7 +140,7 @@ def random_signs(residual: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def gains_of(score: Tensor, strength: Tensor) -> Tensor:
-    """Gain in log evidence of each regressor (M,), without its cost (`column_costs`).
+    """Gain in log evidence of each regressor (M,), without its cost (`regressor_costs`).
 
     score (M,): product of its column with the residual. strength (M,): squared norm of its column.
     """
@@ -160,13 +160,19 @@ def whitened_residual(under: Fitter, fit: Fit, linearised: Linearised) -> Tensor
     return torch.cat([under.residual(linearised.readings).flatten(), -off]).unsqueeze(1)
 
 
-def parameter_basis(under: Fitter, fit: Fit, linearised: Linearised, columns: Tensor | None = None) -> Tensor:
-    """Orthonormal basis (S C + P, .) of the influence of the parameters about a linearised trajectory, and of further
-    columns (S, C, M)."""
+def parameter_basis(
+    under: Fitter,
+    fit: Fit,
+    linearised: Linearised,
+    columns: Tensor | None = None,
+    precision: Tensor | None = None,
+) -> Tensor:
+    """Orthonormal basis (S C + P + M, .) of the influence of the parameters about a linearised trajectory, and of
+    further columns (S, C, M), on the readings and on the priors. precision (M,): of the coefficients of the columns."""
     scale, pull, _ = under.priors(fit.space, fit.theta)
     jacobian = under.whiten(linearised.jacobian[0]) * scale
-    if columns is not None:
-        jacobian = torch.cat([jacobian, under.whiten(columns)], dim=-1)
+    if columns is not None and precision is not None:
+        jacobian, pull = torch.cat([jacobian, under.whiten(columns)], dim=-1), torch.cat([pull, precision.sqrt()])
     return decomposed(jacobian.flatten(0, 1), pull)[0]
 
 

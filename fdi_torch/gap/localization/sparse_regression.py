@@ -1,21 +1,22 @@
-"""Sparse Bayesian regression: which few of many columns explain a residual, and the evidence for them.
+"""Sparse Bayesian regression: which few of many regressors explain a residual, and the evidence for them.
 
-The coefficients have independent priors c_j ~ N(0, 1/a_j), and a column with infinite precision a_j is not used. For a
-residual r, columns C, G = C'C, b = C'r and noise of unit variance,
+A regressor has one column or several. Its coefficients have independent priors c_j ~ N(0, 1/a_j) with the same
+precision, and a regressor with infinite precision is not used. For a residual r, columns C, G = C'C, b = C'r and noise
+of unit variance,
 
     log E = b'S b / 2 + log det(S) / 2 + sum log(a) / 2,   S = (G + diag(a))^-1,
 
-over the columns that are used, each of which has a cost (`column_costs`). Their difference is maximised one column at a
-time: the column whose addition, removal or re-estimation gains most is changed until nothing gains (Tipping and Faul,
-2003, "Fast marginal likelihood maximisation for sparse Bayesian models"). If asked for, a column in use is then
-exchanged for another if that gains: of two nearly equal columns, the one that was added first is not always the one
-that suits the others.
+over the columns that are used. Each regressor in use has a cost (`regressor_costs`). The difference is maximised one
+regressor at a time: the one whose addition, removal or re-estimation gains most is changed until nothing gains
+(Tipping and Faul, 2003, "Fast marginal likelihood maximisation for sparse Bayesian models"). If asked for, a regressor
+in use is then exchanged for another if that gains: of two nearly equal columns, the one that was added first is not
+always the one that suits the others.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -24,16 +25,18 @@ VISIBLE = 1e-6  # chi-square units; columns with less influence are ignored
 COLLINEAR = 1e-9  # share of a column that the columns in use leave over; with less, it cannot be added
 CONVERGED = 1e-2  # nats
 MOST_CHANGES = 500  # a guard against cycles by rounding
+WIDEST = 30.0  # e-folds below the largest strength, within which the precision of several columns is searched
 
 
 @dataclass(frozen=True)
 class SparseFit:
     """evidence: log evidence against no coefficients, less the costs. reduction: of half of chi-square by the
-    coefficients. mean (M,): posterior means of the coefficients. precision (M,): of their priors, infinite for a column
-    that is not used."""
+    coefficients. parameters: effective number of these (MacKay, 1992). mean (M,): their posterior means. precision
+    (M,): of their priors, infinite for a column that is not used."""
 
     evidence: float
     reduction: float
+    parameters: float
     mean: Tensor
     precision: Tensor
 
@@ -46,13 +49,13 @@ class SparseFit:
         """The fit of some columns as a fit of all. columns (M,) bool: those that were fitted."""
         mean, precision = torch.zeros(columns.shape).to(self.mean), torch.full(columns.shape, math.inf).to(self.mean)
         mean[columns], precision[columns] = self.mean, self.precision
-        return SparseFit(self.evidence, self.reduction, mean, precision)
+        return replace(self, mean=mean, precision=precision)
 
 
-def column_costs(choices: Tensor, largest: float) -> Tensor:
-    """Cost (M,) of using each column, nats.
+def regressor_costs(choices: Tensor, largest: float) -> Tensor:
+    """Cost (M,) of using each regressor, nats.
 
-    choices (M,): number of columns among which each is selected; it costs log(choices). The prior of a coefficient's
+    choices (M,): number of regressors among which each is selected; it costs log(choices). The prior of a coefficient's
     size is log-uniform over log(largest) e-folds, from an influence of one (the norm of its column times its size) to
     `largest`. The evidence as a function of the logarithm of the size has a width of sqrt(pi), so that the
     integral over it is sqrt(pi) / log(largest) of its maximum.
@@ -61,101 +64,186 @@ def column_costs(choices: Tensor, largest: float) -> Tensor:
 
 
 def sparse_fit(
-    gram: Tensor, score: Tensor, costs: Tensor, start: Tensor | None = None, *, exchanges: bool = False
+    gram: Tensor,
+    score: Tensor,
+    regressor: Tensor,
+    costs: Tensor,
+    start: Tensor | None = None,
+    *,
+    exchanges: bool = False,
 ) -> SparseFit:
     """Solve the regression with gram (M, M) = C'C and score (M,) = C'r.
 
-    costs (M,): of using each column. start: precisions of the first columns from which the ascent starts. exchanges:
-    whether columns are exchanged, which takes long if many are in use.
+    regressor (M,): the one that each column belongs to. costs (M,): of using it. start: precisions of the first columns
+    from which the ascent starts. exchanges: whether regressors are exchanged, which takes long if many are in use.
     """
-    size = torch.diagonal(gram).clamp(min=0.0)
-    visible, size = size > VISIBLE, torch.sqrt(size.clamp(min=VISIBLE))
-    unit, target = gram / size.unsqueeze(1) / size, score / size
-    precision = torch.full_like(target, math.inf)
-    if start is not None:
-        known = slice(len(start))
-        precision[known] = torch.where(visible[known], start / size[known].square(), math.inf)
-    costs = torch.where(visible, costs, math.inf)
-    precision = _ascended(unit, target, precision, costs)
-    while exchanges and (better := _exchanged(unit, target, precision, costs)) is not None:
+    problem = _Problem(gram, score, regressor, costs)
+    precision = problem.ascended(problem.initial(start))
+    while exchanges and (better := problem.exchanged(precision)) is not None:
         precision = better
-    posterior = _Posterior.of(unit, target, precision)
-    evidence, reduction = posterior.evidence(target, precision, costs), posterior.reduction(target)
-    return SparseFit(evidence, reduction, posterior.mean / size, precision * size.square())
+    posterior = problem.posterior(precision)
+    return SparseFit(
+        problem.evidence(posterior, precision),
+        problem.reduction(posterior),
+        posterior.parameters(precision),
+        posterior.mean / problem.size,
+        precision * problem.size.square(),
+    )
 
 
-def _ascended(unit: Tensor, target: Tensor, precision: Tensor, costs: Tensor) -> Tensor:
-    """The precisions after all single changes that gain."""
-    precision = precision.clone()
-    for _ in range(MOST_CHANGES if len(target) else 0):
-        gain, updated = _changes(unit, target, precision, costs)
+class _Problem:
+    """A regression on columns scaled to unit norm. size (M,): their norms."""
+
+    def __init__(self, gram: Tensor, score: Tensor, regressor: Tensor, costs: Tensor) -> None:
+        squared, (_, regressor, columns) = (
+            torch.diagonal(gram).clamp(min=0.0),
+            torch.unique(regressor, return_inverse=True, return_counts=True),
+        )
+        self.size = torch.sqrt(squared.clamp(min=VISIBLE))
+        self.unit, self.target = gram / self.size.unsqueeze(1) / self.size, score / self.size
+        self.regressor, of_one = regressor, columns[regressor]
+        self.single = of_one == 1
+        self.visible = (squared > VISIBLE) | ~self.single
+        self.costs = torch.where(self.visible, costs, math.inf)
+        self.share = self.costs / of_one  # of the cost of its regressor, for each column
+        self.several = [(regressor == r).nonzero().flatten() for r in (columns > 1).nonzero().flatten().tolist()]
+
+    def initial(self, start: Tensor | None) -> Tensor:
+        """The precisions (M,) from which the ascent starts."""
+        precision = torch.full_like(self.target, math.inf)
+        if start is not None:
+            known = slice(len(start))
+            precision[known] = torch.where(self.visible[known], start / self.size[known].square(), math.inf)
+        return precision
+
+    def posterior(self, precision: Tensor) -> _Posterior:
+        return _Posterior.of(self.unit, self.target, precision)
+
+    def reduction(self, posterior: _Posterior) -> float:
+        """Reduction of half of chi-square, b'S b / 2."""
+        return 0.5 * float(self.target @ posterior.mean)
+
+    def evidence(self, posterior: _Posterior, precision: Tensor) -> float:
+        """Log evidence less the costs."""
+        used = torch.isfinite(precision)
+        volume = 0.5 * float(torch.log(precision[used]).sum()) - posterior.half_log_det
+        return self.reduction(posterior) + volume - float(self.share[used].sum())
+
+    def ascended(self, precision: Tensor) -> Tensor:
+        """The precisions after all changes of one regressor that gain."""
+        precision = precision.clone()
+        for n in range(MOST_CHANGES if len(self.target) else 0):
+            change = self._best_of_single(precision)
+            if n == 0 or not change.gain > CONVERGED:
+                change = max([change, *(self._of_several(precision, columns) for columns in self.several)])
+            if not change.gain > CONVERGED:
+                break
+            precision[change.columns] = change.precision
+        return precision
+
+    def exchanged(self, precision: Tensor) -> Tensor | None:
+        """The precisions after the first exchange of a regressor in use that gains, and what follows; None if none
+        does."""
+        least, used = self.evidence(self.posterior(precision), precision) + CONVERGED, torch.isfinite(precision)
+        for r in torch.unique(self.regressor[used]).tolist():
+            trial = torch.where(self.regressor == r, math.inf, precision)
+            change = self._best_of_single(trial, ~used)
+            trial[change.columns] = change.precision
+            trial = self.ascended(trial)
+            if self.evidence(self.posterior(trial), trial) > least:
+                return trial
+        return None
+
+    def _best_of_single(self, precision: Tensor, among: Tensor | None = None) -> _Change:
+        """The best change of the precision of one column, its regressor. among (M,) bool: the columns considered.
+
+        Equations 16 to 33 of the paper; `sparsity` is S, `quality` is Q.
+        """
+        posterior, used = self.posterior(precision), torch.isfinite(precision)
+        sparsity, quality = posterior.sparsity, self.target - self.unit @ posterior.mean
+        now = torch.where(used, precision, 1.0)
+        # s and q: what S and Q would be without the column itself.
+        factor = torch.where(used, now / (now - sparsity), 1.0)
+        s, q = factor * sparsity, factor * quality
+        excess = q * q - s
+        likeliest = torch.where(excess > 0.0, s * s / excess.clamp(min=1e-300), math.inf)
+        ratio = (quality * quality / sparsity.clamp(min=1e-300)).clamp(min=1e-300)
+        added = 0.5 * (ratio - 1.0 - torch.log(ratio)) - self.costs
+        change = torch.where(excess > 0.0, 1.0 / likeliest, 0.0) - 1.0 / now
+        left = (1.0 + sparsity * change).clamp(min=1e-300)
+        estimated = 0.5 * (quality * quality * change / left - torch.log(left))
+        share = (1.0 - sparsity / now).clamp(min=1e-300)
+        removed = 0.5 * (quality * quality / (sparsity - now) - torch.log(share)) + self.costs
+        may_be_added = ~used & (excess > 0.0) & (sparsity > COLLINEAR)
+        keep = used & (excess > 0.0) & (estimated >= removed)
+        gain = torch.where(used, torch.where(keep, estimated, removed), torch.where(may_be_added, added, -math.inf))
+        considered = self.single if among is None else self.single & among
+        gain = torch.where(considered, gain.nan_to_num(nan=-math.inf), -math.inf)
         best = int(gain.argmax())
-        if not float(gain[best]) > CONVERGED:
-            break
-        precision[best] = updated[best]
-    return precision
+        likeliest = torch.where(keep | may_be_added, likeliest, math.inf)
+        return _Change(float(gain[best]), torch.tensor([best]), likeliest[best : best + 1])
+
+    def _of_several(self, precision: Tensor, columns: Tensor) -> _Change:
+        """The best change of the common precision a of the coefficients of several columns.
+
+        Without them, the readings have the covariance K. With C'K^-1 C = U diag(s) U' and q = U'C'K^-1 r, the columns
+        add sum(q^2 / (a + s) - log(1 + s / a)) / 2 to the evidence.
+        """
+        without, size = precision.clone(), self.size[columns]
+        without[columns] = math.inf
+        posterior = self.posterior(without)
+        explained = posterior.explained[:, columns]
+        strength = (self.unit[columns][:, columns] - explained.T @ explained) * size * size.unsqueeze(1)
+        quality = (self.target[columns] - self.unit[columns] @ posterior.mean) * size
+        s, rotation = torch.linalg.eigh(strength)
+        s, q = s.clamp(min=0.0), rotation.T @ quality
+
+        def gained(log_precision: Tensor) -> Tensor:
+            a = torch.exp(log_precision).unsqueeze(1)
+            return 0.5 * (q * q / (a + s) - torch.log1p(s / a)).sum(dim=1) - self.costs[columns[0]]
+
+        center, width = torch.log(s[-1].clamp(min=VISIBLE)) - 0.5 * WIDEST, 0.5 * WIDEST
+        for count in (61, 51):
+            tried = center + width * torch.linspace(-1.0, 1.0, count, dtype=s.dtype)
+            gains = gained(tried)
+            center, width = tried[gains.argmax()], 2.0 * width / (count - 1)
+        now = self.size[columns[0]].square() * precision[columns[0]]
+        before = float(gained(torch.log(now).unsqueeze(0))) if math.isfinite(now) else 0.0
+        best = float(gains.max())
+        chosen = torch.exp(center) / size.square() if best > 0.0 else torch.full_like(size, math.inf)
+        return _Change(max(best, 0.0) - before, columns, chosen)
 
 
-def _exchanged(unit: Tensor, target: Tensor, precision: Tensor, costs: Tensor) -> Tensor | None:
-    """The precisions after the first exchange of a column in use that gains, and what follows; None if none does."""
-    least = _Posterior.of(unit, target, precision).evidence(target, precision, costs) + CONVERGED
-    used = torch.isfinite(precision)
-    for j in used.nonzero().flatten().tolist():
-        trial = precision.clone()
-        trial[j] = math.inf
-        gain, updated = _changes(unit, target, trial, costs)
-        best = int(torch.where(used, -math.inf, gain).argmax())
-        trial[best] = updated[best]
-        trial = _ascended(unit, target, trial, costs)
-        if _Posterior.of(unit, target, trial).evidence(target, trial, costs) > least:
-            return trial
-    return None
+@dataclass(frozen=True)
+class _Change:
+    """gain: in log evidence, costs included. precision (N,): of the columns (N,), after the change."""
 
+    gain: float
+    columns: Tensor
+    precision: Tensor
 
-def _changes(unit: Tensor, target: Tensor, precision: Tensor, costs: Tensor) -> tuple[Tensor, Tensor]:
-    """Gain in log evidence, costs included, of the best change of each precision (M,), and the precision after it.
-
-    Equations 16 to 33 of the paper; `sparsity` is S, `quality` is Q.
-    """
-    posterior, used = _Posterior.of(unit, target, precision), torch.isfinite(precision)
-    sparsity, quality = posterior.sparsity, target - unit @ posterior.mean
-    now = torch.where(used, precision, 1.0)
-    # s and q: what S and Q would be without the column itself.
-    factor = torch.where(used, now / (now - sparsity), 1.0)
-    s, q = factor * sparsity, factor * quality
-    excess = q * q - s
-    likeliest = torch.where(excess > 0.0, s * s / excess.clamp(min=1e-300), math.inf)
-    ratio = (quality * quality / sparsity.clamp(min=1e-300)).clamp(min=1e-300)
-    added = 0.5 * (ratio - 1.0 - torch.log(ratio)) - costs
-    change = torch.where(excess > 0.0, 1.0 / likeliest, 0.0) - 1.0 / now
-    left = (1.0 + sparsity * change).clamp(min=1e-300)
-    estimated = 0.5 * (quality * quality * change / left - torch.log(left))
-    share = (1.0 - sparsity / now).clamp(min=1e-300)
-    removed = 0.5 * (quality * quality / (sparsity - now) - torch.log(share)) + costs
-    may_be_added = ~used & (excess > 0.0) & (sparsity > COLLINEAR)
-    keep = used & (excess > 0.0) & (estimated >= removed)
-    gain = torch.where(used, torch.where(keep, estimated, removed), torch.where(may_be_added, added, -math.inf))
-    return gain.nan_to_num(nan=-math.inf), torch.where(keep | may_be_added, likeliest, math.inf)
+    def __lt__(self, other: _Change) -> bool:
+        return self.gain < other.gain
 
 
 @dataclass(frozen=True)
 class _Posterior:
-    """mean (M,): zero for columns that are not used. sparsity (M,): C_j' (I - C S C') C_j of each column. half_log_det:
-    half the log determinant of the curvature of the columns in use."""
+    """mean (M,): zero for columns that are not used. root (U, U): L of the curvature L L' of the U columns in use.
+    explained (U, M): L^-1 C_u'C_j of each column. sparsity (M,): C_j' (I - C S C') C_j."""
 
     mean: Tensor
+    root: Tensor
+    explained: Tensor
     sparsity: Tensor
-    half_log_det: float
 
-    def reduction(self, target: Tensor) -> float:
-        """Reduction of half of chi-square, b'S b / 2."""
-        return 0.5 * float(target @ self.mean)
+    @property
+    def half_log_det(self) -> float:
+        return float(torch.log(torch.diagonal(self.root)).sum())
 
-    def evidence(self, target: Tensor, precision: Tensor, costs: Tensor) -> float:
-        """Log evidence less the costs."""
-        used = torch.isfinite(precision)
-        volume = 0.5 * float(torch.log(precision[used]).sum()) - self.half_log_det
-        return self.reduction(target) + volume - float(costs[used].sum())
+    def parameters(self, precision: Tensor) -> float:
+        """Effective number of coefficients, the sum of 1 - a S_jj (MacKay, 1992)."""
+        inverse = torch.linalg.solve_triangular(self.root, torch.eye(len(self.root)).to(self.root), upper=False)
+        return len(self.root) - float(precision[torch.isfinite(precision)] @ inverse.square().sum(dim=0))
 
     @staticmethod
     def of(unit: Tensor, target: Tensor, precision: Tensor) -> _Posterior:
@@ -165,4 +253,4 @@ class _Posterior:
         mean[used] = torch.cholesky_solve(target[used].unsqueeze(1), root).squeeze(1)
         explained = torch.linalg.solve_triangular(root, unit[used], upper=False)
         sparsity = (torch.diagonal(unit) - explained.square().sum(dim=0)).clamp(min=0.0)
-        return _Posterior(mean, sparsity, float(torch.log(torch.diagonal(root)).sum()))
+        return _Posterior(mean, root, explained, sparsity)

@@ -85,16 +85,20 @@ class WhitenedDiscrepancy:
             self._products[b, a] = self._products[a, b].T
         return self._products[a, b]
 
-    def sparse_fit(self, costs: Tensor, start: Tensor | None = None, *, exchanges: bool = False) -> SparseFit:
-        """Sparse regression on the columns. costs (M,): of using each. start: precisions of the first columns."""
+    def sparse_fit(
+        self, regressor: Tensor, costs: Tensor, start: Tensor | None = None, *, exchanges: bool = False
+    ) -> SparseFit:
+        """Sparse regression on the columns. regressor (M,): that of each. costs (M,): of using it. start: precisions of
+        the first columns."""
         gram = torch.cat([torch.cat([self._product(a, b) for b in self._blocks], dim=1) for a in self._blocks])
         score = torch.cat([(b.remaining.T @ self._selecting.residual).squeeze(1) for b in self._blocks])
-        selected = sparse_fit(gram, score, costs, start, exchanges=exchanges)
+        selected = sparse_fit(gram, score, regressor, costs, start, exchanges=exchanges)
         used = selected.used
         in_use = Columns(tuple(b.columns for b in self._blocks))[used]
         columns = self._exact.remaining(self._under.whiten(in_use))
         score = (columns.T @ self._exact.residual).squeeze(1)
-        return sparse_fit(columns.T @ columns, score, costs[used], selected.precision[used]).among(used)
+        precision = selected.precision[used]
+        return sparse_fit(columns.T @ columns, score, regressor[used], costs[used], precision).among(used)
 
 
 def _grouped(x: Tensor, each: int) -> Tensor:
