@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Sequence
+from difflib import SequenceMatcher
 from fnmatch import fnmatchcase
 
 MOST_SHOWN = 80
 MOST_SIMILAR = 3
+MISSPELT = (
+    0.75  # share of the letters of two names that agree (difflib's ratio), above which one is the other, misspelt
+)
 _WORDS = re.compile(r"[^\W_]+")
 
 
@@ -33,16 +37,13 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def similar(name: str, known: Iterable[str]) -> list[str]:
-    """At most `MOST_SIMILAR` known names that may be meant: misspelt, or else a part of the words given or more words.
-
-    A name counts as misspelt if it differs by at most a third of its letters, as in the Rust compiler.
-    """
+    """At most `MOST_SIMILAR` known names that may be meant: a part of the words given or more words, or else misspelt."""
     name, distinct = name[:MOST_SHOWN].lower(), list(dict.fromkeys(known))
-    misspelt = {each: _misspellings(name, each.lower()) for each in distinct}
-    least = min(misspelt.values(), default=0)
-    if least <= len(name) // 3:
-        return [each for each in distinct if misspelt[each] == least][:MOST_SIMILAR]
-    return [each for each in distinct if _shares_words(name, each.lower())][:MOST_SIMILAR]
+    alike = {each: SequenceMatcher(None, name, each.lower()).ratio() for each in distinct}
+    most = max(alike.values(), default=0.0)
+    related = [each for each in distinct if _shares_words(name, each.lower())]
+    misspelt = [each for each in distinct if alike[each] == most >= MISSPELT]
+    return (related or misspelt)[:MOST_SIMILAR]
 
 
 def _shares_words(name: str, known: str) -> bool:
@@ -50,19 +51,6 @@ def _shares_words(name: str, known: str) -> bool:
     words, known_words = set(_WORDS.findall(name)), set(_WORDS.findall(known))
     begins = bool(name) and (known.startswith(name) or name.startswith(known))
     return begins or (bool(words and known_words) and (words <= known_words or known_words <= words))
-
-
-def _misspellings(name: str, known: str) -> int:
-    """Letters inserted, left out, replaced or swapped with the next one (Damerau, 1964, Comm. ACM 7, 171-176)."""
-    before, last = [0] * (len(known) + 1), list(range(len(known) + 1))
-    for i, letter in enumerate(name, start=1):
-        row = [i]
-        for j, other in enumerate(known, start=1):
-            row.append(min(last[j] + 1, row[-1] + 1, last[j - 1] + (letter != other)))
-            if i > 1 and j > 1 and (letter, name[i - 2]) == (known[j - 2], other):
-                row[-1] = min(row[-1], before[j - 2] + 1)
-        before, last = last, row
-    return last[-1]
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> str:
