@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from fdi_torch.gap.answer import UNKNOWN, Amount, Answer, Cause, CauseName, ProbableExplanation, names
-from fdi_torch.gap.candidate_fit import Fitter, standard_errors
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter, covariance, standard_errors
 from fdi_torch.gap.cause_hypothesis import CauseHypothesis
 from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.diagnosis_result import DiagnosisResult
@@ -143,14 +145,10 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
     standard error.
     """
     fitter, fit = result.fitter, result.effects_fit
-    plant, stds = fitter.data.plant, standard_errors(fitter, fit)
-    causes = []
+    plant, causes = fitter.data.plant, []
     placements = [p for p in fit.candidate.placements if (p.effect.name, p.location) in result.posterior.best.causes]
     for p in placements:
-        amounts = {
-            ParameterName.parse(name).field: Amount(value, stds[name], fit.space[name].unit)
-            for name, value in fit.values_of([p]).items()
-        }
+        amounts = _amounts(fitter, fit, p)
         cause = (p.effect.name, p.location)
         others = equivalence_class(cause, plant, fit.values) - {cause}
         causes.append(Cause(*cause, amounts, tuple(sorted(others))))
@@ -160,6 +158,29 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
     rounded = [replace(p, values={"step": steps[p.location]}) for p in result.library if p.effect.quantizes]
     shown = {(p.effect.name, p.location): _amounts_from_readings(p, plant) for p in (*result.limits, *rounded)}
     return (*causes, *(Cause(*name, shown.get(name, {})) for name in result.from_readings))
+
+
+def _amounts(fitter: Fitter, fit: Fit, placement: Placement) -> dict[str, Amount]:
+    """Fitted parameters of an effect, with standard errors.
+
+    A ramp that has not ended when the recording does shows a rate only, in which size and ramp cancel. It is told as
+    one that ends with the recording, with the size that it has reached.
+    """
+    fitted, stds = fit.values_of([placement]), standard_errors(fitter, fit)
+    size, *_ = (placement.full_name(p.name) for p in placement.effect.parameters(placement.location, fitter.data.plant))
+    onset, ramp = placement.full_name("onset"), placement.full_name("ramp")
+    left = fitter.data.longest_duration - fitted.get(onset, 0.0)
+    if fitted.get(ramp, 0.0) >= left:
+        growth = (fitted[size] - fit.space[size].nominal) / fitted[ramp]
+        slopes = torch.zeros(2, len(fit.space), dtype=fit.theta.dtype)  # of size and ramp, by the fitted parameters
+        slopes[0, fit.space.index(size)] = left / fitted[ramp]
+        slopes[0, fit.space.index(ramp)] = -growth * left / fitted[ramp]
+        if onset in fitted:
+            slopes[:, fit.space.index(onset)] = torch.tensor([-growth, -1.0], dtype=slopes.dtype)
+        variance = torch.diagonal(slopes @ covariance(fitter, fit) @ slopes.T).clamp(min=0.0)
+        fitted = {**fitted, size: fit.space[size].nominal + growth * left, ramp: left}
+        stds |= dict(zip((size, ramp), torch.sqrt(variance).tolist(), strict=True))
+    return {ParameterName.parse(n).field: Amount(value, stds[n], fit.space[n].unit) for n, value in fitted.items()}
 
 
 def _amounts_from_readings(placement: Placement, plant: PlantDescription) -> dict[str, Amount]:

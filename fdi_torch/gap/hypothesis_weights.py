@@ -121,8 +121,9 @@ class HypothesisWeights:
     ) -> list[CauseHypothesis]:
         """The hypothesis without some of its effects, by the posterior over the prior density of their sizes at zero.
 
-        This ratio is the Bayes factor for the hypothesis without an effect (Dickey, 1971). Beside a discrepancy, a fit
-        without the effect may end in a local maximum instead. left_out: effects that `h` lacks.
+        This ratio is the Bayes factor for the hypothesis without an effect (Dickey, 1971), at the most likely onset and
+        the like: of an effect of size zero, they are arbitrary. Beside a discrepancy, a fit without the effect may end
+        in a local maximum instead. left_out: effects that `h` lacks.
         """
         fewer: list[CauseHypothesis] = []
         if (at := h.discrepancy) is None:
@@ -133,7 +134,8 @@ class HypothesisWeights:
                 i, fitter = at.fit.space.index(name), self.pool.fitter
                 low, high, _ = fitter.box(at.fit.space)
                 nothing = at.fit.space.parameters[i].nominal
-                density = at.estimate.log_density(i, nothing, (float(low[i]), float(high[i])))
+                shape = [at.fit.space.index(n) for n in at.fit.values_of([p]) if n in at.fit.space and n != name]
+                density = at.estimate.log_density(i, nothing, (float(low[i]), float(high[i])), shape)
                 ratio = density + log_width(fitter, at.fit.space, i) + 0.5 * math.log(2.0 * math.pi)
                 key, without = h.explanation.key - left_out, left_out | {cause}
                 odds = log_prior(key - {cause}, self.pool.choices) - log_prior(key, self.pool.choices)

@@ -91,12 +91,15 @@ def head_range(plant: PlantDescription, pipe: str, operating_range: OperatingRan
     return max(low - far_high, far_low - high, 0.0), max(high - far_low, far_high - low)
 
 
-def onset_grid(operating_range: OperatingRange) -> list[float]:
-    """Onset times from which a fit converges to any onset, s.
+def starts_with_onsets(sizes: Sequence[Mapping[str, float]], operating_range: OperatingRange) -> list[dict[str, float]]:
+    """Starts of an effect that acts from the beginning, from an onset on, or grows from an onset to the end.
 
     The cost has a local minimum about the true onset; nine evenly spaced starts put one within reach of it.
     """
-    return interior_points((0.0, operating_range.duration), 9)
+    duration = operating_range.duration
+    begun = [{"onset": onset} for onset in interior_points((0.0, duration), 9)]
+    growing = {"onset": 0.3 * duration, "ramp": 0.7 * duration}
+    return [{**size, **time} for time in ({}, *begun, growing) for size in sizes]
 
 
 def interior_points(ends: Range, count: int) -> list[float]:

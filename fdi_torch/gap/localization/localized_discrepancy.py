@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,13 +19,15 @@ from fdi_torch.gap.marginal_likelihood import occam, with_disturbances
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.linearised import Linearised
 
+COLLINEAR = 1e-12  # least share of a parameter's variance that others leave, a limit of rounding
+
 
 @dataclass(frozen=True)
 class Estimate:
-    """Most likely values (P,) of a fit's parameters, and their standard errors (P,)."""
+    """Most likely values (P,) of a fit's parameters, and their covariance (P, P)."""
 
     values: Tensor
-    std: Tensor
+    covariance: Tensor
 
     @staticmethod
     def beside(under: Fitter, fit: Fit, linearised: Linearised, columns: Tensor, precision: Tensor) -> Estimate:
@@ -38,18 +41,25 @@ class Estimate:
         basis, factor = decomposed(rows, torch.cat([pull, precision.sqrt()]))
         inverse = torch.linalg.solve_triangular(factor, torch.eye(len(factor)).to(factor), upper=True)[: len(scale)]
         right = torch.cat([residual.flatten(), -off, torch.zeros_like(precision)])
-        return Estimate(fit.theta + scale * (inverse @ (basis.T @ right)), scale * inverse.norm(dim=1))
+        scaled = scale.unsqueeze(1) * inverse
+        return Estimate(fit.theta + scaled @ (basis.T @ right), scaled @ scaled.T)
 
-    def log_density(self, i: int, value: float, bounds: tuple[float, float]) -> float:
-        """Log density of parameter i at a value: normal, and zero outside its bounds.
+    def log_density(self, i: int, value: float, bounds: tuple[float, float], held: Sequence[int] = ()) -> float:
+        """Log density of parameter i at a value, with other parameters `held` at theirs: normal, and zero outside its
+        bounds.
 
         If the readings tell nothing of the parameter, it is uniform between them.
         """
-        low, z, high = ((x - float(self.values[i])) / float(self.std[i]) for x in (bounds[0], value, bounds[1]))
+        size = torch.sqrt(torch.diagonal(self.covariance))
+        correlation, others = self.covariance / size / size.unsqueeze(1), list(held)
+        shared = torch.linalg.pinv(correlation[others][:, others], hermitian=True) @ correlation[others, i]
+        left = 1.0 - float(correlation[i, others] @ shared)
+        std = float(size[i]) * math.sqrt(max(left, COLLINEAR))
+        low, z, high = ((x - float(self.values[i])) / std for x in (bounds[0], value, bounds[1]))
         below, above = (torch.tensor([low, high]) if low + high < 0.0 else torch.tensor([-high, -low])).double()
         above, below = torch.special.log_ndtr(above), torch.special.log_ndtr(below)
         mass = float(above + torch.log(-torch.expm1(below - above)))
-        return -0.5 * z * z - math.log(float(self.std[i]) * math.sqrt(2.0 * math.pi)) - mass
+        return -0.5 * z * z - math.log(std * math.sqrt(2.0 * math.pi)) - mass
 
 
 @dataclass(frozen=True)
