@@ -67,7 +67,7 @@ def test_the_density_ratio_at_zero_is_the_ratio_of_evidences(sound: tuple[Fitter
 
 @pytest.mark.parametrize("mean", [0.4, -2.0, 5.0])
 def test_the_density_of_an_estimate_is_that_of_a_normal_distribution_between_its_bounds(mean: float) -> None:
-    estimate = Estimate(torch.tensor([mean]).double(), torch.tensor([0.7]).double())
+    estimate = Estimate(torch.tensor([mean]).double(), torch.tensor([[0.7**2]]).double())
     x = torch.linspace(-0.5, 1.5, 2001).double()
     density = [math.exp(estimate.log_density(0, value, (-0.5, 1.5))) for value in x.tolist()]
     assert torch.trapezoid(torch.tensor(density).double(), x) == pytest.approx(1.0, abs=1e-5)
@@ -75,7 +75,7 @@ def test_the_density_of_an_estimate_is_that_of_a_normal_distribution_between_its
 
 
 def test_an_estimate_without_information_is_uniform_between_its_bounds() -> None:
-    estimate = Estimate(torch.tensor([3.0]).double(), torch.tensor([1e9]).double())
+    estimate = Estimate(torch.tensor([3.0]).double(), torch.tensor([[1e18]]).double())
     assert estimate.log_density(0, 0.0, (-0.5, 1.5)) == pytest.approx(-math.log(2.0), abs=1e-6)
 
 

@@ -92,14 +92,18 @@ def head_range(plant: PlantDescription, pipe: str, operating_range: OperatingRan
 
 
 def starts_with_onsets(sizes: Sequence[Mapping[str, float]], operating_range: OperatingRange) -> list[dict[str, float]]:
-    """Starts of an effect that acts from the beginning, from an onset on, or grows from an onset to the end.
+    """Starts of an effect that acts from the beginning, or from an onset on.
 
     The cost has a local minimum about the true onset; nine evenly spaced starts put one within reach of it.
     """
+    onsets = [{"onset": onset} for onset in interior_points((0.0, operating_range.duration), 9)]
+    return [{**size, **onset} for onset in ({}, *onsets) for size in sizes]
+
+
+def growing_starts(sizes: Sequence[Mapping[str, float]], operating_range: OperatingRange) -> list[dict[str, float]]:
+    """Starts of an effect that grows from an onset to the end of the recording."""
     duration = operating_range.duration
-    begun = [{"onset": onset} for onset in interior_points((0.0, duration), 9)]
-    growing = {"onset": 0.3 * duration, "ramp": 0.7 * duration}
-    return [{**size, **time} for time in ({}, *begun, growing) for size in sizes]
+    return [{**size, "onset": 0.3 * duration, "ramp": 0.7 * duration} for size in sizes]
 
 
 def interior_points(ends: Range, count: int) -> list[float]:
