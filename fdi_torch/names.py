@@ -37,7 +37,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 
 def similar(name: str, known: Iterable[str]) -> list[str]:
-    """At most `MOST_SIMILAR` known names that may be meant: a part of the words given or more words, or else misspelt."""
+    """At most `MOST_SIMILAR` known names that may be meant: a part of the words given, or more, or else misspelt."""
     name, distinct = name[:MOST_SHOWN].lower(), list(dict.fromkeys(known))
     alike = {each: SequenceMatcher(None, name, each.lower()).ratio() for each in distinct}
     most = max(alike.values(), default=0.0)
