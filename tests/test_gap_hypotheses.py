@@ -74,6 +74,15 @@ def test_the_density_of_an_estimate_is_that_of_a_normal_distribution_between_its
     assert density[1500] / density[500] == pytest.approx(math.exp(((mean**2) - (1.0 - mean) ** 2) / (2 * 0.7**2)))
 
 
+def test_a_size_that_cancels_with_its_ramp_is_compared_with_zero_at_that_ramp() -> None:
+    """Alone it seems undetermined; the rate is known to 1 %."""
+    covariance = torch.tensor([[1.0, 1.0 - 5e-5], [1.0 - 5e-5, 1.0]]).double()
+    estimate = Estimate(torch.tensor([1.0, 1.0]).double(), covariance)
+    assert estimate.log_density(0, 0.0, (-50.0, 50.0)) > -2.0
+    expected = -0.5 / 1e-4 - math.log(0.01 * math.sqrt(2.0 * math.pi))
+    assert estimate.log_density(0, 0.0, (-50.0, 50.0), held=[1]) == pytest.approx(expected, rel=1e-3)
+
+
 def test_an_estimate_without_information_is_uniform_between_its_bounds() -> None:
     estimate = Estimate(torch.tensor([3.0]).double(), torch.tensor([[1e18]]).double())
     assert estimate.log_density(0, 0.0, (-0.5, 1.5)) == pytest.approx(-math.log(2.0), abs=1e-6)

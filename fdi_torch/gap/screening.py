@@ -179,9 +179,8 @@ class _ProjectedRegression:
     def pairs(self, screening: ScreeningResult) -> Pairs:
         """The regression on pairs of the most promising options."""
         chosen: set[int] = set()
-        by_strength, by_gain = (
-            torch.argsort(x, descending=True).tolist() for x in (screening.strength, screening.gain)
-        )
+        values = screening.strength, screening.gain
+        by_strength, by_gain = (torch.argsort(x, descending=True).tolist() for x in values)
         for order in (sorted(by_strength, key=lambda i: not screening.options[i].permanent), by_gain):
             best: dict[tuple[str, str], int] = {}
             for i in order:
