@@ -61,6 +61,15 @@ def test_a_fault_that_begins_or_grows_in_mid_record_is_named(truth: dict[str, fl
         assert estimate.value == pytest.approx(value, abs=5.0 * estimate.std)
 
 
+def test_a_ramp_that_has_not_ended_is_told_by_the_size_that_it_has_reached() -> None:
+    truth = {"h2.sensor_bias.bias": 0.04, "h2.sensor_bias.onset": 400.0, "h2.sensor_bias.ramp": 1200.0}
+    answer = diagnose(nominal_plant(), recorded(truth, 33), settings=Settings(("sensor_bias",)))
+    (cause,) = answer.causes
+    assert cause.parameters["onset"].value + cause.parameters["ramp"].value == pytest.approx(999.0)
+    reached = cause.parameters["bias"]
+    assert reached.value == pytest.approx(0.04 * 599.0 / 1200.0, abs=4.0 * reached.std) and reached.std < 1e-3
+
+
 @pytest.mark.parametrize(("truth", "seed"), [({"T1.leak.size": 0.3}, 1), ({"T1.leak.size": 0.3}, 0)])
 def test_a_fault_from_the_start_at_the_floor_has_neither_onset_nor_height(truth: dict[str, float], seed: int) -> None:
     """Both lower chi-square by chance; their prior widths cost more than that."""

@@ -174,10 +174,9 @@ def _amounts(fitter: Fitter, fit: Fit, placement: Placement) -> dict[str, Amount
         growth = (fitted[size] - fit.space[size].nominal) / fitted[ramp]
         slopes = torch.zeros(2, len(fit.space), dtype=fit.theta.dtype)  # of size and ramp, by the fitted parameters
         slopes[0, fit.space.index(size)] = left / fitted[ramp]
-        slopes[0, fit.space.index(ramp)] = -growth * left / fitted[ramp]
         if onset in fitted:
             slopes[:, fit.space.index(onset)] = torch.tensor([-growth, -1.0], dtype=slopes.dtype)
-        variance = torch.diagonal(slopes @ covariance(fitter, fit) @ slopes.T).clamp(min=0.0)
+        variance = torch.diagonal(slopes @ covariance(fitter, fit, held=(ramp,)) @ slopes.T).clamp(min=0.0)
         fitted = {**fitted, size: fit.space[size].nominal + growth * left, ramp: left}
         stds |= dict(zip((size, ramp), torch.sqrt(variance).tolist(), strict=True))
     return {ParameterName.parse(n).field: Amount(value, stds[n], fit.space[n].unit) for n, value in fitted.items()}

@@ -223,11 +223,16 @@ def _in_library_order(placements: Sequence[Placement]) -> list[Placement]:
     return sorted(placements, key=lambda p: order.get(p.effect.name, len(order)))
 
 
-def covariance(fitter: Fitter, fit: Fit) -> Tensor:
-    """Covariance (P, P) of a fit's parameters: the inverse of the curvature, priors included."""
+def covariance(fitter: Fitter, fit: Fit, held: Collection[str] = ()) -> Tensor:
+    """Covariance (P, P) of a fit's parameters: the inverse of the curvature, priors included.
+
+    held: parameters that count as known.
+    """
     scale, widths = fitter.box(fit.space)[2], _widths(fitter, fit)
     # What the readings do not determine must not vanish from the inverse as if it were known exactly.
     curvature = fitter.curvature(fit) + torch.diag(UNDETERMINED * (scale / widths) ** 2)
+    free = torch.tensor([n not in held for n in fit.space.names])
+    curvature = torch.where(free & free.unsqueeze(1), curvature, 0.0)
     size = torch.sqrt(torch.diagonal(curvature).clamp(min=1e-300))
     correlations = torch.linalg.pinv(curvature / size / size.unsqueeze(1), hermitian=True)
     unit = scale / size
