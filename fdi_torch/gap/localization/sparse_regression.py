@@ -95,10 +95,8 @@ class _Problem:
     """A regression on columns scaled to unit norm. size (M,): their norms."""
 
     def __init__(self, gram: Tensor, score: Tensor, regressor: Tensor, costs: Tensor) -> None:
-        squared, (_, regressor, columns) = (
-            torch.diagonal(gram).clamp(min=0.0),
-            torch.unique(regressor, return_inverse=True, return_counts=True),
-        )
+        squared = torch.diagonal(gram).clamp(min=0.0)
+        _, regressor, columns = torch.unique(regressor, return_inverse=True, return_counts=True)
         self.size = torch.sqrt(squared.clamp(min=VISIBLE))
         self.unit, self.target = gram / self.size.unsqueeze(1) / self.size, score / self.size
         self.regressor, of_one = regressor, columns[regressor]
