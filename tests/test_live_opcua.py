@@ -20,7 +20,7 @@ from test_live_mqtt import MESSAGES, told
 from test_monitor_follow import config, monitored, texts, written
 
 from fdi_torch.cli import main
-from fdi_torch.live.values import Inbox, Item
+from fdi_torch.live.values import Inbox, Item, Value
 
 asyncua = pytest.importorskip("asyncua")
 
@@ -147,12 +147,15 @@ def test_a_server_that_is_stopped_and_started_again_loses_no_event(
     is cut until the server is back, because a server that is being stopped may still take up a session.
     """
     proxy = Proxy(plc.port)
-    connected_again, put = threading.Event(), Inbox.put
+    arrived, connected_again, put = threading.Event(), threading.Event(), Inbox.put
+    last = START.timestamp() + MESSAGES[209]["t"]
 
     def noticing(self: Inbox, items: Iterable[Item]) -> None:
         put(self, kept := list(items))
         if any(isinstance(item, str) and "again after" in item for item in kept):
             connected_again.set()
+        if any(isinstance(item, Value) and item.tag.endswith(NAMES[-1]) and item.stamp >= last for item in kept):
+            arrived.set()
 
     async def failing(subscription: asyncua.common.subscription.Subscription) -> None:
         raise TimeoutError
@@ -166,7 +169,7 @@ def test_a_server_that_is_stopped_and_started_again_loses_no_event(
     def replay() -> None:
         for k, sample in enumerate(MESSAGES):
             if k == 210:
-                time.sleep(0.5)  # for what the server has not sent yet
+                assert arrived.wait(60.0)
                 proxy.cut()
                 plc.close()
                 plc.start()
