@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
-from fdi_torch.plant.operating_range import growing_starts, starts_with_onsets
 
 
 class PumpGain(Effect):
@@ -35,8 +34,7 @@ class PumpGain(Effect):
         )
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        sizes = [{"factor": 0.9}, {"factor": 1.1}]
-        return [*starts_with_onsets(sizes, operating_range), *growing_starts(sizes, operating_range)]
+        return [{"factor": 0.9}, {"factor": 1.1}]
 
     def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * (1.0 + (p["factor"] - 1.0) * local.clock.risen(p["onset"], p["ramp"]))

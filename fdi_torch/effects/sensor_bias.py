@@ -6,7 +6,6 @@ import torch
 
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
-from fdi_torch.plant.operating_range import growing_starts, starts_with_onsets
 
 
 class SensorBias(Effect):
@@ -34,8 +33,7 @@ class SensorBias(Effect):
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         sensor = plant.sensor(place)
         bias = 0.02 * reading_span(plant, sensor)
-        sizes = [{"bias": bias}, {"bias": -bias}]
-        return [*starts_with_onsets(sizes, operating_range), *growing_starts(sizes, operating_range)]
+        return [{"bias": bias}, {"bias": -bias}]
 
     def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         return value + p["bias"] * clock.risen_by_end(p["onset"], p["ramp"]), memory

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 
 from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
-from fdi_torch.plant.operating_range import growing_starts, starts_with_onsets
 
 
 class SensorGain(Effect):
@@ -28,8 +27,7 @@ class SensorGain(Effect):
         )
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        sizes = [{"factor": 0.95}, {"factor": 1.05}]
-        return [*starts_with_onsets(sizes, operating_range), *growing_starts(sizes, operating_range)]
+        return [{"factor": 0.95}, {"factor": 1.05}]
 
     def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         return value * (1.0 + (p["factor"] - 1.0) * clock.risen_by_end(p["onset"], p["ramp"])), memory

@@ -63,11 +63,11 @@ def identifiability(pairs: Pairs, plant: PlantDescription) -> Identifiability:
 
 
 def _most_visible_starts(options: Sequence[Option], strength: Tensor) -> dict[CauseName, int]:
-    """The most visible start of each cause, from the beginning of the recording if there is one: a change in mid-record
-    shows, and differs from others, by its onset."""
+    """The most visible start of each cause."""
     best: dict[CauseName, int] = {}
-    for i in sorted(range(len(options)), key=lambda i: (not options[i].permanent, -float(strength[i]))):
-        best.setdefault(options[i].cause, i)
+    for i, option in enumerate(options):
+        if option.cause not in best or strength[i] > strength[best[option.cause]]:
+            best[option.cause] = i
     return best
 
 

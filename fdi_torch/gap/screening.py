@@ -43,16 +43,11 @@ class Option:
     def cause(self) -> tuple[str, str]:
         return self.placement.effect.name, self.placement.location
 
-    @property
-    def permanent(self) -> bool:
-        """Whether it acts from the beginning of the recording."""
-        return self.placement.full_name("onset") not in self.start
-
 
 @dataclass(frozen=True)
 class Pairs:
-    """Regression on pairs of effects: of each effect at each place, the most visible start, from the beginning of the
-    recording if there is one, and the start with the largest gain.
+    """Regression on pairs of effects: of each effect at each place, the most visible start and the one with the largest
+    gain.
 
     score (M,), gram (M, M) as in `ScreeningResult`.
     """
@@ -179,11 +174,9 @@ class _ProjectedRegression:
     def pairs(self, screening: ScreeningResult) -> Pairs:
         """The regression on pairs of the most promising options."""
         chosen: set[int] = set()
-        values = screening.strength, screening.gain
-        by_strength, by_gain = (torch.argsort(x, descending=True).tolist() for x in values)
-        for order in (sorted(by_strength, key=lambda i: not screening.options[i].permanent), by_gain):
+        for value in (screening.strength, screening.gain):
             best: dict[tuple[str, str], int] = {}
-            for i in order:
+            for i in torch.argsort(value, descending=True).tolist():
                 best.setdefault(screening.options[i].cause, i)
             chosen |= set(best.values())
         options = tuple(screening.options[i] for i in sorted(chosen))

@@ -91,19 +91,12 @@ def head_range(plant: PlantDescription, pipe: str, operating_range: OperatingRan
     return max(low - far_high, far_low - high, 0.0), max(high - far_low, far_high - low)
 
 
-def starts_with_onsets(sizes: Sequence[Mapping[str, float]], operating_range: OperatingRange) -> list[dict[str, float]]:
-    """Starts of an effect that acts from the beginning, or from an onset on.
+def onset_grid(operating_range: OperatingRange) -> list[float]:
+    """Onset times from which a fit converges to any onset, s.
 
     The cost has a local minimum about the true onset; nine evenly spaced starts put one within reach of it.
     """
-    onsets = [{"onset": onset} for onset in interior_points((0.0, operating_range.duration), 9)]
-    return [{**size, **onset} for onset in ({}, *onsets) for size in sizes]
-
-
-def growing_starts(sizes: Sequence[Mapping[str, float]], operating_range: OperatingRange) -> list[dict[str, float]]:
-    """Starts of an effect that grows from an onset to the end of the recording."""
-    duration = operating_range.duration
-    return [{**size, "onset": 0.3 * duration, "ramp": 0.7 * duration} for size in sizes]
+    return interior_points((0.0, operating_range.duration), 9)
 
 
 def interior_points(ends: Range, count: int) -> list[float]:
