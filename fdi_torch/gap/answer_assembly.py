@@ -145,10 +145,10 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
     standard error.
     """
     fitter, fit = result.fitter, result.effects_fit
-    plant, causes = fitter.data.plant, []
+    plant, stds, causes = fitter.data.plant, standard_errors(fitter, fit), []
     placements = [p for p in fit.candidate.placements if (p.effect.name, p.location) in result.posterior.best.causes]
     for p in placements:
-        amounts = _amounts(fitter, fit, p)
+        amounts = _amounts(fitter, fit, p, stds)
         cause = (p.effect.name, p.location)
         others = equivalence_class(cause, plant, fit.values) - {cause}
         causes.append(Cause(*cause, amounts, tuple(sorted(others))))
@@ -160,13 +160,13 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
     return (*causes, *(Cause(*name, shown.get(name, {})) for name in result.from_readings))
 
 
-def _amounts(fitter: Fitter, fit: Fit, placement: Placement) -> dict[str, Amount]:
-    """Fitted parameters of an effect, with standard errors.
+def _amounts(fitter: Fitter, fit: Fit, placement: Placement, stds: Mapping[str, float]) -> dict[str, Amount]:
+    """Fitted parameters of an effect. stds: standard errors of all parameters of the fit.
 
     A ramp that has not ended when the recording does shows a rate only, in which size and ramp cancel. It is told as
     one that ends with the recording, with the size that it has reached.
     """
-    fitted, stds = fit.values_of([placement]), standard_errors(fitter, fit)
+    fitted = fit.values_of([placement])
     size, *_ = (placement.full_name(p.name) for p in placement.effect.parameters(placement.location, fitter.data.plant))
     onset, ramp = placement.full_name("onset"), placement.full_name("ramp")
     left = fitter.data.longest_duration - fitted.get(onset, 0.0)
@@ -178,7 +178,7 @@ def _amounts(fitter: Fitter, fit: Fit, placement: Placement) -> dict[str, Amount
             slopes[:, fit.space.index(onset)] = torch.tensor([-growth, -1.0], dtype=slopes.dtype)
         variance = torch.diagonal(slopes @ covariance(fitter, fit, held=(ramp,)) @ slopes.T).clamp(min=0.0)
         fitted = {**fitted, size: fit.space[size].nominal + growth * left, ramp: left}
-        stds |= dict(zip((size, ramp), torch.sqrt(variance).tolist(), strict=True))
+        stds = {**stds, **dict(zip((size, ramp), torch.sqrt(variance).tolist(), strict=True))}
     return {ParameterName.parse(n).field: Amount(value, stds[n], fit.space[n].unit) for n, value in fitted.items()}
 
 
