@@ -70,15 +70,12 @@ def result_table(compared: Comparison) -> tuple[list[str], list[list[str]]]:
     for result in compared.results:
         unit, scale = shown_unit(result.unit, result.name)
         values = [with_error(scale * v, scale * s) for v, s in zip(result.values, result.std, strict=True)]
-        rows.append([result.name, unit or "1", *values, _p_text(result.p_value), verdicts[result.agree]])
+        p_value = "< 0.0001" if result.p_value < 1e-4 else number(result.p_value, 2)
+        rows.append([result.name, unit or "1", *values, p_value, verdicts[result.agree]])
     header = ["parameter", "unit", *compared.labels, "p", "agree"]
     if all(result.agree is None for result in compared.results):
         return header[:-2], [row[:-2] for row in rows]
     return header, rows
-
-
-def _p_text(p: float) -> str:
-    return "< 0.0001" if p < 1e-4 else number(p, 2)
 
 
 def _convergence(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:

@@ -38,11 +38,11 @@ def escape(content: Any) -> Markup:
 def tag(name: str, /, *content: Any, **attributes: str) -> Markup:
     """An element; write `class_` and `for_` for attributes that are Python keywords."""
     written = "".join(f' {key.rstrip("_").replace("_", "-")}="{escape(value)}"' for key, value in attributes.items())
-    return Markup(f"<{name}{written}>{''.join(escape(part) for part in content)}</{name}>")
+    return Markup(f"<{name}{written}>{join(content)}</{name}>")
 
 
-def join(parts: Sequence[Any], between: str = "") -> Markup:
-    return Markup(escape(between).join(escape(part) for part in parts))
+def join(parts: Iterable[Any]) -> Markup:
+    return Markup("".join(map(escape, parts)))
 
 
 def table(header: Sequence[Any], rows: Sequence[Sequence[Any]], left: int = 1, most: int = MOST_ROWS) -> Markup:

@@ -135,6 +135,11 @@ class Material:
             return {}
         return answer
 
+    @property
+    def where(self) -> dict[str, Payload]:
+        """The `share` of each location of a gap diagnosis, see `meaning_of_shares`."""
+        return {str(place["location"]): place for place in (*self.of("/gap/where"), *self.answer.get("where", []))}
+
     @contextmanager
     def in_its_units(self) -> Iterator[None]:
         """Context of display: the units of the run's plant and of its recordings, and the recordings' clock."""

@@ -1,5 +1,5 @@
-"""The diagnosis on the drawing of a rig: levels, texts at components, moved apart so that none stands on another, and
-strength of colours.
+"""The diagnosis on the drawing of a rig: levels, texts at components, which are moved apart where they overlap, and the
+opacity of colours.
 """
 
 from __future__ import annotations
@@ -103,10 +103,9 @@ class Overlay:
         share = self.probabilities.get(name, 0.0)
         return [*lines, (percent(share), INK, "bold")] if share >= LEAST_SHARE else lines
 
-
-def strength(share: float) -> float:
-    """Opacity of a location by its probability (0 to 1); cubic, so that certain locations stand out."""
-    return 0.3 * share**3
+    def opacity(self, name: str) -> float:
+        """Opacity of the colour at a location, by the cube of its probability, so that certain ones stand out."""
+        return 0.3 * self.probabilities.get(name, 0.0) ** 3
 
 
 def level_text(level: float) -> str:

@@ -24,7 +24,6 @@ from fdi_torch.report.rig_overlay import (
     TextBlock,
     level_text,
     separated,
-    strength,
     text_width,
 )
 from fdi_torch.report.style import INK, MARK, MODEL, PAPER, SOFT, styled
@@ -107,12 +106,12 @@ class _Drawing:
         row, column = self.places[tank]
         return column * self.column, -row * self.row
 
-    def colour(self, name: str, plain: str = INK) -> str:
-        return MARK if name in self.overlay.marks else plain
+    def colour(self, name: str) -> str:
+        return MARK if name in self.overlay.marks else INK
 
     def lines(self, name: str) -> list[LetterStyle]:
         """The lines at a component: its name and below it the diagnosis."""
-        tinted = name in self.places and self.overlay.probabilities.get(name, 0.0) > 0.0
+        tinted = name in self.places and self.overlay.opacity(name) > 0.0
         return [(short(name, 16), INK, "normal"), *self.overlay.lines(name, INK if tinted else MARK)]
 
     def block(self, name: str, point: Point, ha: str, down: bool = True) -> TextBlock:
@@ -125,29 +124,27 @@ class _Drawing:
     def line(self, name: str, points: Sequence[Point], arrow: bool = False) -> None:
         """Draw a line along points, highlighted if it has a discrepancy."""
         x, y = np.array(points).T
-        if self.overlay.probabilities.get(name, 0.0) > 0.0:
-            self.axes.plot(
-                x, y, color=MARK, lw=11, alpha=strength(self.overlay.probabilities[name]), solid_capstyle="round"
-            )
+        if alpha := self.overlay.opacity(name):
+            self.axes.plot(x, y, color=MARK, lw=11, alpha=alpha, solid_capstyle="round")
         self.axes.plot(x, y, color=self.colour(name), lw=2.4 if name in self.overlay.marks else 1.6, zorder=2)
         if arrow:
             self.axes.add_patch(arrow_head(points[-1], direction(points[-2], points[-1]), self.colour(name)))
 
     def tank(self, tank: Tank) -> None:
         x, y = self.corner(tank.name)
-        probability = self.overlay.probabilities.get(tank.name, 0.0)
-        self.axes.add_patch(Rectangle((x - 0.5, y), 1.0, self.tall, facecolor=PAPER, edgecolor="none", zorder=3))
-        if probability > 0.0:
-            fill = Rectangle(
-                (x - 0.5, y), 1.0, self.tall, facecolor=MARK, alpha=strength(probability), edgecolor="none", zorder=3
-            )
-            self.axes.add_patch(fill)
+
+        def fill(height: float, colour: str, alpha: float = 1.0) -> None:
+            shape = Rectangle((x - 0.5, y), 1.0, height, facecolor=colour, alpha=alpha, edgecolor="none", zorder=3)
+            self.axes.add_patch(shape)
+
+        fill(self.tall, PAPER)
+        if alpha := self.overlay.opacity(tank.name):
+            fill(self.tall, MARK, alpha)
         level = self.overlay.levels.get(tank.name, float("nan"))
         first = self.tall - 0.08  # upper end of the tank's words
         if np.isfinite(level):
             height = self.tall * min(max(level / tank.height, 0.0), 1.0)
-            water = Rectangle((x - 0.5, y), 1.0, height, facecolor=MODEL, alpha=0.22, edgecolor="none", zorder=3)
-            self.axes.add_patch(water)
+            fill(height, MODEL, 0.22)
             self.axes.plot([x - 0.5, x + 0.5], [y + height] * 2, color=MODEL, lw=1.2, zorder=4)
             lines, above = LINE * len(self.lines(tank.name)), first + GAP / 2 - height
             if 0.0 < above < lines:  # the surface comes to lie between two lines
@@ -166,9 +163,8 @@ class _Drawing:
         first = min(max(0.85, sum(heights) + 0.2), self.tall - 0.1)
         side = -1.0 if self.joined(sensor.tank, 0.5) > self.joined(sensor.tank, -0.5) else 1.0
         centre = (x + 0.5 * side, y + first - sum(heights[: names.index(sensor.name)]))
-        probability = self.overlay.probabilities.get(sensor.name, 0.0)
-        if probability > 0.0:
-            self.axes.add_patch(Circle(centre, 0.2, facecolor=MARK, alpha=strength(probability), zorder=6))
+        if alpha := self.overlay.opacity(sensor.name):
+            self.axes.add_patch(Circle(centre, 0.2, facecolor=MARK, alpha=alpha, zorder=6))
         colour = self.colour(sensor.name)
         self.axes.add_patch(Circle(centre, 0.085, facecolor=PAPER, edgecolor=colour, lw=1.6, zorder=7))
         self.words(sensor.name, (centre[0] + 0.12 * side, centre[1] + 0.1), "left" if side > 0.0 else "right", "top")
@@ -264,12 +260,11 @@ class _Drawing:
 
     def symbol(self, name: str, sketch: Sketch, middle: Point, direction: Point) -> None:
         """Draw a component's symbol at the middle of its line, turned into the direction of the flow."""
-        colour, probability = self.colour(name), self.overlay.probabilities.get(name, 0.0)
+        colour = self.colour(name)
         if sketch.round:
             self.axes.add_patch(Circle(middle, sketch.round, facecolor=PAPER, edgecolor=colour, lw=1.6, zorder=4))
-            if probability > 0.0:
-                halo = Circle(middle, 1.6 * sketch.round, facecolor=MARK, alpha=strength(probability), zorder=5)
-                self.axes.add_patch(halo)
+            if alpha := self.overlay.opacity(name):
+                self.axes.add_patch(Circle(middle, 1.6 * sketch.round, facecolor=MARK, alpha=alpha, zorder=5))
         (x, y), (cos, sin) = middle, direction
         corners = [(x + a * cos - b * sin, y + a * sin + b * cos) for a, b in sketch.symbol]
         if sketch.round:
@@ -282,12 +277,8 @@ class _Drawing:
         if tank.overflow_to == OUTSIDE:
             return
         (x, y), (to_x, to_y) = self.corner(tank.name), self.corner(tank.overflow_to)
-        path = [
-            (x - 0.5, y + self.tall),
-            (x - 0.68, y + self.tall),
-            (x - 0.68, to_y + self.tall + 0.2),
-            (to_x - 0.3, to_y + self.tall + 0.2),
-        ]
+        rim, above = y + self.tall, to_y + self.tall + 0.2
+        path = [(x - 0.5, rim), (x - ASIDE, rim), (x - ASIDE, above), (to_x - 0.3, above)]
         self.axes.plot(*np.array(path).T, color=SOFT, lw=1.0, ls=":", zorder=1)
 
     def pair(self, location: str) -> None:
@@ -297,7 +288,7 @@ class _Drawing:
             return
         (x, y), (to_x, to_y) = (self.corner(name) for name in tanks)
         points = [(x, y + 0.42), (to_x, to_y + 0.42)]
-        alpha = 1.0 if location in self.overlay.marks else strength(self.overlay.probabilities.get(location, 0.0))
+        alpha = 1.0 if location in self.overlay.marks else self.overlay.opacity(location)
         self.axes.plot(*np.array(points).T, color=MARK, lw=1.8, ls="--", alpha=alpha, zorder=1)
         if location in self.overlay.marks:
             self.words(location, ((x + to_x) / 2, (y + to_y) / 2 + 1.3), "center", "top")

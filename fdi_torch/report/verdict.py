@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any
 
 from fdi_torch.amounts import parameter_words
@@ -38,20 +39,11 @@ def kind_words(material: Material) -> str:
 
 def headline(material: Material) -> str:
     """The verdict, or the status of the run if it has none."""
-    sentences = (
-        gap_words,
-        monitor_words,
-        fault_words,
-        alarm_words,
-        benchmark_words,
-        rehearsal_words,
-        study_words,
-    )
-    warning = unreliable_words(material)
+    kinds = [gap_words, monitor_words, fault_words, alarm_words]
+    kinds += [benchmark_words, rehearsal_words, study_words, windows_words]
     with material.in_its_units():
-        for words in (of(material) for of in (*sentences, windows_words)):
-            if words:
-                return warning + words
+        if words := next(filter(None, (of_kind(material) for of_kind in kinds)), ""):
+            return unreliable_words(material) + words
     status = material.about("status")
     words = status.get("status", "did not end").replace("_", " ").capitalize()
     return f"{words}: {status['reason']}" if status.get("reason") else words
@@ -194,15 +186,9 @@ def how_it_ended(material: Material) -> str:
     ended = status.get("status", "no end in the log").replace("_", " ")
     reason = f" ({status['reason']})" if status.get("reason") else ""
     parts = [f"{ended}{reason}"]
-    seconds = status.get("wall_seconds")  # of a blind benchmark: of writing its log, after all diagnoses
     parts += [f"started {run['started'][:19].replace('T', ' ')} UTC"] if run.get("started") else []
-    parts += [f"took {_rounded(seconds)} s"] if seconds and material.kind != "challenge" else []
-    return " · ".join(parts)
-
-
-def _rounded(seconds: str) -> str:
-    """The duration with three digits; unchanged if it is not a number."""
-    try:
-        return number(float(seconds), 3)
-    except ValueError:
-        return seconds
+    # The log of a blind benchmark has only the time of its writing, after all diagnoses.
+    seconds = "" if material.kind == "challenge" else status.get("wall_seconds", "")
+    with suppress(ValueError):
+        seconds = number(float(seconds), 3)
+    return " · ".join([*parts, *([f"took {seconds} s"] if seconds else [])])

@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 from fdi_torch.blind.kind_meanings import KIND_MEANINGS
 from fdi_torch.blind.score import Row
 from fdi_torch.blind.scored_rows import OWN, Scores, Sheet, group_of, misses, sheets, tables
-from fdi_torch.report.html import Markup, folded, join, short, table, tag
+from fdi_torch.report.html import Markup, folded, short, table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.sections.study import TRIAL, group_panel
@@ -55,7 +55,8 @@ def scores_section(material: Material) -> Section | None:
         own = [row for row in rows if row["by"] == OWN and group_of(row) == group]
         first, *more = sheets(by)
         blocks += [tag("h4", f"{group}, {len(own)} cases"), _pictures(by, own, f"challenge_{k + 1}")]
-        blocks += [_shown(first), folded("Further scores, baselines, and effect by effect", *map(_titled, more))]
+        further = [part for sheet in more for part in (tag("h4", sheet.title), _shown(sheet))]
+        blocks += [_shown(first), folded("Further scores, baselines, and effect by effect", *further)]
     return Section("Right answers", blocks)
 
 
@@ -138,10 +139,6 @@ def _confusion(name: str, title: str, pairs: Sequence[tuple[str, str]], columns:
 
 def _words(names: Iterable[str]) -> list[str]:
     return [name.replace("_", " ") for name in names]
-
-
-def _titled(sheet: Sheet) -> Markup:
-    return join([tag("h4", sheet.title), _shown(sheet)])
 
 
 def _shown(sheet: Sheet) -> Markup:

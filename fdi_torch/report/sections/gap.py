@@ -30,9 +30,7 @@ CONTENT = 0.95  # probability of the plausible explanations together
 
 def where_section(material: Material) -> Section | None:
     """Probability of a discrepancy at each component, whatever its law; nothing without a gap."""
-    where = {str(m["location"]): m for m in material.of("/gap/where")}
-    where |= {str(place["location"]): place for place in material.answer.get("where", [])}
-    ranked = sorted(where.items(), key=lambda item: -float(item[1]["share"]))
+    ranked = sorted(material.where.items(), key=lambda item: -float(item[1]["share"]))
     if not ranked or not has_causes(material.answer):
         return None
     shown = [item for item in ranked if float(item[1]["share"]) >= LEAST_SHOWN] or ranked[:3]

@@ -49,8 +49,14 @@ def errors_section(material: Material) -> Section | None:
     named = stages.get("augmented")
     frozen = (closure.get("frozen") or {}) if named else {}
     extra = [(f"{named}, {other}", as_float(frozen.get(key))) for key, other in FROZEN.items() if key in frozen]
-    header = [f"plant{', error in ' + unit if unit else ''}", "all", *_headed(closure)]
-    rows = [[name, number(float(closure[m]), 3), *_by_sensor(closure, m)] for m, name in stages.items()]
+    units, sensors = closure.get("units") or {}, {str(s): e for s, e in (closure.get("per_sensor") or {}).items()}
+    several = len(set(units.values())) > 1
+    header = [f"plant{', error in ' + unit if unit else ''}", "all"]
+    header += [f"{s}, {units[s]}" if several and s in units else s for s in sensors]
+    rows = [
+        [name, *(number(e, 3) for e in (float(closure[m]), *(as_float(errors.get(m)) for errors in sensors.values())))]
+        for m, name in stages.items()
+    ]
     rows += [[name, number(value, 3), *[""] * (len(header) - 2)] for name, value in extra]
     blocks: list[Any] = [table(header, rows)]
     blocks += _each_holdout(closure, unit, stages)
@@ -91,20 +97,6 @@ def constants_section(material: Material) -> Section | None:
     return Section("Calibration constants", [words, table(header, rows)])
 
 
-def _headed(closure: Mapping[str, Any]) -> list[str]:
-    """The sensors, with their units if these differ."""
-    units = closure.get("units") or {}
-    return [f"{s}, {units[s]}" if len(set(units.values())) > 1 and s in units else s for s in _sensors(closure)]
-
-
-def _sensors(closure: Mapping[str, Any]) -> list[str]:
-    return [str(sensor) for sensor in closure.get("per_sensor") or {}]
-
-
-def _by_sensor(closure: Mapping[str, Any], stage: str) -> list[str]:
-    return [number(as_float(errors.get(stage)), 3) for errors in (closure.get("per_sensor") or {}).values()]
-
-
 def _each_holdout(closure: Mapping[str, Any], unit: str, stages: Mapping[str, str]) -> list[Any]:
     """One row per file, if there are several; the share that closes if there are causes."""
     shown = {key: name for key, name in stages.items() if key in ("recalibrated", "augmented", "noise_floor")}
@@ -143,7 +135,7 @@ def limits_section(material: Material) -> Section | None:
     """Effects that these inputs hide or confuse, and how often another cause would have got this name."""
     excitation = material.answer.get("excitation") or {}
     confusability = material.answer.get("impostors") or {}
-    blocks: list[Any] = [*_confusability_words(confusability)]
+    blocks: list[Any] = _confusability_words(confusability)
     hidden = [explanation_words([cause]) for cause in excitation.get("hidden") or []]
     pairs = [" and ".join(explanation_words([c]) for c in p["between"]) for p in excitation.get("inseparable") or []]
     small = "Effects that these inputs do not show at their typical size"

@@ -5,6 +5,7 @@ Carlo validation.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -63,41 +64,22 @@ def event_section(material: Material) -> Section | None:
     events = material.of(ALARM)
     if not events:
         return None
-    dated = bool(clock_text(0.0))
-    rows = [
-        [
-            number(float(m["t"]), 6),
-            *([_moment(float(m["t"]))] if dated else []),
-            str(m.get("event", "")),
-            sentence(str(m.get("message", ""))),
-            *_onset(m, dated),
-        ]
-        for m in events
+    header = ("time, s", "clock time", "event", "description", "onset, s", "onset, clock time")
+    return Section("Events", [table(header, [_event_cells(m) for m in events], left=4)])
+
+
+def _event_cells(event: Payload) -> list[Any]:
+    """Cells of an event, empty where it has no onset or the recording has no dates."""
+    time, onset, std = (as_float(event.get(name)) for name in ("t", "onset", "onset_std"))
+    # A span of this class is not broken into two lines.
+    moments = [tag("span", text, class_="moment") if (text := clock_text(t)) else "" for t in (time, onset)]
+    words = str(event.get("event", "")), sentence(str(event.get("message", "")))
+    return [
+        number(time, 6),
+        moments[0],
+        *words,
+        *(["", ""] if math.isnan(onset) else [rounded_number(onset, std), moments[1]]),
     ]
-    clock = ["clock time"] if dated else []
-    header = (
-        "time, s",
-        *clock,
-        "event",
-        "description",
-        "onset, s",
-        *(["onset, clock time"] if dated else []),
-    )
-    listed = table(header, rows, left=len(header) - 1 - len(clock))
-    return Section("Events", [listed])
-
-
-def _onset(event: Payload, dated: bool) -> list[Any]:
-    """The onset of an event's fault in s, and by the clock of a dated recording; empty cells without an onset."""
-    onset, std = as_float(event.get("onset")), as_float(event.get("onset_std"))
-    if math.isnan(onset):
-        return ["", ""] if dated else [""]
-    return [rounded_number(onset, std), *([_moment(onset)] if dated else [])]
-
-
-def _moment(seconds: float) -> Any:
-    """A clock time that is not broken into two lines."""
-    return tag("span", clock_text(seconds), class_="moment")
 
 
 def rehearsal_section(material: Material) -> Section | None:
@@ -115,11 +97,7 @@ def rehearsal_section(material: Material) -> Section | None:
 def _texts(rows: Sequence[Sequence[Any]]) -> int:
     """Number of leading columns that hold no number, at least one."""
     columns = list(zip(*rows, strict=True))[1:]
-    return 1 + next((k for k, column in enumerate(columns) if any(map(_number_in, column))), 0)
-
-
-def _number_in(cell: Any) -> bool:
-    return any(letter.isdigit() for letter in str(cell))
+    return 1 + next((k for k, column in enumerate(columns) if re.search(r"\d", " ".join(map(str, column)))), 0)
 
 
 def rehearsal_tables(material: Material) -> list[dict[str, Any]]:

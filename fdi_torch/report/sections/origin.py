@@ -5,8 +5,6 @@ integrity.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -83,9 +81,8 @@ def marks_of(material: Material) -> dict[str, list[str]]:
 
 def probabilities_of(material: Material) -> dict[str, float]:
     """Location -> its number between 0 and 1, see `Material.meaning_of_shares`."""
-    where = {str(message["location"]): float(message["share"]) for message in material.of("/gap/where")}
-    where |= {str(place["location"]): float(place["share"]) for place in material.answer.get("where", [])}
-    return {location: min(max(share, 0.0), 1.0) for location, share in where.items() if math.isfinite(share)}
+    shares = {location: float(place["share"]) for location, place in material.where.items()}
+    return {location: min(max(share, 0.0), 1.0) for location, share in shares.items() if math.isfinite(share)}
 
 
 MOST_TEXT = 40_000
@@ -123,7 +120,10 @@ def health_section(material: Material) -> Section | None:
     topics, chunks = inspection.topics.values(), counted(inspection.health.chunks, "chunk")
     content = f"{counted(inspection.messages, 'message')} on {counted(len(topics), 'topic')} in {chunks}"
     rows = [[info.topic, str(info.messages), number(info.first), number(info.last)] for info in topics]
-    messages = [_log_message(message) for message in material.of("/log")]
+    messages = [
+        tag("li", f"{_LEVELS[level]}: " if (level := m.get("level")) in _LEVELS else "", m.get("message", ""))
+        for m in material.of("/log")
+    ]
     return Section(
         "Integrity of the log",
         [
@@ -134,8 +134,3 @@ def health_section(material: Material) -> Section | None:
             folded("Topics", table(("topic", "messages", "from, s", "to, s"), rows)),
         ],
     )
-
-
-def _log_message(message: Mapping[str, Any]) -> str:
-    level = _LEVELS.get(message.get("level", 0), "")
-    return tag("li", f"{level}: " if level else "", message.get("message", ""))

@@ -44,8 +44,9 @@ def inputs_section(material: Material) -> Section | None:
             if np.isfinite(values).any() and np.nanmin(values) == np.nanmax(values):
                 constant.append(f"{name} at {number(float(np.nanmax(values)))} {unit}".rstrip())
                 continue
-            time, corners = _steps(recording, values)
-            line = Line("command", time, corners, MODEL, steps=recording.hold == "zero_order")
+            held = recording.hold == "zero_order"
+            time, corners = corner_points(recording.time, values) if held else (recording.time, values)
+            line = Line("command", time, corners, MODEL, steps=held)
             title = f"{name}, {recording_name(group).lower()}" if several else name
             chart = Chart(title, "time, s", axis("command", unit), [line], clock=clock_of(group))
             pictures.append(signals(f"input{suffix}_{i + 1}", chart))
@@ -64,10 +65,6 @@ def recording_name(group: str) -> str:
 def clock_of(group: str) -> str:
     """Name of the clock of a recording's charts."""
     return f"recording {group}"
-
-
-def _steps(recording: Signals, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return corner_points(recording.time, values) if recording.hold == "zero_order" else (recording.time, values)
 
 
 def _output_panels(recording: Signals, model: np.ndarray | None, suffix: str, clock: str) -> list[Column]:

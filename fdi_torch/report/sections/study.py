@@ -88,7 +88,7 @@ def error_section(material: Material) -> Section | None:
         unit, scale = _unit_of(material, name)
         errors, bounds = [scale * e for e in errors], [scale * b for b in bounds]
         label = axis("size of the error", unit)
-        figure = group_panel(parameter_words(name), label, groups, errors, bar=_root_mean_square)
+        figure = group_panel(parameter_words(name), label, groups, errors, lambda e: float(np.sqrt(np.mean(e**2))))
         if all(np.nanmax(e, initial=0.0) > 0 for e in errors):
             logarithmic(figure.axes[0])
         figure.axes[0].plot(range(len(groups)), bounds, "_", color=MARK, ms=22, mew=2.0)
@@ -177,10 +177,6 @@ def group_panel(
     return figure
 
 
-def _root_mean_square(errors: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(errors**2)))
-
-
 def _column(trials: Sequence[Payload], group: str, name: str) -> np.ndarray:
     own = (m.get(name) for m in trials if str(m.get("group", "")) == group)
     return np.array([float(v) for v in own if isinstance(v, int | float)])
@@ -202,7 +198,7 @@ MOST_MODES = 64
 
 def isolation_section(material: Material) -> Section | None:
     """The confusion matrix of the modes as a picture, and a table with one row per mode."""
-    labels, counts = _labels(material), material.arrays.get("confusion")
+    labels, counts = [*map(str, material.listed("isolation.labels"))], material.arrays.get("confusion")
     if counts is None or counts.shape != (len(labels), len(labels)) or not 0 < len(labels) <= MOST_MODES:
         return None
     result = material.about("result")
@@ -237,8 +233,3 @@ def _row(k: int, labels: list[str], counts: np.ndarray) -> list[str]:
     worst = int(wrong.argmax())
     taken = f"{short(labels[worst], 60)} ({percent(wrong[worst] / counts[k].sum())})" if wrong[worst] else ""
     return [str(k + 1), short(labels[k], 60), str(int(counts[k].sum())), percent(counts[k, k] / counts[k].sum()), taken]
-
-
-def _labels(material: Material) -> list[str]:
-    """Names of the modes from the result record."""
-    return [str(label) for label in material.listed("isolation.labels")]
