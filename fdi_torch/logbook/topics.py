@@ -146,20 +146,16 @@ class Topics:
             raise ValueError(f"{signals[0][0]}: expected finite times, got NaN or infinity; drop those samples")
         topics = [topic for topic, *_ in signals]
         for first in range(0, len(time), _BLOCK):
-            last = first + _BLOCK
-            clock = time[first:last].astype(np.float64)
+            block = slice(first, first + _BLOCK)
+            clock = time[block].astype(np.float64)
             log_times = EPOCH_NS + np.rint(clock * 1e9).astype(np.int64)
-            blocks = [values[first:last].astype(np.float64) for _, values, *_ in signals]
-            hidden = [
-                np.zeros(0, bool) if mask is None else ~mask[first:last] & np.isfinite(block)
-                for block, (*_, mask, _) in zip(blocks, signals, strict=True)
-            ]
-            for topic, _, names, units, _, about in signals:
+            encoded = []
+            for topic, values, names, units, mask, about in signals:
                 numbers = dict.fromkeys(names, 0.0)
                 self.register.channel(topic, numbers, numbers, dict(zip(names, units, strict=True)), about)
-            named = [names for _, _, names, *_ in signals]
+                valid = None if mask is None else mask[block]
+                encoded.append(_payloads(names, clock, values[block].astype(np.float64), valid))
             channels, sequences = self.register.next_numbers(topics, len(clock))
-            encoded = [_rows(*parts, clock.tolist()) for parts in zip(named, blocks, hidden, strict=True)]
             self.put(_interleaved(channels, sequences, log_times.tolist(), encoded))
         self._latest = max(self._latest, float(time.max())) if len(time) else self._latest
 
@@ -273,19 +269,15 @@ def _interleaved(
     return chain.from_iterable(zip(*streams, strict=True))
 
 
-def _rows(names: Sequence[str], block: np.ndarray, hidden: np.ndarray, clock: list[float]) -> list[bytes]:
-    """Payloads of samples (B, N), with readings masked by hidden (B, N)."""
-    keys = ("t", *names)
-    rows = zip(clock, *block.T.tolist(), strict=True)
-    if np.isfinite(block).all() and not hidden.any():
-        return [orjson.dumps(dict(zip(keys, row, strict=True))) for row in rows]
-    return [orjson.dumps(_row(keys, row, hidden[i : i + 1])) for i, row in enumerate(rows)]
-
-
-def _row(keys: Sequence[str], row: Sequence[float], hidden_row: np.ndarray) -> dict[str, Any]:
-    hidden = zip(keys[1:], hidden_row.ravel(), strict=True) if hidden_row.size else ()
-    masked = [name for name, is_hidden in hidden if is_hidden]
-    return plain({**dict(zip(keys, row, strict=True)), "masked": masked or None})
+def _payloads(names: Sequence[str], clock: np.ndarray, values: np.ndarray, valid: np.ndarray | None) -> list[bytes]:
+    """Payloads of samples (B, N) at the times (B,); those that are finite but not valid (B, N) are masked."""
+    rows = [dict(zip(("t", *names), row, strict=True)) for row in zip(clock.tolist(), *values.T.tolist(), strict=True)]
+    finite = np.isfinite(values)
+    masked = np.zeros_like(finite) if valid is None else finite & ~valid
+    if finite.all() and not masked.any():
+        return [orjson.dumps(row) for row in rows]
+    hidden = ([name for name, is_masked in zip(names, row, strict=True) if is_masked] for row in masked.tolist())
+    return [orjson.dumps(plain({**row, "masked": of_row or None})) for row, of_row in zip(rows, hidden, strict=True)]
 
 
 def _check_signal(topic: str, values: np.ndarray, names: Sequence[str], samples: int) -> None:
