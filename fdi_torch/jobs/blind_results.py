@@ -41,15 +41,11 @@ def _write_log(
     seeds = {f"challenge_{k + 1}": seed for k, seed in enumerate(sorted({int(row["seed"]) for row in rows}))}
     with RunLog(path, "challenge", config=config, seeds=seeds, data=data) as log:
         for number, row in enumerate(rows):
-            log.trial(number, _trial_fields(row), group=row["kind"], seed=row["seed"], status=row["verdict"])
+            fields = {key: value for key, value in row.items() if key not in ("kind", "seed", "verdict")}
+            fields |= {key: [f"{effect}@{place}" for effect, place in row[key]] for key in ("truth", "causes")}
+            log.trial(number, fields, group=row["kind"], seed=row["seed"], status=row["verdict"])
         for group, by in scores.items():
             log.result({group: {name: _hit_counts(score) for name, score in by[OWN]["strata"].items()}})
-
-
-def _trial_fields(row: Row) -> dict[str, Any]:
-    """Fields of a row that are not None, causes as texts; kind, seed and verdict are fields of each trial message."""
-    named = {key: [f"{effect}@{place}" for effect, place in row[key]] for key in ("truth", "causes")}
-    return {k: v for k, v in row.items() if v is not None and k not in ("kind", "seed", "verdict")} | named
 
 
 def _hit_counts(score: Mapping[str, Any]) -> dict[str, str]:

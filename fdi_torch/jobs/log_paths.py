@@ -49,7 +49,10 @@ def find_unfinished(folder: Path, name: str, text: str) -> tuple[Path, Log | Non
     The log is None if the run was killed before it wrote its configuration. Returns None if there is no log of that
     name. Raises ValueError if all are finished, or if their configuration is not `text`.
     """
-    paths = {p.with_suffix("") if p.suffix == ".partial" else p: p for p in _logs_of(folder, name)}
+    pattern = re.compile(re.escape(name) + r"(_\d+)?\.mcap(\.partial)?")
+    found = sorted((p for p in folder.glob("*.mcap*") if pattern.fullmatch(p.name)), reverse=True)
+    # Of a log and its `.partial` file, which comes first, the log itself counts.
+    paths = {p.with_suffix("") if p.suffix == ".partial" else p: p for p in found}
     if not paths:
         return None
     logs = {path: _read_log(path) for path in paths.values()}
@@ -76,12 +79,6 @@ def expect_unfinished(folder: Path, name: str, text: str) -> tuple[Path, Log | N
     if unfinished is None:
         raise ValueError(f"{folder}: expected an unfinished log {name}.mcap, got none; start without --resume")
     return unfinished
-
-
-def _logs_of(folder: Path, name: str) -> list[Path]:
-    """NAME.mcap, NAME_2.mcap ... and their `.partial` files; each log comes after its `.partial` file."""
-    pattern = re.compile(re.escape(name) + r"(_\d+)?\.mcap(\.partial)?")
-    return sorted((p for p in folder.glob("*.mcap*") if pattern.fullmatch(p.name)), reverse=True)
 
 
 def _has_ended(path: Path, log: Log | None) -> bool:

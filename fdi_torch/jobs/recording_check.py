@@ -19,7 +19,10 @@ def checked(config: RecordingConfig, plant: PlantDescription, base: Path) -> tup
     whole = read_recording(config, plant, base)
     check = check_recording(whole, plant)
     examinations = [examined(plant, part, thorough=True) for part in whole.known_segments()]
-    problems = [_slip(", ".join(e.fault.channels), e.fault.text) for e in examinations if e.fault]
+    problems = []
+    for fault in (e.fault for e in examinations if e.fault):
+        channels = ", ".join(fault.channels)
+        problems.append(ChannelFinding("slip", channels, fault.text.removeprefix(f"{channels}: ")))
     problems += [
         ChannelFinding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop})
         for e in examinations
@@ -30,10 +33,6 @@ def checked(config: RecordingConfig, plant: PlantDescription, base: Path) -> tup
     beyond = [f for f in doubts if f.kind == "range"]
     problems = [p for p in problems if not any(f.text in p.text for f in beyond)]
     return whole, replace(check, findings=(*beyond, *problems, *(f for f in doubts if f not in beyond)))
-
-
-def _slip(channels: str, text: str) -> ChannelFinding:
-    return ChannelFinding("slip", channels, text.removeprefix(f"{channels}: "))
 
 
 def usable_spans(recording: Recording, config: RecordingConfig, plant: PlantDescription) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,21 +45,20 @@ def repeat_run(
     tell = tell or (lambda share, text: None)
     if trials and kind != "study":
         raise ValueError(f"--trial: expected a study's log, got one of fdi {kind}: {log.path}; leave --trial out")
-    if kind == "study":
-        replay_study(log, path, overrides, trials, tell, parent)
-    elif kind == "gap":
-        replay_gap(log, path, overrides, tell, parent)
-    elif kind == "monitor":
-        replay_monitor(log, path, overrides, tell, parent)
-    elif kind == "train":
-        replay_estimate(log, path, overrides, tell, parent)
-    else:
+    replays: dict[str, Callable[[LoggedRun, Path, Sequence[str], Tell, str], None]] = {
+        "train": replay_estimate,
+        "study": partial(replay_study, trials=trials),
+        "gap": replay_gap,
+        "monitor": replay_monitor,
+    }
+    if kind not in replays:
         wanted = "fdi train, fdi study, fdi gap or fdi monitor"
         raise LogError(f"{log.path}: expected a log of {wanted}, got one of {kind or 'another program'}")
+    replays[kind](log, path, list(overrides), tell, parent)
     return path
 
 
-def replay_estimate(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, parent: str) -> None:
+def replay_estimate(log: LoggedRun, path: Path, overrides: Sequence[str], tell: Tell, parent: str) -> None:
     """Repeat an estimation from the recordings in the log."""
     run = logged_run(log, overrides)
     if run.config.estimate.windows is not None:
@@ -69,14 +69,16 @@ def replay_estimate(log: LoggedRun, path: Path, overrides: Iterable[str], tell: 
     space, loaded = requested_space(run), logged_recordings(log, run)
     fitting = fitting_of(run, space, loaded)
     records = run.log_records(part.recording.origin for part in loaded)
+    true_faults = {
+        name: float(values[0]) for name, values in series(log, "/plant/truth").items() if name != "t" and len(values)
+    }
     with RunLog(path, "train", **records, parent_run_id=parent) as again:
-        log_recordings(again, loaded, logged_truth(log))
+        log_recordings(again, loaded, true_faults)
         estimate_logged(run, fitting, again, tell)
 
 
-def replay_monitor(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, parent: str) -> None:
+def replay_monitor(log: LoggedRun, path: Path, overrides: Sequence[str], tell: Tell, parent: str) -> None:
     """Repeat a monitor run along the samples in the log."""
-    overrides = list(overrides)
     _expect_no_data(overrides, ("recording",))
     run = build_monitor(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
     callbacks = MonitorCallbacks(tell, lambda event: None, lambda prepared: None)
@@ -92,10 +94,9 @@ def replay_monitor(log: LoggedRun, path: Path, overrides: Iterable[str], tell: T
 
 
 def replay_study(
-    log: LoggedRun, path: Path, overrides: Iterable[str], trials: Sequence[int], tell: Tell, parent: str
+    log: LoggedRun, path: Path, overrides: Sequence[str], tell: Tell, parent: str, *, trials: Sequence[int]
 ) -> None:
     """Repeat trials of a study, and its summary if all trials are repeated."""
-    overrides = list(overrides)
     study = build_study(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
     logged = range(study.plan.trials) if overrides else (m.payload["trial"] for m in log.messages([TRIAL]))
     numbers = sorted(set(trials or logged))
@@ -180,13 +181,7 @@ def start_levels(run: Run, count: int, path: Path) -> list[Any]:
     return [{t: w.get(t, "free") if isinstance(w, dict) else w for t in tanks} for w in wanted]
 
 
-def logged_truth(log: LoggedRun) -> dict[str, float]:
-    """Simulated fault values, SI by full name; empty for real data."""
-    truth = series(log, "/plant/truth")
-    return {name: float(values[0]) for name, values in truth.items() if name != "t" and len(values)}
-
-
-def replay_gap(log: LoggedRun, path: Path, overrides: Iterable[str], tell: Tell, parent: str) -> None:
+def replay_gap(log: LoggedRun, path: Path, overrides: Sequence[str], tell: Tell, parent: str) -> None:
     """Repeat a diagnosis into the log `path`.
 
     overrides: changed settings, such as library=pump_lag,leak@T1, leave_out=pump_lag, step=0.5, named_only=true.

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -80,9 +80,12 @@ def run_study(
         trials = copied_trials(log, before)
         copied = len(trials)
         started = time.monotonic()
-        for done in computed_trials(study.plan, trials, cluster):
-            log_trials(log, study.plan, [trial for trial in done if trial.number not in trials])
-            trials |= {trial.number: trial for trial in done if trial.number not in trials}
+        blocks = [block for block in study.plan.blocks() if not trials.keys() >= set(block.numbers)]
+        computed = run_blocks(study.plan, blocks) if cluster is None else run_on_cluster(study.plan, blocks, cluster)
+        for done in computed:
+            new = {trial.number: trial for trial in done if trial.number not in trials}
+            log_trials(log, study.plan, new.values())
+            trials |= new
             tell(*progress(len(trials), copied, study.plan.trials, time.monotonic() - started))
         seconds = time.monotonic() - started
         summaries, isolation = log_summary(study, trials, log)
@@ -117,13 +120,7 @@ def copied_trials(log: RunLog, before: LoggedRun | None) -> dict[int, Trial]:
     return trials
 
 
-def computed_trials(plan: Plan, known: Mapping[int, Trial], cluster: str | None) -> Iterator[list[Trial]]:
-    """Compute the blocks with missing trials, and yield the trials of each block when it is done."""
-    blocks = [block for block in plan.blocks() if any(number not in known for number in block.numbers)]
-    return run_blocks(plan, blocks) if cluster is None else run_on_cluster(plan, blocks, cluster)
-
-
-def log_trials(log: RunLog, plan: Plan, trials: list[Trial]) -> None:
+def log_trials(log: RunLog, plan: Plan, trials: Iterable[Trial]) -> None:
     for trial in trials:
         log.trial(
             trial.number, trial.numbers, group=trial.setting, seed=f"{plan.seed}/{trial.number}", status=trial.status
@@ -137,34 +134,22 @@ def progress(done: int, copied: int, total: int, seconds: float) -> tuple[float,
     return done / total, f"{done} of {total} trials, {remaining:.0f} s left"
 
 
-def trials_by_setting(plan: Plan, trials: Mapping[int, Trial]) -> Iterator[list[Trial]]:
-    """The trials of each setting, in order."""
-    numbers: dict[int, list[int]] = {}
-    for block in plan.blocks():
-        numbers.setdefault(block.setting, []).extend(block.numbers)
-    for chosen in numbers.values():
-        yield [trials[number] for number in chosen]
-
-
-def summaries_of(study: Study, trials: Mapping[int, Trial]) -> Iterator[Summary]:
-    for setting, group in zip(study.plan.settings, trials_by_setting(study.plan, trials), strict=True):
-        yield summarise(study.plan, setting, group, study.config.tolerance)
-
-
-def isolation_of(study: Study, trials: Mapping[int, Trial]) -> Isolation | None:
-    """Isolated modes compared with the true ones; None unless faults are drawn by mode and estimated without bounds."""
-    if study.config.faults != "modes" or "free" not in study.config.estimators:
-        return None
-    ordered = [trials[number] for number in sorted(trials)]
-    return count_modes(study.plan.fitting.space, ordered, study.run.config.estimate.confidence)
-
-
 def log_summary(study: Study, trials: Mapping[int, Trial], log: RunLog) -> tuple[tuple[Summary, ...], Isolation | None]:
-    """Summarise all trials, and log the summary."""
-    summaries, isolation = tuple(summaries_of(study, trials)), isolation_of(study, trials)
+    """Summarise all trials, and log the summary.
+
+    Isolated modes are compared with the true ones if faults are drawn by mode and estimated without bounds.
+    """
+    plan, config = study.plan, study.config
+    of_setting: dict[int, list[Trial]] = {}
+    for block in plan.blocks():
+        of_setting.setdefault(block.setting, []).extend(trials[number] for number in block.numbers)
+    summaries = tuple(summarise(plan, plan.settings[k], group, config.tolerance) for k, group in of_setting.items())
     for summary in summaries:
         log.summary(summary.setting, summary.trials, summary.numbers())
-    if isolation is not None:
+    isolation = None
+    if config.faults == "modes" and "free" in config.estimators:
+        ordered = [trials[number] for number in sorted(trials)]
+        isolation = count_modes(plan.fitting.space, ordered, study.run.config.estimate.confidence)
         log.result({"isolation": {name: value for name, value in vars(isolation).items() if name != "confusion"}})
         log.result_arrays(confusion=isolation.confusion)
     return summaries, isolation

@@ -53,7 +53,9 @@ def fit_windows(run: Run, tell: Callable[[float, str], None] = lambda share, tex
         log_recordings(log, loaded, {})
         noise = [noise_of(part.recording, run.plant) for part in loaded]
         cuts = [(c, std) for part, std in zip(loaded, noise, strict=True) for c in cut_up(part.recording, length)]
-        _expect_windows(run, len(cuts))
+        if not cuts:
+            got = f"{length:g} s; shorten them"
+            raise ConfigError([f"{run.source}: estimate.windows: expected windows shorter than a recording, got {got}"])
         fittings = [fitting_of(run, space, [LoadedRecording(cut, free)]) for cut, _ in cuts]
         step = hybrid_settings(run.config.estimate).refine_step or window_step(fittings, noise[0])
         windows = []
@@ -61,22 +63,11 @@ def fit_windows(run: Run, tell: Callable[[float, str], None] = lambda share, tex
             tell(k / len(cuts), f"window at {float(cut.time[0]):g} s")
             windows.append(window_of(fitting, std, suspects, step))
         result = WindowedFit(tuple(windows), tuple(stretches_of(windows)), step, path)
-        stretches = [vars(s) for s in result.stretches]
-        log.result({"step": step, "windows": [_window_fields(w) for w in windows], "stretches": stretches})
+        fields = [
+            {"start": w.start, "stop": w.stop, "misfit": w.misfit}
+            | {f.name: {"size": f.size, "std": f.std, "state": f.state} for f in w.faults}
+            for w in windows
+        ]
+        log.result({"step": step, "windows": fields, "stretches": [vars(s) for s in result.stretches]})
     tell(1.0, "done")
     return result
-
-
-def _expect_windows(run: Run, count: int) -> None:
-    if not count:
-        got = f"{run.config.estimate.windows:g} s; shorten them"
-        raise ConfigError([f"{run.source}: estimate.windows: expected windows shorter than a recording, got {got}"])
-
-
-def _window_fields(window: Window) -> dict[str, object]:
-    return {
-        "start": window.start,
-        "stop": window.stop,
-        "misfit": window.misfit,
-        **{f.name: {"size": f.size, "std": f.std, "state": f.state} for f in window.faults},
-    }
