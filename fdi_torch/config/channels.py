@@ -29,7 +29,11 @@ def channel_mapping(config: FileConfig, plant: PlantDescription) -> dict[str, Ch
         _expect_keys_that_fit(place, name, column, plant)
         if column.period is not None:
             _expect_rows_in_time(place, column, config)
-        mapping[name] = _clock_source(column) if name == "t" else _channel_source(place, column, units[name])
+        if name == "t":
+            clock = {key: getattr(column, key) for key in ONLY_CLOCK}
+            mapping[name] = ClockSource(column.column, column.unit, **clock)
+        else:
+            mapping[name] = _channel_source(place, column, units[name])
     return mapping
 
 
@@ -52,10 +56,6 @@ def _expect_rows_in_time(place: str, column: ColumnConfig, config: FileConfig) -
         raise ValueError(f"{place}: expected a period or a column, got period and {', '.join(beside)}; drop one")
     if config.tags or is_log(Path(config.file)):
         raise ValueError(f"{place}.period: expected this key of a table with one row per instant only; leave it out")
-
-
-def _clock_source(column: ColumnConfig) -> ClockSource:
-    return ClockSource(column.column, column.unit, **{key: getattr(column, key) for key in ONLY_CLOCK})
 
 
 def _channel_source(place: str, column: ColumnConfig, unit: str) -> ChannelSource:
@@ -111,7 +111,8 @@ def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[s
     if not missing:
         return
     inputs = [name for name in missing if name in plant.channels()]
-    if set(missing) == set(plant.outputs()) and not _other_columns(path, plant):
+    others = [column for column in _header(path)[1:] if names_in((column,)).isdisjoint(_units(plant))]  # first: time
+    if set(missing) == set(plant.outputs()) and not others:
         raise ValueError(
             f"{path}: expected readings of {', '.join(missing)}, got inputs alone; fdi plan and fdi "
             "diagnosability show what planned inputs can reveal"
@@ -161,11 +162,6 @@ def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()
 def _missing(path: Path, plant: PlantDescription, also_known: Collection[str]) -> list[str]:
     known = {*unrecorded_valves(path, plant), *also_known}
     return [name for name in without_column(path, _units(plant)) if name not in known]
-
-
-def _other_columns(path: Path, plant: PlantDescription) -> list[str]:
-    """The columns of a table that are neither a channel of the plant nor, first, the time."""
-    return [column for column in _header(path)[1:] if not names_in((column,)) & set(_units(plant))]
 
 
 def _header(path: Path) -> tuple[str, ...]:

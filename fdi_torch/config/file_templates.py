@@ -23,6 +23,7 @@ from fdi_torch.plant.components import COMMAND_UNITS
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.quantities import display_unit, quantity_text, significant, unit_factor
+from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_binding import bind_clock
 from fdi_torch.recordings.csv_files import read_csv, read_header
 from fdi_torch.recordings.csv_text import HeaderlessError, header_unit
@@ -114,14 +115,34 @@ def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
     entry = parse_yaml(reading.encode(), "recording").get("recording")
     if entry is None or " ..." in reading:  # a live source, or columns that the user must write
         return _usual_part(plant)
-    from fdi_torch.config.learning_time import learning_time
     from fdi_torch.config.loaded_recordings import read_recording
 
     read = read_recording(entry, plant)
     first, last = float(read.time[0]), float(read.time[-1])
-    enough = _rounded_up(learning_time(read, every))
+    enough = _rounded_up(_learning_time(read, every))
     until = first + min(enough, 0.5 * (last - first))
     return f"[{first:.10g} s, {until:.10g} s]    # the noise is learnt from it; {enough:.10g} s suffice if it is white"
+
+
+def _learning_time(recording: Recording, false_alarms_every: float) -> float:
+    """Time from which white noise determines the false-alarm rate within a factor of RATE_FACTOR (95 %), s.
+
+    The recording gives the sampling interval and the number of sensors; correlated noise and random flows need longer.
+    false_alarms_every: mean time between false alarms, s. Raises ValueError if it is less than 20 samples.
+    """
+    # Only this needs the monitor, which takes a while to load.
+    from fdi_torch.monitor.detection import make_detector
+    from fdi_torch.monitor.fault_free_checks import RATE_FACTOR
+    from fdi_torch.monitor.samples import usual_interval
+    from fdi_torch.monitor.whitening import FEWEST_SAMPLES, Whitening
+
+    interval, sensors = usual_interval(recording.time), len(recording.output_names)
+    zero, one = torch.zeros(sensors, dtype=torch.float64), torch.eye(sensors, dtype=torch.float64)
+    error = torch.full_like(zero, (2.0 * FEWEST_SAMPLES) ** -0.5)  # of ln of a standard deviation
+    white = Whitening(zero, zero.new_zeros(0, sensors, sensors), one, FEWEST_SAMPLES, error)
+    draws = torch.Generator().manual_seed(0)
+    design = make_detector("cusum", false_alarms_every, interval, sensors, draws, learnt=white).design
+    return interval * FEWEST_SAMPLES * max(design.learning_factor(RATE_FACTOR), 1.0)
 
 
 def _rounded_up(value: float) -> float:

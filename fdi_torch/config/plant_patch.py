@@ -57,8 +57,10 @@ def _edited(text: str, before: PlantDescription, after: PlantDescription, errors
     with displayed_in(units_for_display(after)):
         for path, value in _changes(before, after):
             edits.set(path, value, _unit_of(path, after), errors.get(_full_name(path, after)))
-        for placed in _new_effects(before, after):
-            edits.append(("effects",), _rounded(placed, after, errors))
+        known = {(e.effect, e.location) for e in before.effects}
+        for placed in after.effects:
+            if (placed.effect, placed.location) not in known:
+                edits.append(("effects",), _rounded(placed, after, errors))
     return edits.applied()
 
 
@@ -95,11 +97,6 @@ def _unit_of(path: Path, plant: PlantDescription) -> str:
     if path[0] == "tolerances" and name not in absolute_units(plant):
         return "%"
     return display_unit("1", name)[0] or "1"
-
-
-def _new_effects(before: PlantDescription, after: PlantDescription) -> list[PlacedEffect]:
-    known = {(e.effect, e.location) for e in before.effects}
-    return [e for e in after.effects if (e.effect, e.location) not in known]
 
 
 def _rounded(placed: PlacedEffect, plant: PlantDescription, errors: Mapping[str, float]) -> dict[str, Any]:

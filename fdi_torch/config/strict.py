@@ -68,7 +68,6 @@ def quantity_of(unit: str) -> tuple[BeforeValidator, Any]:
 
 Share = Annotated[float, *quantity_of("1")]
 Length = Annotated[float, *quantity_of("m")]
-Area = Annotated[float, *quantity_of("m^2")]
 Seconds = Annotated[float, *quantity_of("s")]
 HeldFor = Annotated[float, AllowInfNan(True), BeforeValidator(_held)]
 """A time, s, or always."""

@@ -196,7 +196,8 @@ def find_file(name: str, base: Path, also: Sequence[Path] = ()) -> Path:
         if (folder / name).is_dir():
             raise ConfigError([f"{folder / name}: expected a file, got a folder; name a file in it"])
     looked = ", ".join(dict.fromkeys(str(folder) for folder in folders))
-    raise ConfigError([f"{name}: file not found (looked in {looked}){_similar(name, folders)}"])
+    beside = {path.name for folder in folders for path in (folder / name).parent.glob("*")}
+    raise ConfigError([f"{name}: file not found (looked in {looked}){nearest(Path(name).name, beside)}"])
 
 
 def find_data(name: str, base: Path) -> Path:
@@ -226,11 +227,6 @@ def find_plant(name: str, base: Path) -> Path:
     if Path(name).suffix in YAML_ENDINGS:
         return find_file(name, base)
     raise ConfigError([f"plant: {unknown('a plant file (.yaml) or a shipped plant', name, plants)}"])
-
-
-def _similar(name: str, folders: Sequence[Path]) -> str:
-    beside = {path.name for folder in folders for path in (folder / name).parent.glob("*")}
-    return nearest(Path(name).name, beside)
 
 
 _OWN_KEYS = {
