@@ -89,39 +89,31 @@ def _adopt(
     screen: Screen,
 ) -> list[str]:
     """Write the adopted plant if requested. Returns the lines of the diff, none if nothing was adopted."""
+    if not arguments.adopt:
+        return []
     named = any(cause.effect != UNKNOWN for cause in answer.causes)
-    if arguments.adopt and named and not answer.converged:
-        screen.complain("fdi gap: nothing adopted: the fit of the likeliest explanation has not converged")
-    elif arguments.adopt and named:
-        target = Path(arguments.adopt)
-        better = _adopted(plant, answer, arguments)
-        if not _error(better, recordings) <= _error(plant, recordings):
-            screen.complain(
-                "fdi gap: nothing adopted: the plant with the causes has a larger free-run error than the plant file; "
-                "--with-constants also writes the constants that were fitted together with the causes"
-            )
-            return []
-        diff = write_adopted(arguments.plant, plant, better, target, screen, _errors(answer))
-        constants = (
-            "as fitted with them" if arguments.with_constants else "unchanged (--with-constants writes the fitted ones)"
-        )
-        screen.note(f"plant file with the causes, its constants {constants}: {target}")
-        return diff
-    if arguments.adopt and arguments.with_constants and answer.verdict == "no_gap":
-        better, target = _adopted(plant, answer, arguments), Path(arguments.adopt)
-        diff = write_adopted(arguments.plant, plant, better, target, screen, _errors(answer))
-        screen.note(f"plant file with its fitted constants; no cause was found: {arguments.adopt}")
-        return diff
-    if arguments.adopt and not named:
+    if not named and not (arguments.with_constants and answer.verdict == "no_gap"):
         screen.complain(f"fdi gap: nothing to adopt: the verdict is {answer.verdict.replace('_', ' ')}")
-    return []
-
-
-def _adopted(plant: PlantDescription, answer: Answer, arguments: argparse.Namespace) -> PlantDescription:
-    better = adopted(plant, answer, arguments.with_constants)
-    if not arguments.narrow:
-        return better
-    return narrowed(better, _errors(answer))
+        return []
+    if named and not answer.converged:
+        screen.complain("fdi gap: nothing adopted: the fit of the likeliest explanation has not converged")
+        return []
+    better, errors = adopted(plant, answer, arguments.with_constants), _errors(answer)
+    if arguments.narrow:
+        better = narrowed(better, errors)
+    if named and not _error(better, recordings) <= _error(plant, recordings):
+        screen.complain(
+            "fdi gap: nothing adopted: the plant with the causes has a larger free-run error than the plant file; "
+            "--with-constants also writes the constants that were fitted together with the causes"
+        )
+        return []
+    diff = write_adopted(arguments.plant, plant, better, Path(arguments.adopt), screen, errors)
+    constants = (
+        "as fitted with them" if arguments.with_constants else "unchanged (--with-constants writes the fitted ones)"
+    )
+    what = f"the causes, its constants {constants}" if named else "its fitted constants; no cause was found"
+    screen.note(f"plant file with {what}: {arguments.adopt}")
+    return diff
 
 
 def _errors(answer: Answer) -> dict[str, float]:

@@ -7,6 +7,7 @@ estimate.misfit.misfit_of → recordings.plant_limits.denied_by → cli.explaine
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -91,16 +92,9 @@ def _recordings(name: str, plant: PlantDescription, arguments: argparse.Namespac
     columns = _constants(arguments, plant)
     constants = "if it was constant, add --constant {inputs}=0 (--from and --to select a part); "
     expect_columns(find_data(name, Path.cwd()), plant, columns, constants)
-    config = RecordingConfig.model_validate(
-        {
-            "file": name,
-            "start": _seconds(arguments.start),
-            "stop": _seconds(arguments.stop),
-            "columns": columns,
-        }
-    )
-    loaded = load_recordings([config], plant, Path.cwd())
-    return [part.recording for part in loaded]
+    limits = {key: f"{vars(arguments)[key]} s" for key in ("start", "stop") if vars(arguments)[key] is not None}
+    config = RecordingConfig.model_validate({"file": name, "columns": columns, **limits})
+    return [part.recording for part in load_recordings([config], plant, Path.cwd())]
 
 
 def _names(plant: PlantDescription, other: PlantDescription | None, arguments: argparse.Namespace) -> tuple[str, str]:
@@ -117,18 +111,13 @@ def _constants(arguments: argparse.Namespace, plant: PlantDescription) -> dict[s
         name, _, value = (part.strip() for part in text.partition("="))
         if not (name and value):
             raise ValueError(f"--constant: expected INPUT=VALUE such as q1_cmd=0, got '{text}'")
-        bare = _is_number(value)
         unit = units.get(name, "1")
-        columns[name] = {"constant": f"{value} {unit}" if bare and unit != "1" else float(value) if bare else value}
+        constant: dict[str, Any] = {"constant": value}
+        with suppress(ValueError):  # of a value that has a unit
+            number = float(value)
+            constant = {"constant": number if unit == "1" else f"{value} {unit}"}
+        columns[name] = constant
     return columns
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _own_constants(plant: PlantDescription, recording: Recording, prediction: Prediction, screen: Screen) -> None:
@@ -174,7 +163,3 @@ def _result(
         "time": recording.time.tolist(),
         "readings": {s.name: prediction.readings[:, i].tolist() for i, s in enumerate(plant.sensors)},
     }
-
-
-def _seconds(value: float | None) -> str | None:
-    return None if value is None else f"{value} s"

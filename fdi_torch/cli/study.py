@@ -40,7 +40,7 @@ def show(result: StudyResult, screen: Screen) -> None:
         screen.say()
     if single:
         screen.say(LEGEND)
-    if not single:
+    else:
         header = ("setting", "trials", "failures", "worst error (share of range)")
         screen.table("", header, [_short_row(summary) for summary in result.summaries])
     if result.isolation is not None:
