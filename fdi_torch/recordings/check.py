@@ -164,10 +164,12 @@ def _missing_inputs(recording: Recording) -> Iterator[ChannelFinding]:
         unknown = torch.isnan(values)
         runs = _runs(unknown)
         if len(runs) > MANY_RUNS:
+            known = recording.time[~unknown]
+            step = float(torch.diff(known).median()) if len(known) > 1 else 0.0
             text = (
                 f"unknown at {int(unknown.sum())} of {len(values)} samples, in {len(runs)} stretches: the recording is "
                 f"cut at each; where an empty cell means the last value, say for how long: columns: "
-                f"{{{name}: {{held: {_usual_step(recording.time[~unknown]):.3g} s}}}}"
+                f"{{{name}: {{held: {step:.3g} s}}}}"
             )
             yield ChannelFinding("unknown", name, text, {"count": int(unknown.sum()), "stretches": len(runs)})
             continue
@@ -176,10 +178,6 @@ def _missing_inputs(recording: Recording) -> Iterator[ChannelFinding]:
             samples = counted(last - first + 1, "sample")
             text = f"unknown from {start:g} s to {stop:g} s ({samples}): the recording is cut there"
             yield ChannelFinding("unknown", name, text, {"start": start, "stop": stop})
-
-
-def _usual_step(time: Tensor) -> float:
-    return float(torch.diff(time).median()) if len(time) > 1 else 0.0
 
 
 def _missing_readings(recording: Recording) -> Iterator[ChannelFinding]:
