@@ -7,7 +7,7 @@ tank, so that the matrix is diagonally dominant by columns.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -70,8 +70,11 @@ def eliminate(size: int, pattern: Sequence[tuple[int, int]]) -> Elimination:
     remaining, order = set(range(size)), []
     rows: list[tuple[int, int]] = []
     updates, above = [], []
-    columns = _neighbours(size, entries, lambda at: at)
-    rows_of_column = _neighbours(size, entries, lambda at: (at[1], at[0]))
+    columns: list[set[int]] = [set() for _ in range(size)]
+    rows_of_column: list[set[int]] = [set() for _ in range(size)]
+    for row, column in entries:
+        columns[row].add(column)
+        rows_of_column[column].add(row)
     while remaining:
         pivot = min(remaining, key=lambda k: ((len(columns[k]) - 1) * (len(rows_of_column[k]) - 1), k))
         remaining.remove(pivot)
@@ -91,13 +94,3 @@ def eliminate(size: int, pattern: Sequence[tuple[int, int]]) -> Elimination:
             rows_of_column[k].discard(pivot)
     given = tuple(index.get(at, -1) for at in entries)
     return Elimination(size, tuple(entries), given, tuple(order), tuple(rows), tuple(updates), tuple(above))
-
-
-def _neighbours(
-    size: int, entries: dict[tuple[int, int], int], orient: Callable[[tuple[int, int]], tuple[int, int]]
-) -> list[set[int]]:
-    """The columns of the entries in each row; if `orient` exchanges row and column, the rows in each column."""
-    columns: list[set[int]] = [set() for _ in range(size)]
-    for row, column in map(orient, entries):
-        columns[row].add(column)
-    return columns

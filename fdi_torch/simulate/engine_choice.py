@@ -37,13 +37,22 @@ def make_engine(
         return ReferenceEngine(network, space, experiment, why="reference engine (torchdiffeq): asked for")
     if kind == "traced":
         return TracedEngine(network, space, experiment, "traced engine (torch): asked for")
-    engine = CompiledEngine(network, space, experiment, "compiled engine: asked for")
-    if kind == "compiled" and torch.device(device).type != "cpu":
+    runs_on = torch.device(device).type
+    if kind == "compiled" and runs_on != "cpu":
         raise ValueError(f"engine: expected auto, traced or reference on {device}, got compiled, which runs on the CPU")
-    if kind == "compiled":
+    if runs_on != "cpu":
+        return TracedEngine(network, space, experiment, f"traced engine (torch): runs on {runs_on}")
+    engine = CompiledEngine(network, space, experiment, "compiled engine: asked for")
+    try:
         engine.prepare()
-        return engine
-    return _fastest(engine, torch.device(device).type)
+    except BuildError as error:
+        if kind == "compiled":
+            raise
+        return TracedEngine(network, space, experiment, f"traced engine (torch): {error}")
+    if kind == "auto":
+        threads = torch.get_num_threads()
+        engine.why = f"compiled engine on {threads} processor core{'s' if threads > 1 else ''}"
+    return engine
 
 
 def adaptive_engine(network: TankNetwork, space: ParameterSpace, experiment: Experiment, step: float) -> Engine:
@@ -58,16 +67,3 @@ def adaptive_engine(network: TankNetwork, space: ParameterSpace, experiment: Exp
     atol = 0.01 * rtol * length_scale(plant)
     why = f"reference engine (torchdiffeq, dopri5 at {rtol:.0e}): asked for"
     return ReferenceEngine(network, space, smoothed, "dopri5", rtol, atol, why, every_node=False)
-
-
-def _fastest(compiled: CompiledEngine, device: str) -> Engine:
-    parts = (compiled.network, compiled.space, compiled.experiment)
-    if device != "cpu":
-        return TracedEngine(*parts, f"traced engine (torch): runs on {device}")
-    try:
-        compiled.prepare()
-    except BuildError as error:
-        return TracedEngine(*parts, f"traced engine (torch): {error}")
-    threads = torch.get_num_threads()
-    compiled.why = f"compiled engine on {threads} processor core{'s' if threads > 1 else ''}"
-    return compiled

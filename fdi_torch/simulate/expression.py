@@ -153,7 +153,10 @@ class Graph:
         if operation == "sub":
             if value[1] == 0.0:
                 return a[0]
-            return self.apply("neg", a[1]) if value[0] == 0.0 else self._subtract(a)
+            if value[0] == 0.0:
+                return self.apply("neg", a[1])
+            second = self.nodes[a[1]]
+            return self.apply("add", a[0], second.arguments[0]) if second.operation == "neg" else None
         if operation == "div":
             return a[0] if value[1] == 1.0 else self._divide(a, value)
         if operation == "neg" and self.nodes[a[0]].operation == "neg":
@@ -171,11 +174,6 @@ class Graph:
             return self.apply("sub", a[0], self.nodes[a[1]].arguments[0])
         if self.nodes[a[0]].operation == "neg":
             return self.apply("sub", a[1], self.nodes[a[0]].arguments[0])
-        return None
-
-    def _subtract(self, a: Sequence[int]) -> int | None:
-        if self.nodes[a[1]].operation == "neg":
-            return self.apply("add", a[0], self.nodes[a[1]].arguments[0])
         return None
 
     def _divide(self, a: Sequence[int], value: Sequence[float | None]) -> int | None:

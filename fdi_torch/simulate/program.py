@@ -206,7 +206,11 @@ class _Builder:
         """The rates of the levels, their derivatives by the levels, and which of these derivatives are not zero."""
         levels = self._inputs("level", self.network.order)
         held = self._inputs("action", len(self.network.actuators()))
-        rates = self._network_rates(levels, held, self._step_clock() if self.adaptive else self.clock)
+        clock = self.clock
+        if self.adaptive:  # a lane's own steps, which are implicit and therefore stable for every rate of change
+            start, step = (self.tracer.tensor(n) for n in self._inputs("part", 2))
+            clock = Clock(start, step, clock.resolution, explicit=False)
+        rates = self._network_rates(levels, held, clock)
         moving = {held[o.place[1]]: o.place for o in act if o.place[0] == "action" and o.row}
         tank = {n: i for i, n in enumerate(levels)}
         slopes = self.graph.partials(rates, levels) if self.adaptive or self.tangent else []
@@ -219,11 +223,6 @@ class _Builder:
         with self.tracer:
             rates = self.network.rates([tensor(h) for h in levels], [tensor(a) for a in held], clock, self.values)
         return [self.tracer.node(r) for r in rates]
-
-    def _step_clock(self) -> Clock:
-        """The clock of a lane's adaptive step, which is implicit and therefore stable for every rate of change."""
-        start, step = (self.tracer.tensor(n) for n in self._inputs("part", 2))
-        return Clock(start, step, self.clock.resolution, explicit=False)
 
     def _readings(self) -> tuple[Section, Section]:
         network, tensor, node = self.network, self.tracer.tensor, self.tracer.node
