@@ -79,11 +79,8 @@ class Diagnosis:
     def statement(self) -> str:
         """Kind and names of the faults present: 'multiple faults: leak at T1, leak at T2 or plugging at OUT2'."""
         names = ", ".join([*(parameter_words(f.name) for f in self.present), *map(_rivals, self.not_isolated)])
-        return f"{self.kind}: {names or self._none}"
-
-    @property
-    def _none(self) -> str:
-        return "no suspected fault differs significantly from nominal" if self.misfit.explained else NONE_EXPLAINS
+        nothing = "no suspected fault differs significantly from nominal" if self.misfit.explained else NONE_EXPLAINS
+        return f"{self.kind}: {names or nothing}"
 
     @property
     def headline(self) -> str:

@@ -124,17 +124,19 @@ class Inbox:
         return items
 
 
-class BackOff:
-    """Waiting times between attempts to connect, s: doubled after each failure up to `longest`."""
+FIRST_RETRY, LONGEST_RETRY = 0.5, 30.0  # s
 
-    def __init__(self, first: float = 0.5, longest: float = 30.0) -> None:
-        self.first, self.longest = first, longest
-        self._next = first
+
+class BackOff:
+    """Waiting times between attempts to connect, s: doubled after each failure up to LONGEST_RETRY."""
+
+    def __init__(self) -> None:
+        self._next = FIRST_RETRY
 
     def failed(self) -> float:
         """The time to wait before the next attempt."""
-        wait, self._next = self._next, min(2.0 * self._next, self.longest)
+        wait, self._next = self._next, min(2.0 * self._next, LONGEST_RETRY)
         return wait
 
     def succeeded(self) -> None:
-        self._next = self.first
+        self._next = FIRST_RETRY

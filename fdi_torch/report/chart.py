@@ -21,14 +21,14 @@ from fdi_torch.report.style import HEIGHT, MARK, SOFT, VARIABLES, label_lines, l
 BINS = 400
 
 
-def thinned(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray]:
-    """A signal (T,) reduced to the minimum and maximum of each of `bins` segments, in order, so that spikes remain.
+def thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A signal (T,) reduced to the minimum and maximum of each of BINS segments, in order, so that spikes remain.
 
     A segment without finite values becomes a gap (NaN).
     """
-    if len(time) <= 2 * bins:
+    if len(time) <= 2 * BINS:
         return time, values
-    kept = extremes(values, bins)
+    kept = extremes(values, BINS)
     return time[kept], values[kept]
 
 

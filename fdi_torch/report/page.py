@@ -54,10 +54,10 @@ class RunReport:
         return [picture for section in self.sections for picture in section.pictures]
 
 
-def report_of(material: Material, makers: Sequence[Maker] = SECTIONS) -> RunReport:
+def report_of(material: Material) -> RunReport:
     """All sections for which the log has content. An error in a log affects its section only."""
     with material.in_its_units():
-        made = [_made(maker, material) for maker in makers]
+        made = [_made(maker, material) for maker in SECTIONS]
     return RunReport(material, tuple(section for section in made if section is not None))
 
 
