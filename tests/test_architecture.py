@@ -52,7 +52,7 @@ DOORS = {
     "pyarrow": ("recordings/parquet.py", "recordings/feather.py"),
     "openpyxl": ("recordings/excel.py",),
     "h5py": ("recordings/hdf5.py",),
-    "influxdb_client_3": ("recordings/influx.py",),
+    "influxdb_client_3": ("recordings/database.py",),
     "sqlalchemy": ("recordings/database.py",),
     "pandas": (),
     "xarray": (),

@@ -33,7 +33,7 @@ class LearningItems:
                 for line in self.path.read_bytes().splitlines():
                     zero, batch = orjson.loads(line)
                     origin = zero if origin is None else origin
-                    items += [item if isinstance(item, str) else _row(*item) for item in batch]
+                    items += [item if isinstance(item, str) else _without_null(*item) for item in batch]
         return items, origin
 
     def keeping(self, batches: Iterator[list[Item]], origin: Callable[[], float | None]) -> Iterator[list[Item]]:
@@ -50,10 +50,7 @@ class LearningItems:
         self.path.unlink(missing_ok=True)
 
 
-def _row(time: float, inputs: list[float | None], readings: list[float | None]) -> Row:
-    """A row of which unknown values are null."""
-    return time, [_number(x) for x in inputs], [_number(x) for x in readings]
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else value
+def _without_null(time: float, *values: list[float | None]) -> Row:
+    """A row with NaN for unknown values."""
+    inputs, readings = ([math.nan if x is None else x for x in each] for each in values)
+    return time, inputs, readings

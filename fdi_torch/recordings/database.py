@@ -1,8 +1,10 @@
-"""The result of a database query as a table (SQLAlchemy, extra `sql`, and InfluxDB). The only importer of SQLAlchemy.
+"""The result of a database query as a table (SQLAlchemy, extra `sql`; influxdb3-python, extra `influx`). The only
+importer of both.
 
 A query is one address: `DATABASE?query=SQL`, such as `sqlite:///plant.db?query=SELECT t_s, Q1_cm3_s, h1_cm FROM run`.
 The SQL is last and taken as it is written. Passwords stand in environment variables, as `${NAME}`, so that
-the address can be shown and logged: the value is inserted for the connection only.
+the address can be shown and logged: the value is inserted for the connection only. An InfluxDB 3 database is
+`influxdb://HOST:PORT/DATABASE?token=${NAME}`, or `influxdbs://...` for an encrypted connection.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, quote, unquote, urlsplit
 
-from fdi_torch.recordings import influx
+from fdi_torch.recordings.parquet import plain_values
 from fdi_torch.recordings.table_files import Row, tab_separated
 from fdi_torch.tables import needed
 
@@ -23,6 +25,7 @@ _ADDRESS = re.compile(r"(?P<database>[A-Za-z][\w+]*://[^?]*(?:\?.*?)?)[?&]query=
 _VARIABLE = re.compile(r"\$\{(\w+)\}")
 _SECRETS = ("password", "passwd", "pwd", "passfile", "sslpassword", "token")
 _ROWS_AT_ONCE = 4096
+_INFLUX_PORT = 8181
 HIDDEN = "***"
 
 
@@ -79,8 +82,8 @@ def _value(name: str, address: str) -> str:
 
 def _rows(database: str, query: str, find: Callable[[str], Path]) -> Iterator[Row]:
     """The names of the columns, then the rows."""
-    if database.startswith(("influxdb://", f"{influx.SECURE}://")):
-        yield from influx.rows(database, query, _inserted)
+    if database.startswith(("influxdb://", "influxdbs://")):
+        yield from _influx_rows(database, query)
         return
     library = needed("sqlalchemy", "sql")
     engine = _engine(library, database, find)
@@ -93,6 +96,24 @@ def _rows(database: str, query: str, find: Callable[[str], Path]) -> Iterator[Ro
                 yield from block
     finally:
         engine.dispose()
+
+
+def _influx_rows(database: str, query: str) -> Iterator[Row]:
+    """As `_rows`, of InfluxDB 3."""
+    parts = urlsplit(database)
+    token = dict(parse_qsl(parts.query)).get("token")
+    client = needed("influxdb_client_3", "influx").InfluxDBClient3(
+        host=f"{'https' if parts.scheme == 'influxdbs' else 'http'}://{parts.hostname}:{parts.port or _INFLUX_PORT}",
+        database=unquote(parts.path.removeprefix("/")),
+        token=_inserted(token) if token else None,
+    )
+    try:
+        table = client.query(query, language="sql")
+    finally:
+        client.close()
+    yield table.column_names
+    for batch in table.to_batches():
+        yield from zip(*(plain_values(column) for column in batch.columns), strict=True)
 
 
 def _inserted(text: str, encode: Callable[[str], str] = str) -> str:
