@@ -355,7 +355,7 @@ def test_refused_steps_do_not_give_a_lane_up() -> None:
 def test_status_says_out_of_iterations_or_stalled() -> None:
     few = levenberg_marquardt(DECAYS.linearise, START, *FREE, RefineSettings(iterations=2))
     assert set(few.statuses()) == {"max_iterations"} and set(few.iterations.tolist()) == {2}
-    assert (few.promised > 1e-6).all()
+    assert (few.newton_decrement > 1e-6).all()
 
     def wrong_way(theta: Tensor, lanes: Tensor) -> Linearisation:
         model = DECAYS.linearise(theta, lanes)

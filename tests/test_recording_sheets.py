@@ -69,7 +69,7 @@ def test_an_input_is_not_held_over_rows_that_are_missing(plant: PlantDescription
     whole = read(plant, tmp_path, text)
     assert len(whole.known_segments()) == 1
     (warning,) = data_warnings(whole, plant)
-    assert warning.startswith("Q: changes in the gap after 2 s, nobody knows when")
+    assert warning.startswith("Q: changes in the gap after 2 s, at an unknown time")
     assert warning.endswith("unless the recording is cut there: columns: {Q: {held: 3 s}}")
     (tmp_path / "flow.csv").write_text("t_s,Q_l_min\n0,60\n5,30\n11,30\n")
     levels = "\n".join(",".join(cell for k, cell in enumerate(row.split(",")) if k != 1) for row in text.split())

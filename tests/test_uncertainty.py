@@ -153,7 +153,9 @@ def test_a_search_covers_four_standard_deviations_of_a_prior_within_the_range() 
 def test_a_stalled_refinement_within_a_tenth_of_a_standard_error_has_converged(errors: float, status: str) -> None:
     """At x standard errors from the optimum, the log-likelihood is x^2 / 2 below its maximum."""
     one = torch.ones(1, dtype=DOUBLE)
-    stopped = replace(unfinished(one[:, None], None), status=torch.tensor([STALLED]), promised=0.5 * errors**2 * one)
+    stopped = replace(
+        unfinished(one[:, None], None), status=torch.tensor([STALLED]), newton_decrement=0.5 * errors**2 * one
+    )
     assert status_of(stopped) == status
 
 

@@ -21,7 +21,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     screen.say(f"{arguments.fmu}: FMU for co-simulation (FMI 2.0) with {numbers}")
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     starts = ["" if row["start"] is None else f"{row['start']:.6g}" for row in rows]
-    told = [[row["name"], row["causality"], row["unit"], start] for row, start in zip(rows, starts, strict=True)]
-    screen.table("", ("variable", "causality", "unit", "start"), told, left=3)
+    shown = [[row["name"], row["causality"], row["unit"], start] for row, start in zip(rows, starts, strict=True)]
+    screen.table("", ("variable", "causality", "unit", "start"), shown, left=3)
     screen.result({"format": "fdi_torch.export/1", "fmu": str(arguments.fmu), "variables": rows})
     return DONE

@@ -40,8 +40,8 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str, rec
     """The text of a new run, monitor, rehearsal or study.
 
     plant: the plant of the file; plant_file: its entry under the key `plant`; name: of the run. recording: the file
-    that it reads, of a monitor also the URL of a live source; None for one of the name of the run, whose header is then
-    told. Raises ValueError for a recording that cannot be read.
+    that it reads, of a monitor also the URL of a live source; None for one of the name of the run, with a comment that
+    shows its header. Raises ValueError for a recording that cannot be read.
     """
     if recording is not None and urlsplit(recording).scheme in PORTS:
         if kind != "monitor":

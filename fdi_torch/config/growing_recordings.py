@@ -101,14 +101,14 @@ def _csv_rows(
 def _new_rows(file: GrowingCsv, idle: float, began: Callable[[float], None] | None) -> Iterator[Row | str]:
     quiet_since = time.monotonic()
     while time.monotonic() - quiet_since <= idle:
-        seconds, commands, readings, troubles = file.new()
+        seconds, commands, readings, problems = file.new()
         if began is not None and len(seconds) and (zero := file.clock_zero) is not None:
             began(zero)
         rows = list(zip(seconds.tolist(), commands.tolist(), readings.tolist(), strict=True))
         first = 0
-        for count, trouble in troubles:
+        for count, problem in problems:
             yield from rows[first:count]
-            yield f"{trouble}; the row is left out"
+            yield f"{problem}; the row is left out"
             first = count
         yield from rows[first:]
         if len(seconds):
@@ -131,11 +131,11 @@ def _mcap_rows(
     clock = mapping.get("t", ChannelSource())
     scale = unit_factor(clock.unit, "s") if clock.unit else 1.0
     time_now, readings_now = None, dict.fromkeys(outputs, np.nan)
-    troubles: list[str] = []
+    problems: list[str] = []
     topics = {topic for topic, _ in places.values()}
-    for message in follow(path, topics, idle, POLL, lambda damage: troubles.append(str(damage))):
-        yield from troubles
-        troubles.clear()
+    for message in follow(path, topics, idle, POLL, lambda damage: problems.append(str(damage))):
+        yield from problems
+        problems.clear()
         payload = message.payload
         t = number_at(payload, clock.column or "t") * scale
         t = message.t if np.isnan(t) else t

@@ -68,7 +68,7 @@ class MonitorConfig(Strict):
     @model_validator(mode="before")
     @classmethod
     def _a_source_is_the_recording(cls, data: Any) -> Any:
-        """Let `recording` describe a live source to whatever asks for its name, inputs and initial levels."""
+        """Let `recording` describe a live source: its name, inputs and initial levels."""
         if not isinstance(data, dict) or not isinstance(source := data.get("source"), dict):
             return data
         if data.get("recording") is not None:

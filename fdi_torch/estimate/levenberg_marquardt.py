@@ -101,7 +101,7 @@ class Progress:
     lanes: Tensor  # (L,) index in the flattened batch
     theta: Tensor  # (L, P)
     cost: Tensor  # (L,)
-    promised: Tensor  # (L,) Newton decrement before the step
+    newton_decrement: Tensor  # (L,) Newton decrement before the step
     damping: Tensor  # (L,)
     accepted: Tensor  # (L,) bool
 
@@ -204,7 +204,7 @@ def _filed(result: Refined, finished: _Lanes, status: Tensor, decrement: Tensor,
         cost=model.cost,
         gradient=model.gradient,
         curvature=model.curvature,
-        promised=decrement,
+        newton_decrement=decrement,
         held=finished.quadratic.held(),
         status=status,
         iterations=torch.full_like(finished.lanes, iteration),

@@ -33,8 +33,8 @@ class Refined:
 
     status: 'failed' means that the cost or its derivatives were not finite at the start, which is returned.
     gradient, curvature: of the last linearisation, priors included.
-    promised: Newton decrement, the decrease of the cost that the model still predicts. For a negative log-likelihood,
-    the distance to the optimum is sqrt(2 promised) standard errors.
+    newton_decrement: g' H^-1 g / 2, the decrease of the cost that the quadratic model still predicts. For a negative
+    log-likelihood, the distance to the optimum is sqrt(2 newton_decrement) standard errors.
     state: data that the problem attaches to the final points; None for most problems.
     """
 
@@ -42,7 +42,7 @@ class Refined:
     cost: Tensor  # (*batch)
     gradient: Tensor  # (*batch, P)
     curvature: Tensor  # (*batch, P, P)
-    promised: Tensor  # (*batch) Newton decrement
+    newton_decrement: Tensor  # (*batch)
     held: Tensor  # (*batch, P) bool: parameters at an active bound
     status: Tensor  # (*batch) int64, index into STATUSES
     iterations: Tensor  # (*batch) int64
@@ -88,7 +88,7 @@ def unfinished(start: Tensor, state: State | None) -> Refined:
         cost=start.new_full((count,), math.inf),
         gradient=torch.full_like(start, math.nan),
         curvature=start.new_full((count, parameters, parameters), math.nan),
-        promised=start.new_full((count,), math.nan),
+        newton_decrement=start.new_full((count,), math.nan),
         held=torch.zeros_like(start, dtype=torch.bool),
         status=zeros,
         iterations=zeros,

@@ -195,7 +195,7 @@ class _Profiler:
     def _minimise(self, start: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         fitted = levenberg_marquardt(self.linearise, start.clamp(low, high), low, high, SETTINGS)
         cost = torch.where(torch.isfinite(fitted.cost), fitted.cost, math.inf)
-        return fitted.theta, cost, fitted.converged | (fitted.promised < IMPROVEMENT)
+        return fitted.theta, cost, fitted.converged | (fitted.newton_decrement < IMPROVEMENT)
 
     def _fit_freely(self) -> None:
         """Add the best fit near the best point, if one of another local minimum than the estimate's was found."""

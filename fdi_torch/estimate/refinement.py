@@ -196,7 +196,7 @@ def status_of(refinement: Refined) -> str:
     within `CONVERGED_WITHIN` standard errors of the optimum. Otherwise a member without iterations is 'not refined'.
     """
     status = refinement.statuses()[0]
-    near_optimum = float(refinement.promised[0]) < 0.5 * CONVERGED_WITHIN**2
+    near_optimum = float(refinement.newton_decrement[0]) < 0.5 * CONVERGED_WITHIN**2
     no_iterations = status == "max_iterations" and not int(refinement.iterations[0])
     if (status == "stalled" or no_iterations) and near_optimum:
         return "converged"

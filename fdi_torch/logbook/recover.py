@@ -51,8 +51,8 @@ class Recovery:
         if len(self.lost) > 1:
             gaps = f"{len(self.lost)} damaged stretches, {size} bytes in all, are lost"
         end = "" if self.ended else "the run did not come to its end: up to its last second is missing"
-        trouble = "; ".join(part for part in (gaps, end) if part)
-        return f"{self.source}: {self.messages} messages saved in {self.target}; {trouble}"
+        losses = "; ".join(part for part in (gaps, end) if part)
+        return f"{self.source}: {self.messages} messages saved in {self.target}; {losses}"
 
 
 def recover(source: str | Path, target: str | Path | None = None) -> Recovery:

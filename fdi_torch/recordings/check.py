@@ -144,7 +144,7 @@ def _changes_in_gaps(recording: Recording) -> Iterator[ChannelFinding]:
         if len(moved):
             start = float(recording.time[moved[0]])
             text = (
-                f"changes in the gap after {start:g} s, nobody knows when; it counts as unchanged until the gap ends, "
+                f"changes in the gap after {start:g} s, at an unknown time; it counts as unchanged until the gap ends, "
                 f"unless the recording is cut there: columns: {{{name}: {{held: {GAP_STEPS * interval:g} s}}}}"
             )
             yield ChannelFinding("held", name, text, {"after": start, "count": len(moved)})

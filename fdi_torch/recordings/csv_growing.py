@@ -72,19 +72,19 @@ class GrowingCsv:
         whole = data[: data.rfind(b"\n") + 1]
         self._place += len(whole)
         rows: list[np.ndarray] = []
-        troubles = []
+        problems = []
         for line in whole.decode(self._encoding, errors="replace").splitlines():
             try:
                 row = parse_carefully([*joined([line], self._columns.heading)], self._columns, self._line)
                 rows += [values for values in row if np.isfinite(values[0])]
             except ValueError as error:
-                troubles.append((len(rows), str(error)))
+                problems.append((len(rows), str(error)))
             self._line += 1
         table = np.array(rows).reshape(len(rows), len(self._columns.positions))
         inputs, outputs = (channels_in_si(table, self._columns, bounds) for bounds in (self._inputs, self._outputs))
         seconds = self._seconds(table[:, 0])
         outputs[~np.isfinite(outputs)] = np.nan
-        return seconds, self._filled_inputs(seconds, inputs), outputs, troubles
+        return seconds, self._filled_inputs(seconds, inputs), outputs, problems
 
     def _filled_inputs(self, seconds: np.ndarray, inputs: np.ndarray) -> np.ndarray:
         """Inputs (R, M) with empty cells filled by the last logged value while it is held, also from earlier rows."""

@@ -67,7 +67,7 @@ def denied_rims(plant: PlantDescription, recording: Recording) -> list[DeniedRim
     A reading counts as above the rim if it exceeds RIM_MARGIN, the tolerances of height, gain and offset, and noise by
     their quantiles of 1 - CHANCE. Noise alone lets r successive readings exceed with a probability of CHANCE^r, and in
     one of N places with N CHANCE^r, so that a rim is denied by a run of r > 1 + ln N / ln(1 / CHANCE) readings: not by
-    a spike. A sensor that has effects in the plant file is left to these.
+    a spike. Sensors with effects in the plant file are not examined.
     """
     located = {effect.location for effect in plant.effects}
     sensors = [s for s in plant.sensors if s.column in recording.output_names and s.name not in located]

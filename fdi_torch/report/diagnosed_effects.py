@@ -77,7 +77,7 @@ def combinations_of(material: Material, result: str) -> list[Combination]:
     try:
         return [Combination.from_dict(plain) for plain in material.listed(result)]
     except (KeyError, TypeError, ValueError) as error:
-        material.trouble.append(f"the result's {result.replace('_', ' ')} are unreadable: {error}")
+        material.problems.append(f"the result's {result.replace('_', ' ')} are unreadable: {error}")
         return []
 
 

@@ -42,7 +42,7 @@ Payload = dict[str, Any]
 @dataclass
 class Material:
     """Content of one log. events: topic -> messages in order. units: topic -> field -> SI unit. counts: messages of
-    every topic. plant: from the log's configuration, None if it has none. trouble: what could not be read.
+    every topic. plant: from the log's configuration, None if it has none. problems: what could not be read.
     """
 
     run: Run
@@ -50,7 +50,7 @@ class Material:
     events: dict[str, list[Payload]] = field(default_factory=dict)
     units: dict[str, dict[str, str]] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
-    trouble: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
 
     def about(self, record: str) -> dict[str, str]:
         """A metadata record of ours, such as "status"."""
@@ -106,7 +106,7 @@ class Material:
         try:
             return arrays(self.run)
         except LogError as error:
-            self.trouble.append(str(error))
+            self.problems.append(str(error))
             return {}
 
     @cached_property
@@ -131,7 +131,7 @@ class Material:
         except ValueError:
             answer = None
         if not isinstance(answer, dict):
-            self.trouble.append("/gap/verdict: the answer is not a JSON object")
+            self.problems.append("/gap/verdict: the answer is not a JSON object")
             return {}
         return answer
 
@@ -187,5 +187,5 @@ def gather(run: Run, plant: PlantDescription | None = None) -> Material:
         try:
             material.events.setdefault(topic, []).append(message.payload)
         except LogError as error:
-            material.trouble.append(str(error))
+            material.problems.append(str(error))
     return material

@@ -115,7 +115,7 @@ def provenance_section(material: Material) -> Section | None:
 def health_section(material: Material) -> Section | None:
     """CRCs, indices, completeness, log messages, and the number of messages per topic."""
     inspection = material.inspection
-    problems = [*inspection.health.problems, *material.trouble]
+    problems = [*inspection.health.problems, *material.problems]
     state = tag("span", "damaged", class_="bad") if problems else tag("span", "intact", class_="good")
     topics, chunks = inspection.topics.values(), counted(inspection.health.chunks, "chunk")
     content = f"{counted(inspection.messages, 'message')} on {counted(len(topics), 'topic')} in {chunks}"
