@@ -440,6 +440,15 @@ def test_rounding_of_nearly_equal_columns_is_harmless() -> None:
     assert math.isfinite(fit.evidence) and int(fit.used[:2].sum()) <= 1
 
 
+def test_a_start_with_equal_columns_keeps_one_of_them() -> None:
+    """About another fit, two regressors that were in use may be the same."""
+    columns = torch.randn(50, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)[:, [0, 1, 0]]
+    gram, score = columns.T @ columns, columns.T @ (3.0 * columns[:, 0] - 2.0 * columns[:, 1])
+    fit = sparse_fit(gram, score, torch.arange(3), torch.zeros(3).double(), torch.full((3,), 1e-20).double())
+    assert torch.isfinite(fit.precision).tolist() == [True, True, False]
+    assert fit.mean.tolist() == pytest.approx([3.0, -2.0, 0.0], abs=0.2)
+
+
 def test_a_rounding_error_is_no_unknown_cause() -> None:
     """It changes as slowly as the level does, but by no more than half a step."""
     run = recorded({}, 7, samples=1500)

@@ -9,9 +9,12 @@ from fdi_torch.config.loaded_recordings import named_recordings, read_recording
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.gap.answer import Answer, adopted
-from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
+from fdi_torch.gap.explanation_pool import CONVERGED, ExplanationPool
 from fdi_torch.gap.free_runs.prediction import predict
 from fdi_torch.gap.free_runs.refit import refit
+from fdi_torch.gap.marginal_likelihood import evidence_under, with_estimated_noise
+from fdi_torch.gap.problem import PLAIN, problem_of
 from fdi_torch.recording import Recording
 
 ROOT = Path(__file__).parents[1]
@@ -43,6 +46,16 @@ def test_the_cascade_predicts_a_quarter_that_its_numbers_never_saw(quarter: int)
     fitted = refit(load_plant(REAL / "cascaded_tanks_found.yaml"), cascade(**rest)).plant
     held_out = predict(fitted, cascade(start=f"{first} s", stop=f"{last} s"))
     assert held_out.rmse["level"] < 0.25
+
+
+def test_the_noise_of_the_recalibrated_cascade_is_the_most_likely_one_with_its_fit() -> None:
+    """Linearised about the free run, the plant is another one after a refit, in which the fit may be less likely."""
+    data = problem_of(load_plant(REAL / "cascaded_tanks_nominal.yaml"), [cascade()], [], PLAIN).data
+    fitter, null, _ = recalibrate(data)
+    pool = ExplanationPool(fitter, null, 100)
+    base = pool.evaluate(null)
+    own, _ = with_estimated_noise(fitter, base.fit, base.noise)
+    assert evidence_under(own, base.fit, pool.choices) < base.log_evidence + CONVERGED
 
 
 @pytest.mark.slow

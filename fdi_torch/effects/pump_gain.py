@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
+from fdi_torch.plant.operating_range import timed_starts
 
 
 class PumpGain(Effect):
@@ -34,7 +35,7 @@ class PumpGain(Effect):
         )
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        return [{"factor": 0.9}, {"factor": 1.1}]
+        return timed_starts([{"factor": 0.9}, {"factor": 1.1}], operating_range)
 
     def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * (1.0 + (p["factor"] - 1.0) * local.clock.risen(p["onset"], p["ramp"]))

@@ -6,6 +6,7 @@ import torch
 
 from fdi_torch.plant.constants import reading_span
 from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
+from fdi_torch.plant.operating_range import timed_starts
 
 
 class SensorBias(Effect):
@@ -33,7 +34,7 @@ class SensorBias(Effect):
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         sensor = plant.sensor(place)
         bias = 0.02 * reading_span(plant, sensor)
-        return [{"bias": bias}, {"bias": -bias}]
+        return timed_starts([{"bias": bias}, {"bias": -bias}], operating_range)
 
     def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         return value + p["bias"] * clock.risen_by_end(p["onset"], p["ramp"]), memory

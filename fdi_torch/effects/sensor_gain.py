@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from fdi_torch.plant.effect import Clock, Effect, Memory, OperatingRange, Parameter, PlantDescription, Stage, Values
+from fdi_torch.plant.operating_range import timed_starts
 
 
 class SensorGain(Effect):
@@ -27,7 +28,7 @@ class SensorGain(Effect):
         )
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        return [{"factor": 0.95}, {"factor": 1.05}]
+        return timed_starts([{"factor": 0.95}, {"factor": 1.05}], operating_range)
 
     def reading(self, value: torch.Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[torch.Tensor, Memory]:
         return value * (1.0 + (p["factor"] - 1.0) * clock.risen_by_end(p["onset"], p["ramp"])), memory

@@ -55,6 +55,12 @@ class RankedExplanation:
         return self.fit.key
 
     @property
+    def negative_log_posterior(self) -> float:
+        """That of the fitted parameters under this noise, up to a constant; infinite if it is undefined."""
+        value = 0.5 * (self.fit.cost + self.fitter.log_det)
+        return value if math.isfinite(value) else math.inf
+
+    @property
     def log_weight(self) -> float:
         """Log posterior weight if nothing is unknown: random flows are then of one order of magnitude in all tanks."""
         return self.log_evidence + self.noise.log_prior()
@@ -89,16 +95,15 @@ class ExplanationPool:
         climb = False
         while True:
             own_fitter, likely = with_estimated_noise(self.fitter, fit, start, climb)
-            fit = replace(fit, cost=own_fitter.cost(fit))
-            lead = log_evidence(own_fitter, fit, self.choices) - rival
-            fit = own_fitter.fit(Candidate(fit.candidate.placements, (fit.effect_values,)), fit, fit.cost + 2.0 * lead)
-            # Beside strong flows a fit may go where the plant, linearised about its trajectory, is another one.
-            own_fitter = with_disturbances(self.fitter, fit, likely.noise)
-            fit = replace(fit, cost=own_fitter.cost(fit))
-            updated = RankedExplanation(fit, own_fitter, likely.noise, log_evidence(own_fitter, fit, self.choices))
-            gain = updated.log_evidence - best.log_evidence if best else math.inf
+            here = self._explanation(own_fitter, fit, likely.noise)
+            target = here.fit.cost + 2.0 * (here.log_evidence - rival)
+            fit = own_fitter.fit(Candidate(candidate.placements, (fit.effect_values,)), here.fit, target)
+            # The plant, linearised about the new trajectory, may be another one, in which the fit is less likely.
+            there = self._explanation(with_disturbances(self.fitter, fit, likely.noise), fit, likely.noise)
+            likelier = min(there, here, key=lambda e: e.negative_log_posterior)
+            gain = likelier.log_evidence - best.log_evidence if best else math.inf
             if best is None or gain > 0.0:
-                best = updated
+                best = likelier
             behind = rival - best.log_evidence
             if behind > 0.5 * BEHIND and gain < SHARE * behind:
                 break
@@ -107,10 +112,16 @@ class ExplanationPool:
                 best = replace(best, fit=fit, log_evidence=evidence_under(best.fitter, fit, self.choices))
                 break
             # The search for the correlation time, which takes longest, begins where the rest has converged.
-            fit, start, climb = best.fit, best.noise, not gain > CONVERGED
+            climb = not gain > CONVERGED
+            fit, start = (best.fit, best.noise) if climb else (there.fit, there.noise)
         if before is None or best.log_evidence > before.log_evidence:
             self.explanations[fit.key] = best
         return best
+
+    def _explanation(self, fitter: Fitter, fit: Fit, noise: StateNoise) -> RankedExplanation:
+        """The explanation of a fit under a fitter's noise."""
+        fit = replace(fit, cost=fitter.cost(fit))
+        return RankedExplanation(fit, fitter, noise, log_evidence(fitter, fit, self.choices))
 
     def without(self, explanation: RankedExplanation, cause: CauseName) -> RankedExplanation:
         """The explanation without one of its effects, refitted from its present values.

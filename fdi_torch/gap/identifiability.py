@@ -30,7 +30,7 @@ from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.extensions import size_of
 from fdi_torch.gap.library import equivalence_class, library_of
-from fdi_torch.gap.screening import Option, Pairs, options_of, pairs_of, products, screen
+from fdi_torch.gap.screening import Option, Pairs, most_visible, options_of, pairs_of, products, screen
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of
@@ -53,22 +53,11 @@ class Identifiability:
 def identifiability(pairs: Pairs, plant: PlantDescription) -> Identifiability:
     """Identifiability from the regression on pairs of a library."""
     strength = torch.diagonal(pairs.gram)
-    most_visible = _most_visible_starts(pairs.options, strength)
-    hidden = tuple(cause for cause, i in most_visible.items() if float(strength[i]) < SHOWN)
+    best = most_visible(pairs.options, strength)
+    hidden = tuple(cause for cause, i in best.items() if float(strength[i]) < SHOWN)
     return Identifiability(
-        hidden,
-        _inseparable_pairs(plant, most_visible, pairs.gram),
-        {c: float(strength[i]) for c, i in most_visible.items()},
+        hidden, _inseparable_pairs(plant, best, pairs.gram), {c: float(strength[i]) for c, i in best.items()}
     )
-
-
-def _most_visible_starts(options: Sequence[Option], strength: Tensor) -> dict[CauseName, int]:
-    """The most visible start of each cause."""
-    best: dict[CauseName, int] = {}
-    for i, option in enumerate(options):
-        if option.cause not in best or strength[i] > strength[best[option.cause]]:
-            best[option.cause] = i
-    return best
 
 
 def _inseparable_pairs(

@@ -43,6 +43,11 @@ class Option:
     def cause(self) -> tuple[str, str]:
         return self.placement.effect.name, self.placement.location
 
+    @property
+    def permanent(self) -> bool:
+        """Whether it acts from the beginning of the recording."""
+        return self.placement.full_name("onset") not in self.start
+
 
 @dataclass(frozen=True)
 class Pairs:
@@ -98,6 +103,17 @@ class ScreeningResult:
         """Reduction of chi-square by each option alone (M,); 0 if its size had to be negative or nothing is visible."""
         strength = self.strength
         return torch.where((self.score > 0) & (strength > 1e-6), self.score**2 / strength.clamp(min=1e-300), 0.0)
+
+
+def most_visible(options: Sequence[Option], strength: Tensor) -> dict[tuple[str, str], int]:
+    """The most visible start of each cause, among those that act from the beginning if there are any.
+
+    Onsets make causes separable that are not if they act from the beginning.
+    """
+    best: dict[tuple[str, str], int] = {}
+    for i in sorted(range(len(options)), key=lambda i: (options[i].permanent, float(strength[i])), reverse=True):
+        best.setdefault(options[i].cause, i)
+    return best
 
 
 def options_of(placements: Sequence[Placement], fitter: Fitter, reach: OperatingRange) -> list[Option]:
@@ -173,12 +189,11 @@ class _ProjectedRegression:
 
     def pairs(self, screening: ScreeningResult) -> Pairs:
         """The regression on pairs of the most promising options."""
-        chosen: set[int] = set()
-        for value in (screening.strength, screening.gain):
-            best: dict[tuple[str, str], int] = {}
-            for i in torch.argsort(value, descending=True).tolist():
-                best.setdefault(screening.options[i].cause, i)
-            chosen |= set(best.values())
+        chosen = {*most_visible(screening.options, screening.strength).values()}
+        best: dict[tuple[str, str], int] = {}
+        for i in torch.argsort(screening.gain, descending=True).tolist():
+            best.setdefault(screening.options[i].cause, i)
+        chosen |= set(best.values())
         options = tuple(screening.options[i] for i in sorted(chosen))
         return Pairs(options, *self.products(options))
 

@@ -99,6 +99,14 @@ def onset_grid(operating_range: OperatingRange) -> list[float]:
     return interior_points((0.0, operating_range.duration), 9)
 
 
+def timed_starts(starts: Sequence[Mapping[str, float]], operating_range: OperatingRange) -> list[dict[str, float]]:
+    """These starts from the beginning of the recording, from each onset of the grid, and growing until its end."""
+    duration = operating_range.duration
+    growing = {"onset": 0.3 * duration, "ramp": 0.7 * duration}
+    times = [{}, *({"onset": instant} for instant in onset_grid(operating_range)), growing]
+    return [{**start, **time} for time in times for start in starts]
+
+
 def interior_points(ends: Range, count: int) -> list[float]:
     """`count` evenly spaced values strictly inside a range."""
     low, high = ends

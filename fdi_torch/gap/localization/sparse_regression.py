@@ -112,7 +112,15 @@ class _Problem:
         if start is not None:
             known = slice(len(start))
             precision[known] = torch.where(self.visible[known], start / self.size[known].square(), math.inf)
+        while (dependent := self._first_dependent(precision)) is not None:
+            precision[self.regressor == self.regressor[dependent]] = math.inf
         return precision
+
+    def _first_dependent(self, precision: Tensor) -> int | None:
+        """The first column in use that is, up to rounding, a linear combination of those before it; None if none is."""
+        used = torch.isfinite(precision).nonzero().flatten()
+        _, order = torch.linalg.cholesky_ex(self.unit[used][:, used] + torch.diag(precision[used]))
+        return int(used[int(order) - 1]) if int(order) else None
 
     def posterior(self, precision: Tensor) -> _Posterior:
         return _Posterior.of(self.unit, self.target, precision)
