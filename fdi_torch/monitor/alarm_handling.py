@@ -259,7 +259,7 @@ class AlarmHandler:
         )
         change = replace(change, explanations=kept)
         back = recovered_columns(self.space, change)
-        ended = tuple(t for t in (change.ended or state.tracks) if t.column in back)
+        told, ended = change.ended, tuple(t for t in (change.ended or state.tracks) if t.column in back)
         names = self._names(reported)
         announce = announce or names != change.reported
         change = replace(change, ended=ended, reported=names)
@@ -278,7 +278,7 @@ class AlarmHandler:
         ends = possible_ends(self.observer, state, change, self.settings.lookback)
         earliest_end = change.best.onset if ends is None else ends[0]
         state = with_hidden(self.observer, state, change, earliest_end, self.settings.confirm)
-        state, events = end_recovered(self.writer, state, change, reported, ends)
+        state, events = end_recovered(self.writer, state, change, reported, ends, told)
         present = [c for c in best.hypothesis.sizes if c not in back]
         if not present:
             numbers = [t.number for t in ended]

@@ -256,18 +256,21 @@ def end_recovered(
     change: DetectedChange,
     reported: Sequence[HypothesisFit],
     ends: tuple[float, float] | None,
+    told: Sequence[FaultTrack],
 ) -> tuple[MonitorState, list[Event]]:
     """End the alarms of recovered faults; "cannot tell" if the readings would not show one of them any more.
 
-    ends: see `possible_ends`.
+    ends: see `possible_ends`. told: those that had recovered by earlier fits of the change.
     """
     events, unseen = [], [h.track.column for h in state.hidden]
     for number in sorted({t.number for t in change.ended}):
-        columns, alarm = [t.column for t in change.ended if t.number == number], state.alarm(number)
-        hidden = [c for c in columns if c in unseen]
-        answer = State.CANNOT_TELL if hidden else State.RECOVERED
-        if alarm.state is not answer:
-            state = state.with_alarm(alarm.with_state(answer))
-            names = [writer.space.names[c] for c in hidden or columns]
-            events.append(writer.ended(state, change, reported, number, names, not hidden, ends))
+        ended, alarm = [t for t in change.ended if t.number == number], state.alarm(number)
+        answer = State.CANNOT_TELL if any(t.column in unseen for t in ended) else State.RECOVERED
+        differs = alarm.state is not answer
+        state = state.with_alarm(alarm.with_state(answer)) if differs else state
+        for kind in (State.CANNOT_TELL, State.RECOVERED):
+            alike = [t for t in ended if (t.column in unseen) == (kind is State.CANNOT_TELL)]
+            if any(t not in told for t in alike) or (alike and differs and kind is answer):
+                names = [writer.space.names[t.column] for t in alike]
+                events.append(writer.ended(state, change, reported, number, names, kind is State.RECOVERED, ends))
     return state, events
