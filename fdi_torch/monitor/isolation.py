@@ -93,8 +93,8 @@ def with_flows_of_window(
     them uncertain.
 
     First, the hypotheses are fitted again with the flows that are most likely under the likeliest one, apart from those
-    that are far from plausible with these flows and their previous values. Then the evidence of each plausible
-    hypothesis is raised by the log-likelihood that flows learnt under it add.
+    that are far from plausible with their previous values, both with the earlier flows and with these. Then the
+    evidence of each plausible hypothesis is raised by the log-likelihood that flows learnt under it add.
     """
     observer, _ = observer.learning_from(window, believed, changes_of(ranked[:1]))
     base = observer.white_innovations(window, believed, no_change(believed))
@@ -104,7 +104,7 @@ def with_flows_of_window(
     changes = [
         f
         for f, p in zip(ranked, posterior(evidence), strict=True)
-        if f.hypothesis.columns and p > SMALLEST_PROBABILITY**2
+        if f.hypothesis.columns and max(f.probability, p) > SMALLEST_PROBABILITY**2
     ]
     starts, hypotheses = torch.stack([point_of(f) for f in changes]), [f.hypothesis for f in changes]
     fits = fit(observer, window, believed, hypotheses, starts, misfit(base), prior)
