@@ -63,12 +63,12 @@ def tested(
     prepared = prepare_monitor(plant, learnt, time_between_false_alarms=every)
     monitor, samples = prepared.monitor, samples_of_recording(test, plant)
     observer = Observer(
-        monitor.network, prepared.noise.gain, monitor.space, prepared.believed, monitor.observer.stepper.longest
+        monitor.network, monitor.noise.gain, monitor.space, prepared.believed, monitor.observer.stepper.longest
     )
     whole = len(samples)
     starts = range(skip, whole, piece) if piece else [0]
     runs = [observer.run(samples.segment(first, min(first + (piece or whole), whole))) for first in starts]
-    white = torch.cat([prepared.noise.whitening(run.steady_residual) for run in runs])[0 if piece else skip :]
+    white = torch.cat([monitor.noise.whitening(run.steady_residual) for run in runs])[0 if piece else skip :]
     detector, seconds = monitor.detector, len(white) * monitor.detector.design.interval
     alarms, expected = int(detector.alarms(white).sum()), detector.design.rates * seconds
     low, high = (detector.design.count_quantile(seconds, p) for p in (0.025, 0.975))

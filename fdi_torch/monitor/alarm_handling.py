@@ -1,8 +1,8 @@
 """What the monitor does after an alarm: isolate the fault, adopt it, revise it later, and end or retire the alarm.
 
 An alarm is pending for `settings.confirm` seconds. Then all single changes, and the best pairs, are fitted. The
-likeliest explanation goes into the observer, and is fitted again each time the time since the onset has grown by
-`settings.revise`.
+likeliest explanation goes into the observer, and is fitted again each time the time since the onset has grown by the
+factor REVISE.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from fdi_torch.monitor.known_faults import (
     with_hidden,
     with_new_sizes,
 )
+from fdi_torch.monitor.monitor_settings import REVISE
 from fdi_torch.monitor.monitor_state import DetectedChange, HiddenFault, MonitorState, PendingAlarm
 from fdi_torch.monitor.state_update import ResidualTest, adopt_change, adopt_sizes, beside_deviation
 
@@ -48,7 +49,7 @@ class AlarmHandler:
         """When something is examined next, s: the pending alarm, else the latest change or a hidden fault."""
         if state.pending is not None:
             raised = state.alarm(state.pending.number).last
-            return raised + self.settings.confirm * self.settings.revise**state.pending.attempts
+            return raised + self.settings.confirm * REVISE**state.pending.attempts
         changes = [] if state.change is None else [state.change.next_fit]
         return min([*changes, *(self._next_look(h) for h in state.hidden)], default=float("inf"))
 
@@ -87,7 +88,7 @@ class AlarmHandler:
         resized = size_change(self.observer, state, self.explainer.search_start(state, state.now), self.faults)
         if resized is not None:
             moved = adopt_sizes(self.observer, state, resized)
-            moved, announced = with_new_sizes(moved, resized, self.settings.revise)
+            moved, announced = with_new_sizes(moved, resized)
             changed = [t for t in moved.tracks if t.column in resized.hypothesis.columns]
             return moved, self.writer.followed(moved, changed, announced)
         sensors = [sensor.name for sensor in self.observer.network.description.sensors]

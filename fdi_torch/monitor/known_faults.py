@@ -13,6 +13,7 @@ from fdi_torch.monitor.event_text import EventWriter
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit
 from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.monitor_settings import REVISE
 from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, HiddenFault, MonitorState
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
 from fdi_torch.parameters import ParameterSpace
@@ -112,17 +113,17 @@ def updated_tracks(
     return replace(state, tracks=tuple(tracks))
 
 
-def with_new_sizes(state: MonitorState, fit: HypothesisFit, revise: float) -> tuple[MonitorState, list[FaultTrack]]:
+def with_new_sizes(state: MonitorState, fit: HypothesisFit) -> tuple[MonitorState, list[FaultTrack]]:
     """The state with new sizes of known faults, and the tracks to announce.
 
-    A size is announced again once the fault has lasted `revise` times as long as at the last announcement.
+    A size is announced again once the fault has lasted REVISE times as long as at the last announcement.
     """
     tracks, due = [], []
     for t in state.tracks:
         if t.column in fit.hypothesis.columns:
             size, std = float(fit.value[t.column]), float(fit.std[t.column])
             t = replace(t, last=(state.now, size, std), adjusted=fit.onset)
-            if state.now - t.onset >= revise * (t.announced - t.onset):
+            if state.now - t.onset >= REVISE * (t.announced - t.onset):
                 t = replace(t, announced=state.now)
                 due.append(t)
         tracks.append(t)
