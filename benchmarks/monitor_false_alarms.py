@@ -1,7 +1,9 @@
 """False alarms of single calibrations on disturbed tanks without a fault: `python -m benchmarks.monitor_false_alarms`.
 
 Each calibration learns from its own recording and is tested on the rest of it. Its number of alarms is compared with
-the 95 % interval that it predicts for itself. With `--cases FOLDER`, each fault-free case of a folder of practice data
+the 95 % interval that it predicts for itself. With `--tolerance 1` the rig's constants differ from the plant's by their
+tolerances; with `--rests` the inputs rest while it learns; with `--piece 500` the observer starts anew each 500 samples
+of the test. With `--cases FOLDER`, each fault-free case of a folder of practice data
 (CASE/plant.yaml, CASE/recording.csv.gz, CASE/holdout.csv.gz, key.json) is learnt from its recording and tested on its
 hold-out.
 """
@@ -16,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from scipy.stats import poisson
 
 from benchmarks.monitor_rigs import KINDS, Case, recordings
@@ -50,14 +53,22 @@ class Calibration:
         return self.low <= self.alarms <= self.high
 
 
-def tested(plant: PlantDescription, learnt: Recording, test: Recording, skip: int, every: float) -> Calibration:
-    """Learn from one recording and count the alarms of another, whose first `skip` samples do not count."""
+def tested(
+    plant: PlantDescription, learnt: Recording, test: Recording, skip: int, every: float, piece: int = 0
+) -> Calibration:
+    """Learn from one recording and count the alarms of another, whose first `skip` samples do not count.
+
+    piece: after so many samples the observer starts anew; 0 if it never does.
+    """
     prepared = prepare_monitor(plant, learnt, time_between_false_alarms=every)
     monitor, samples = prepared.monitor, samples_of_recording(test, plant)
     observer = Observer(
-        monitor.network, prepared.noise.gain, monitor.space, prepared.believed, monitor.observer.stepper.longest
+        monitor.network, monitor.noise.gain, monitor.space, prepared.believed, monitor.observer.stepper.longest
     )
-    white = prepared.noise.whitening(observer.run(samples).steady_residual)[skip:]
+    whole = len(samples)
+    starts = range(skip, whole, piece) if piece else [0]
+    runs = [observer.run(samples.segment(first, min(first + (piece or whole), whole))) for first in starts]
+    white = torch.cat([monitor.noise.whitening(run.steady_residual) for run in runs])[0 if piece else skip :]
     detector, seconds = monitor.detector, len(white) * monitor.detector.design.interval
     alarms, expected = int(detector.alarms(white).sum()), detector.design.rates * seconds
     low, high = (detector.design.count_quantile(seconds, p) for p in (0.025, 0.975))
@@ -87,6 +98,9 @@ def main() -> None:
     parser.add_argument("--lasts", type=float, default=40000.0, help="test after learning, s")
     parser.add_argument("--every", type=float, default=20000.0)
     parser.add_argument("--correlation", type=float, default=0.0, help="of neighbouring values of the sensors' noise")
+    parser.add_argument("--tolerance", type=float, default=0.0, help="errors of the constants, in their tolerances")
+    parser.add_argument("--rests", action="store_true", help="inputs rest during the learning part")
+    parser.add_argument("--piece", type=int, default=0, help="the observer starts anew each that many samples")
     parser.add_argument("--cases", type=Path, help="folder of practice data")
     a = parser.parse_args()
     if a.cases is not None:
@@ -105,6 +119,8 @@ def main() -> None:
             closed,
             100000 * a.seed + 100 * i + j,
             correlation=a.correlation,
+            tolerance=a.tolerance,
+            rests=a.rests,
         )
         for i, (k, closed, learn) in enumerate(cells)
         for j in range(a.calibrations)
@@ -113,7 +129,7 @@ def main() -> None:
     for first in range(0, len(cases), a.calibrations):
         case = cases[first]
         whole = [recording for recording, _ in runs[first : first + a.calibrations]]
-        rows = [tested(plant, fault_free_part(r, 0.0, case.learn), r, int(case.learn), a.every) for r in whole]
+        rows = [tested(plant, fault_free_part(r, 0.0, case.learn), r, int(case.learn), a.every, a.piece) for r in whole]
         results += rows
         loop, thresholds = "closed" if case.closed else "open", [round(row.threshold, 1) for row in rows]
         texts = ", ".join(f"{row.alarms} ({row.low} to {row.high})" for row in rows)

@@ -7,7 +7,7 @@ T1 is under proportional-integral control by Q1, or open loop; Q2 moves in steps
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -26,6 +26,8 @@ KINDS = {"white": 1.0, "held": 15.0, "slow": 150.0}
 FLOW = 1.5e-6
 """Standard deviation of the random flow into a tank, m^3/s, held for 15 s; that of the others has the same effect on a
 level after a minute."""
+REST = np.array([0.59, 0.393, 0.492])
+"""Steady levels with 50 cm^3/s from each pump, m."""
 SIZES = {
     "T1.leak.size": 0.15, "T2.leak.size": 0.15, "T3.leak.size": 0.15,
     "P13.plugging.size": 0.2, "P32.plugging.size": 0.2, "OUT2.plugging.size": 0.2,
@@ -43,7 +45,9 @@ class Case:
     """One recording. fault: a key of SIZES, empty for none. ramp: duration of its growth, s; 0 if abrupt. learn: s.
 
     share: of the usual size. pumps: flows asked for after the learning part, m^3/s, instead of the usual commands.
-    correlation: of neighbouring values of the sensors' noise.
+    correlation: of neighbouring values of the sensors' noise. tolerance: standard deviation of the rig's discharge
+    coefficients about the plant's, in its tolerances. rests: whether the commands and set points rest at the usual mean
+    during the learning part, from the plant's steady levels on.
     """
 
     fault: str
@@ -57,6 +61,8 @@ class Case:
     share: float = 1.0
     pumps: tuple[float, float] | None = None
     correlation: float = 0.0
+    tolerance: float = 0.0
+    rests: bool = False
 
     @property
     def name(self) -> str:
@@ -74,7 +80,7 @@ class Case:
 def recordings(cases: Sequence[Case], step: float = STEP) -> list[tuple[Recording, Array]]:
     """Recording and true levels (T, N) m of each case, all simulated together."""
     plant, draws = load_plant("three_tank"), [np.random.default_rng(case.seed) for case in cases]
-    rigs = HiddenRigs([plant] * len(cases), [()] * len(cases))
+    rigs = HiddenRigs([_rig(plant, case) for case in cases], [()] * len(cases))
     _with_faults(rigs, plant, cases)
     sensors, drives = [], []
     for case, rng in zip(cases, draws, strict=True):
@@ -89,6 +95,18 @@ def recordings(cases: Sequence[Case], step: float = STEP) -> list[tuple[Recordin
         (_recording(run.asked, factor * (run.levels + error)), run.levels)
         for run, (factor, error) in zip(runs, sensors, strict=True)
     ]
+
+
+def _rig(plant: PlantDescription, case: Case) -> PlantDescription:
+    """The plant with discharge coefficients that differ from those of its file."""
+    rng = np.random.default_rng([case.seed, 1])  # apart from that of flows and noise
+    std = {p.name: case.tolerance * plant.tolerances[f"{p.name}.discharge_coefficient"] for p in plant.pipes}
+    factors = [float(np.exp(std[p.name] * rng.normal())) for p in plant.pipes]
+    pipes = (
+        replace(p, discharge_coefficient=p.discharge_coefficient * factor)
+        for p, factor in zip(plant.pipes, factors, strict=True)
+    )
+    return replace(plant, pipes=tuple(pipes))
 
 
 def _recording(asked: Array, readings: Array) -> Recording:
@@ -133,6 +151,9 @@ def _drive(case: Case, rng: np.random.Generator, samples: int, factor: Array, er
     if case.pumps is not None:
         asked[int(case.learn) :] = case.pumps
     start = np.array([0.52, 0.32, 0.42])
+    if case.rests:
+        start = REST
+        asked[: int(case.learn)], points[: int(case.learn)] = 5e-5, REST[0]
     # The variance of the flow integrated over a minute is that of flows held for 15 s.
     scale = {"white": 15.0**0.5, "held": 1.0, "slow": 0.55}[case.kind]
     random = Disturbance(case.kind, KINDS[case.kind], FLOW * scale * rng.uniform(0.5, 1.5, size=3), 1.0)

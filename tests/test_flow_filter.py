@@ -15,16 +15,21 @@ from scipy.stats import poisson
 from torch import Tensor
 
 from fdi_torch.config.plant_file import load_plant
-from fdi_torch.effects import build_network
+from fdi_torch.effects import build_network, placements_for
 from fdi_torch.monitor import noise_model
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.fault_free_checks import false_alarm_rate_text
 from fdi_torch.monitor.flow_filter import forcing
 from fdi_torch.monitor.flow_noise_estimate import estimate_flow_filter
+from fdi_torch.monitor.hypothesis import Hypothesis
+from fdi_torch.monitor.hypothesis_fit import Prior, fit, misfit, no_change_fit
+from fdi_torch.monitor.isolation import with_flows_of_window
 from fdi_torch.monitor.noise_model import learn_noise, operating_point
 from fdi_torch.monitor.observer import Observer
+from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow, no_change
 from fdi_torch.monitor.observer_gain import hand_gain, start_uncertainty
 from fdi_torch.monitor.samples import Samples
+from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.build import BuildError
 from fdi_torch.simulate.equilibrium import equilibrium
 
@@ -129,6 +134,34 @@ def test_flows_learnt_from_a_window_too_are_those_of_the_whole_recording(correla
     white = further.of_innovations(further.innovations(residual[300:], 300)[0])
     assert white.std(dim=0).tolist() == pytest.approx([1.0] * 3, abs=0.1)
     assert spread_of_sums(white).tolist() == pytest.approx([1.0] * 3, abs=4.0 * 0.11)
+
+
+def test_a_fault_is_fitted_again_however_much_flows_learnt_as_too_small_favour_a_second_one() -> None:
+    """A bias of h1 from 700 s on, and flows learnt with a twentieth of their intensity: plugging beside it explains
+    what the flows do. With the flows of the window it does not.
+    """
+    names = ("P32.plugging.size", "h1.sensor_bias.bias")
+    network = build_network(PLANT, placements_for(names))
+    space = ParameterSpace([network.constants[name] for name in names])
+    nominal, run = space.nominal(), disturbed(150.0, 1500)
+    run.readings[700:, 0] += 0.03
+    learnt, _ = learn_noise(network, run.segment(0, 300), space, nominal)
+    flows = learnt.whitening.flows
+    assert flows is not None
+    small = replace(flows, noise=replace(flows.noise, intensity=0.05 * flows.noise.intensity))
+    whitener = learnt.whitening.whitener * (flows.innovation_std / small.innovation_std)
+    bank = ObserverBank(network, space, learnt.gain, replace(learnt.whitening, flows=small, whitener=whitener))
+    seen = Observer(network, learnt.gain, space, nominal).run(run)
+    memory = small(seen.steady_residual)[1]
+    window = ObserverWindow(run.segment(299, 1500), seen.state[299], 300, memory[299])
+    start = torch.cat([space.vector({names[1]: 0.03}), nominal.new_tensor([700.0])])
+    hypotheses, prior = [Hypothesis((1,)), Hypothesis((0, 1))], Prior(space.names, 4)
+    base = bank.white_innovations(window, nominal, no_change(nominal))
+    fits = fit(bank, window, nominal, hypotheses, start.repeat(2, 1), misfit(base), prior)
+    ranked = sorted([*fits, no_change_fit(bank, window, nominal, base)], key=lambda f: -f.evidence)
+    assert ranked[0].hypothesis.columns == (0, 1) and ranked[0].evidence - ranked[1].evidence > 20.0
+    again = with_flows_of_window(bank, window, nominal, ranked, prior)[1]
+    assert again[0].hypothesis.columns == (1,) and again[0].probability > 0.99
 
 
 def test_innovations_are_white_at_every_frequency() -> None:

@@ -366,7 +366,7 @@ def test_an_observer_offset_is_reported_if_significant_and_relevant() -> None:
     white = whitening(residual + whitening.mean)
     assert white.mean(0).tolist() == pytest.approx(whitening.offset.tolist())
     one = torch.ones(1, 3, dtype=torch.float64)
-    seen = Observation(torch.arange(3600.0), residual, residual, one, 3)
+    seen = Observation(torch.arange(3600.0), residual, residual, one)
     noise_of_it = NoiseModel(one[0], 1.0, whitening, hand_gain(torch.eye(3, dtype=torch.float64)))
     detector = make_detector("fixed", 1e7, 1.0, 3, torch.Generator())
     [doubt] = residual_warnings(load_plant("three_tank"), noise_of_it, detector, seen)

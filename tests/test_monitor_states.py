@@ -14,9 +14,12 @@ from fdi_torch.config.plant_file import load_plant
 from fdi_torch.monitor.alarm_state import FOLLOWS, Alarm, State
 from fdi_torch.monitor.detection import CHARTS, make_detector
 from fdi_torch.monitor.events import Event
+from fdi_torch.monitor.hypothesis import Hypothesis, HypothesisFit
+from fdi_torch.monitor.known_faults import end_recovered
 from fdi_torch.monitor.monitor import Monitor, ResidualTrace
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
+from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, HiddenFault
 from fdi_torch.monitor.samples import ABSENT, ClockState, Samples, samples_of_recording, split_at_gaps
 from fdi_torch.monitor.state_update import residuals_to_test
 from fdi_torch.monitor.window_monitor import WindowMonitor
@@ -227,6 +230,27 @@ def test_a_closed_drain_is_told_once_its_tank_fills_even_if_a_fault_came_between
     assert abs(last.onset - 600.0) < 2.0 * last.onset_std, "it closed while the tank was dry"
     assert any(e.faults == ("U.leak.size",) and 500.0 < e.time < 600.0 for e in events)
     assert [e.state for e in events if e.kind == "summary" and e.alarm == 1] == [State.RECOVERED]
+
+
+def test_a_recovery_is_told_once_beside_a_fault_whose_end_the_readings_would_not_show() -> None:
+    watch, samples = monitor(), recorded(lambda t: SPACE.nominal(), 40)
+    leak, bias = SPACE.index("T1.leak.size"), SPACE.index("h3.sensor_bias.bias")
+    size = 10.0, 0.1, 0.01
+    tracks = [FaultTrack(c, 1, 5.0, 0.1, size, size, 1.0, 10.0) for c in (leak, bias)]
+    hidden, none = HiddenFault(tracks[0], 0.1, 30.0, 39.0), torch.zeros(len(SPACE), dtype=torch.float64)
+    fit = HypothesisFit(
+        Hypothesis((leak, bias), recovered=(leak, bias)), SPACE.nominal(), none, 30.0, 0.5, 9.0, 1.0, 2.0, 3.0
+    )
+    change = DetectedChange(2, SPACE.nominal() + 0.1, 5.0, (fit,), 35.0, 99.0, tuple(tracks))
+    state = replace(
+        watch.start(samples), hidden=(hidden,), alarms=(Alarm(1, 10.0, 10.0).with_state(State.CANNOT_TELL),)
+    )
+    state, events = end_recovered(watch.writer, state, change, [fit], None, tracks[:1])
+    assert [(e.kind, e.alarm, e.state) for e in events] == [("recovered", 1, State.CANNOT_TELL)]
+    assert events[0].text.startswith("sensor bias at h3: back to nominal, since 30.0")
+    assert not end_recovered(watch.writer, state, change, [fit], None, tracks)[1], "both are told"
+    shown, events = end_recovered(watch.writer, replace(state, hidden=()), change, [fit], None, tracks)
+    assert shown.alarm(1).state is State.RECOVERED and [e.kind for e in events] == ["recovered"]
 
 
 @pytest.mark.parametrize(("mouth", "closes"), [(0.0, 450), (0.0, 490), (0.014, 460)])

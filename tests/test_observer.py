@@ -96,7 +96,7 @@ def test_an_unmeasured_level_is_found() -> None:
     linear = linearised(Stepper(network), REST, INPUTS, 1.0, bind_parameters(network, None, None))
     observer = Observer(network, kalman_gain(linear, 1e-6 * torch.ones(3, dtype=torch.float64), NOISE[:2], START))
     seen = observer.run(samples, REST + torch.tensor([0.0, 0.0, 0.03], dtype=torch.float64))
-    assert (seen.levels[-1] - REST).abs().max() < 2e-4
+    assert (seen.state[-1] - REST).abs().max() < 2e-4
 
 
 def test_a_gain_of_the_wrong_shape_is_refused() -> None:
@@ -122,7 +122,7 @@ def test_a_missing_reading_leaves_the_other_channels_at_work() -> None:
     gain = kalman_gain(LINEAR, 0.01 * NOISE, NOISE, START)
     seen = Observer(NETWORK, gain).run(replace(samples, readings=holes))
     assert torch.isnan(seen.residual[10:20, 1]).all()
-    assert torch.isfinite(seen.residual[:, [0, 2]]).all() and torch.isfinite(seen.levels).all()
+    assert torch.isfinite(seen.residual[:, [0, 2]]).all() and torch.isfinite(seen.state).all()
 
 
 def test_a_run_is_the_same_alone_and_beside_a_nan_neighbour() -> None:

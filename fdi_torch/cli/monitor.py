@@ -63,7 +63,7 @@ def _show_event(event: Event, screen: Screen, publish: Publish) -> None:
 
 def _show_setup(prepared: PreparedMonitor, screen: Screen) -> None:
     """Print the noise model, the detector and the calibrated constants."""
-    noise, detector = prepared.noise, prepared.monitor.detector
+    noise, detector = prepared.monitor.noise, prepared.monitor.detector
     stds = ", ".join(
         f"{sensor.name} {quantity_text(std, sensor.unit, 3, sensor.column)}"
         for sensor, std in zip(prepared.monitor.network.description.sensors, noise.reading_std.tolist(), strict=True)

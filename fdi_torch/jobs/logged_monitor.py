@@ -177,7 +177,7 @@ class LoggedMonitor:
         text = f"watches for {', '.join(faults_in_words(names))}"
         part = fault_free_part(whole, *self.run.config.fault_free)
         try:
-            report = diagnosability(self.plant, names, part, prepared.noise.reading_std, start="free")
+            report = diagnosability(self.plant, names, part, prepared.monitor.noise.reading_std, start="free")
         except ValueError as error:
             return text, f"which of them can be isolated is unknown: {error}"
         return text, *report.groups

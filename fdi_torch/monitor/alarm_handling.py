@@ -1,8 +1,8 @@
 """What the monitor does after an alarm: isolate the fault, adopt it, revise it later, and end or retire the alarm.
 
 An alarm is pending for `settings.confirm` seconds. Then all single changes, and the best pairs, are fitted. The
-likeliest explanation goes into the observer, and is fitted again each time the time since the onset has grown by
-`settings.revise`.
+likeliest explanation goes into the observer, and is fitted again each time the time since the onset has grown by the
+factor REVISE.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from fdi_torch.monitor.known_faults import (
     with_hidden,
     with_new_sizes,
 )
+from fdi_torch.monitor.monitor_settings import REVISE
 from fdi_torch.monitor.monitor_state import DetectedChange, HiddenFault, MonitorState, PendingAlarm
 from fdi_torch.monitor.state_update import ResidualTest, adopt_change, adopt_sizes, beside_deviation
 
@@ -48,7 +49,7 @@ class AlarmHandler:
         """When something is examined next, s: the pending alarm, else the latest change or a hidden fault."""
         if state.pending is not None:
             raised = state.alarm(state.pending.number).last
-            return raised + self.settings.confirm * self.settings.revise**state.pending.attempts
+            return raised + self.settings.confirm * REVISE**state.pending.attempts
         changes = [] if state.change is None else [state.change.next_fit]
         return min([*changes, *(self._next_look(h) for h in state.hidden)], default=float("inf"))
 
@@ -87,7 +88,7 @@ class AlarmHandler:
         resized = size_change(self.observer, state, self.explainer.search_start(state, state.now), self.faults)
         if resized is not None:
             moved = adopt_sizes(self.observer, state, resized)
-            moved, announced = with_new_sizes(moved, resized, self.settings.revise)
+            moved, announced = with_new_sizes(moved, resized)
             changed = [t for t in moved.tracks if t.column in resized.hypothesis.columns]
             return moved, self.writer.followed(moved, changed, announced)
         sensors = [sensor.name for sensor in self.observer.network.description.sensors]
@@ -259,7 +260,7 @@ class AlarmHandler:
         )
         change = replace(change, explanations=kept)
         back = recovered_columns(self.space, change)
-        ended = tuple(t for t in (change.ended or state.tracks) if t.column in back)
+        told, ended = change.ended, tuple(t for t in (change.ended or state.tracks) if t.column in back)
         names = self._names(reported)
         announce = announce or names != change.reported
         change = replace(change, ended=ended, reported=names)
@@ -278,7 +279,7 @@ class AlarmHandler:
         ends = possible_ends(self.observer, state, change, self.settings.lookback)
         earliest_end = change.best.onset if ends is None else ends[0]
         state = with_hidden(self.observer, state, change, earliest_end, self.settings.confirm)
-        state, events = end_recovered(self.writer, state, change, reported, ends)
+        state, events = end_recovered(self.writer, state, change, reported, ends, told)
         present = [c for c in best.hypothesis.sizes if c not in back]
         if not present:
             numbers = [t.number for t in ended]

@@ -14,7 +14,6 @@ from fdi_torch.monitor.events import (
     Event,
     Explanation,
     Kind,
-    Limit,
     Size,
     headline,
     rate_text,
@@ -66,7 +65,10 @@ class EventWriter:
         text += f"; grows by {', '.join(rates)}" if rates else ""
         if best.misfit_ratio > 1.0:
             text += "; does not explain all of the residual"
-        limits = self._limits(state, change, fits)
+        faulty = [f for f in fits if f.hypothesis.columns]
+        horizon, lookback = FORECAST_WINDOWS * self.settings.longest, self.settings.lookback
+        generator = torch.Generator().manual_seed(change.number)  # the draws depend on the alarm's number only
+        limits = forecast_limits(self.observer, state, change, faulty, horizon, lookback, generator)
         text += "".join(f"; {limit.text}" for limit in limits[:1] if limit.chance > 0.5)
         delay, (urgency, large) = change.alarm_time - best.onset, self._severity(explanations)
         text += f"; urgency: {urgency}" if urgency else ""
@@ -174,13 +176,6 @@ class EventWriter:
             return Explanation(fit.probability, (), unlisted=h.unlisted or not fit.fits)
         ended = tuple(self.space.names[c] for c in h.recovered if c not in hidden)
         return Explanation(fit.probability, tuple(sizes), fit.onset, fit.onset_std, h.incipient, ended)
-
-    def _limits(self, state: MonitorState, change: DetectedChange, fits: Sequence[HypothesisFit]) -> tuple[Limit, ...]:
-        """Forecast of overflow and dry tanks. The random draws depend on the alarm's number only."""
-        faulty = [f for f in fits if f.hypothesis.columns]
-        generator = torch.Generator().manual_seed(change.number)
-        horizon, lookback = FORECAST_WINDOWS * self.settings.longest, self.settings.lookback
-        return forecast_limits(self.observer, state, change, faulty, horizon, lookback, generator)
 
     def _severity(self, explanations: Sequence[Explanation]) -> tuple[str, bool]:
         """The urgency of the likeliest explanation, and whether one of its faults is large enough to announce."""

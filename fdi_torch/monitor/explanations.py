@@ -10,7 +10,7 @@ from torch import Tensor
 from fdi_torch.monitor.alarm_state import State
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit, credible_set, merged
 from fdi_torch.monitor.isolation import SMALLEST_PROBABILITY, isolate
-from fdi_torch.monitor.monitor_settings import GROWING_WINDOWS, MonitorSettings
+from fdi_torch.monitor.monitor_settings import GROWING_WINDOWS, REVISE, MonitorSettings
 from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
 from fdi_torch.monitor.observer_bank import ObserverBank
 
@@ -79,11 +79,11 @@ class Explainer:
 
     def next_fit(self, fit: HypothesisFit, now: float) -> float:
         """When an explanation is fitted again, s."""
-        return fit.onset + self.settings.revise * max(now - fit.onset, self.settings.confirm)
+        return fit.onset + REVISE * max(now - fit.onset, self.settings.confirm)
 
     def reported(self, fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
-        """The fewest explanations that together have the reported probability."""
-        return credible_set(merged(fits), self.settings.level)
+        """The fewest explanations that together have the reported probability of 95 %."""
+        return credible_set(merged(fits))
 
 
 def answer_of(reported: Sequence[HypothesisFit]) -> State:

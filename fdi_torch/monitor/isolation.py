@@ -13,6 +13,7 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.evidence import posterior
 from fdi_torch.monitor.hypothesis import Fault, Hypothesis, HypothesisFit, with_posterior, with_unlisted_as_one
 from fdi_torch.monitor.hypothesis_fit import Prior, changes_of, fit, misfit, no_change_fit, point_of
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
@@ -80,24 +81,31 @@ def isolate(
         fits = _best_of_each([*fits, *fit(observer, window, believed, wider, starts, misfit(base), prior)])
     ranked = with_posterior([*fits, no_change_fit(observer, window, believed, base)])
     if flows and ranked[0].hypothesis.columns and ranked[0].fits:
-        observer, ranked = _with_flows_of_window(observer, window, believed, ranked, prior)
+        observer, ranked = with_flows_of_window(observer, window, believed, ranked, prior)
     ranked = with_unlisted_as_one(ranked, outside) if outside else ranked
     return [_beyond_range(observer, window, believed, f, prior) if f.at_bound else f for f in ranked]
 
 
-def _with_flows_of_window(
+def with_flows_of_window(
     observer: ObserverBank, window: ObserverWindow, believed: Tensor, ranked: Sequence[HypothesisFit], prior: Prior
 ) -> tuple[ObserverBank, list[HypothesisFit]]:
     """The fits repeated with random flows that are learnt from the window too, because a short fault-free part leaves
     them uncertain.
 
-    First, the hypotheses are fitted with the flows that are most likely under the likeliest one, apart from those that
-    stay below SMALLEST_PROBABILITY even if the flows halve the differences of log evidence. Then the evidence of each
-    plausible hypothesis is raised by the log-likelihood that flows learnt under it add.
+    First, the hypotheses are fitted again with the flows that are most likely under the likeliest one, apart from those
+    that are far from plausible with their previous values, both with the earlier flows and with these. Then the
+    evidence of each plausible hypothesis is raised by the log-likelihood that flows learnt under it add.
     """
     observer, _ = observer.learning_from(window, believed, changes_of(ranked[:1]))
     base = observer.white_innovations(window, believed, no_change(believed))
-    changes = [f for f in ranked if f.hypothesis.columns and f.probability > SMALLEST_PROBABILITY**2]
+    blocks = observer.in_blocks(window, changes_of(ranked))
+    misfits = torch.cat([0.5 * observer.white_innovations(window, believed, b).square().sum((1, 2)) for b in blocks])
+    evidence = [f.evidence + f.misfit - now for f, now in zip(ranked, misfits.tolist(), strict=True)]
+    changes = [
+        f
+        for f, p in zip(ranked, posterior(evidence), strict=True)
+        if f.hypothesis.columns and max(f.probability, p) > SMALLEST_PROBABILITY**2
+    ]
     starts, hypotheses = torch.stack([point_of(f) for f in changes]), [f.hypothesis for f in changes]
     fits = fit(observer, window, believed, hypotheses, starts, misfit(base), prior)
     fits.append(no_change_fit(observer, window, believed, base))

@@ -13,6 +13,7 @@ from fdi_torch.monitor.event_text import EventWriter
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit
 from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.monitor_settings import REVISE
 from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, HiddenFault, MonitorState
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
 from fdi_torch.parameters import ParameterSpace
@@ -112,17 +113,17 @@ def updated_tracks(
     return replace(state, tracks=tuple(tracks))
 
 
-def with_new_sizes(state: MonitorState, fit: HypothesisFit, revise: float) -> tuple[MonitorState, list[FaultTrack]]:
+def with_new_sizes(state: MonitorState, fit: HypothesisFit) -> tuple[MonitorState, list[FaultTrack]]:
     """The state with new sizes of known faults, and the tracks to announce.
 
-    A size is announced again once the fault has lasted `revise` times as long as at the last announcement.
+    A size is announced again once the fault has lasted REVISE times as long as at the last announcement.
     """
     tracks, due = [], []
     for t in state.tracks:
         if t.column in fit.hypothesis.columns:
             size, std = float(fit.value[t.column]), float(fit.std[t.column])
             t = replace(t, last=(state.now, size, std), adjusted=fit.onset)
-            if state.now - t.onset >= revise * (t.announced - t.onset):
+            if state.now - t.onset >= REVISE * (t.announced - t.onset):
                 t = replace(t, announced=state.now)
                 due.append(t)
         tracks.append(t)
@@ -256,18 +257,21 @@ def end_recovered(
     change: DetectedChange,
     reported: Sequence[HypothesisFit],
     ends: tuple[float, float] | None,
+    told: Sequence[FaultTrack],
 ) -> tuple[MonitorState, list[Event]]:
     """End the alarms of recovered faults; "cannot tell" if the readings would not show one of them any more.
 
-    ends: see `possible_ends`.
+    ends: see `possible_ends`. told: those that had recovered by earlier fits of the change.
     """
     events, unseen = [], [h.track.column for h in state.hidden]
     for number in sorted({t.number for t in change.ended}):
-        columns, alarm = [t.column for t in change.ended if t.number == number], state.alarm(number)
-        hidden = [c for c in columns if c in unseen]
-        answer = State.CANNOT_TELL if hidden else State.RECOVERED
-        if alarm.state is not answer:
-            state = state.with_alarm(alarm.with_state(answer))
-            names = [writer.space.names[c] for c in hidden or columns]
-            events.append(writer.ended(state, change, reported, number, names, not hidden, ends))
+        ended, alarm = [t for t in change.ended if t.number == number], state.alarm(number)
+        answer = State.CANNOT_TELL if any(t.column in unseen for t in ended) else State.RECOVERED
+        differs = alarm.state is not answer
+        state = state.with_alarm(alarm.with_state(answer)) if differs else state
+        for kind in (State.CANNOT_TELL, State.RECOVERED):
+            alike = [t for t in ended if (t.column in unseen) == (kind is State.CANNOT_TELL)]
+            if any(t not in told for t in alike) or (alike and differs and kind is answer):
+                names = [writer.space.names[t.column] for t in alike]
+                events.append(writer.ended(state, change, reported, number, names, kind is State.RECOVERED, ends))
     return state, events

@@ -9,29 +9,27 @@ from fdi_torch.plant.scales import time_scale
 
 LOOKBACK, CONFIRM, LONGEST = 300.0, 60.0, 1000.0  # in units of the plant's time scale
 GROWING_WINDOWS = 8.0  # longest windows over which one straight line describes a fault that grows
+REVISE = 2.0  # factor by which the time since an onset grows between two fits
 
 
 @dataclass(frozen=True)
 class MonitorSettings:
-    """lookback: how long before an alarm an onset is searched for, s. confirm: time from alarm to isolation, s. revise:
-    factor by which the time since the onset grows between fits. longest: length of the longest window, s. incipient:
-    whether faults may grow slowly. together: largest number of simultaneous faults. level: posterior probability of the
-    reported explanations together.
+    """lookback: how long before an alarm an onset is searched for, s. confirm: time from alarm to isolation, s.
+    longest: length of the longest window, s. incipient: whether faults may grow slowly. together: largest number of
+    simultaneous faults.
     """
 
     lookback: float
     confirm: float
     longest: float
-    revise: float = 2.0
     incipient: bool = True
     together: int = 2
-    level: float = 0.95
 
     def __post_init__(self) -> None:
-        if not (self.lookback > 0 and self.confirm >= 0 and self.revise > 1 and self.longest >= self.lookback):
+        if not (self.lookback > 0 and self.confirm >= 0 and self.longest >= self.lookback):
             raise ValueError(
-                "expected lookback > 0, confirm >= 0, revise > 1 and longest >= lookback, "
-                f"got {self.lookback:g} s, {self.confirm:g} s, {self.revise:g}, {self.longest:g} s; change them"
+                "expected lookback > 0, confirm >= 0 and longest >= lookback, "
+                f"got {self.lookback:g} s, {self.confirm:g} s, {self.longest:g} s; change them"
             )
 
     @property

@@ -17,7 +17,7 @@ from fdi_torch.monitor.fault_free_checks import false_alarm_rate_text, fault_war
 from fdi_torch.monitor.hypothesis import SHAPE, faults_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
-from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
+from fdi_torch.monitor.noise_model import learn_noise
 from fdi_torch.monitor.samples import samples_of_recording, usual_interval
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.monitor.whitening import FEWEST_SAMPLES
@@ -31,14 +31,12 @@ from fdi_torch.simulate.step_length import commensurate_step
 class PreparedMonitor:
     """A monitor ready to start.
 
-    believed: parameter values for the observer, including calibrated constants. calibrated: the constants' values by
-    name. warnings: signs that the fault-free part is not fault
-    free. false_alarm_text: accuracy of the time between false alarms.
+    believed: parameter values for the observer, including calibrated constants, and calibrated: these by name.
+    warnings: signs of a fault in the fault-free part. false_alarm_text: accuracy of the time between false alarms.
     """
 
     monitor: Monitor
     believed: Tensor
-    noise: NoiseModel
     calibrated: dict[str, float]
     warnings: tuple[str, ...] = ()
     false_alarm_text: str = ""
@@ -100,7 +98,7 @@ def prepare_monitor(
         *fault_warnings(learning, space, samples, believed, step, faults_of(watched)),
     )
     text = false_alarm_rate_text(noise, detector, every)
-    return PreparedMonitor(monitor, believed, noise, values, warnings, text)
+    return PreparedMonitor(monitor, believed, values, warnings, text)
 
 
 def with_shapes(faults: Sequence[str], plant: PlantDescription) -> list[str]:

@@ -90,7 +90,7 @@ class _Candidate:
 
 
 def _candidate(seen: Observation, lane: int, exponent: float) -> _Candidate:
-    single = Observation(seen.time, seen.state[lane], seen.residual[lane], seen.inflation[..., lane, :, :], seen.tanks)
+    single = Observation(seen.time, seen.state[lane], seen.residual[lane], seen.inflation[..., lane, :, :])
     score, whitening = score_whitenings(single.steady_residual)[0]
     return _Candidate(exponent, score + 2.0 * float(torch.log(single.inflation).sum()), whitening, single)
 
@@ -169,11 +169,7 @@ def operating_point(
         samples.time, samples.inputs, samples.readings.nanmedian(dim=-2, keepdim=True).values, samples.hold
     )
     levels = initial_levels(network, median, values)
-    lowest = 0.02 * tank_heights(network)  # the outflow law has no finite slope in an empty tank
+    heights = network.nominal.new_tensor([tank.height for tank in network.description.tanks])
+    lowest = 0.02 * heights  # the outflow law has no finite slope in an empty tank
     span = float(torch.diff(samples.time).median())
     return linearised(Stepper(network, longest_step), torch.maximum(levels, lowest), inputs, span, values)
-
-
-def tank_heights(network: TankNetwork) -> Tensor:
-    """Height of each tank, (tanks,) m."""
-    return network.nominal.new_tensor([tank.height for tank in network.description.tanks])

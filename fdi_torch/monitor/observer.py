@@ -78,21 +78,14 @@ class Observation:
     """States and residuals of an observer.
 
     state (*batch, S, order + M) after each correction: the network's states in m, of which the levels of the tanks are
-    the first, then the memory of actuators and sensors. residual
-    (*batch, S, sensors): reading minus prediction, NaN where a reading is missing. inflation (S, *batch or 1, sensors):
-    see `Gain`.
+    the first, then the memory of actuators and sensors. residual (*batch, S, sensors): reading minus prediction, NaN
+    where a reading is missing. inflation (S, *batch or 1, sensors): see `Gain`.
     """
 
     time: Tensor
     state: Tensor
     residual: Tensor
     inflation: Tensor
-    tanks: int
-
-    @property
-    def levels(self) -> Tensor:
-        """(*batch, S, tanks) m."""
-        return self.state[..., : self.tanks]
 
     @property
     def steady_residual(self) -> Tensor:
@@ -144,13 +137,13 @@ class Observer:
         )
         residual = (readings - ran.expected).reshape(*lanes, len(samples), -1)
         state = ran.state.reshape(*lanes, len(samples), -1)
-        return Observation(samples.time, state, residual, self.gain.spread(0, len(samples)), levels.shape[-1])
+        return Observation(samples.time, state, residual, self.gain.spread(0, len(samples)))
 
     def _one_by_one(self, samples: Samples, levels: Tensor) -> Observation:
         """Run recordings with different inputs one after the other."""
         seen = [self.run(samples.member(i), level) for i, level in enumerate(levels)]
         state, residual = torch.stack([s.state for s in seen]), torch.stack([s.residual for s in seen])
-        return Observation(samples.time, state, residual, seen[0].inflation, seen[0].tanks)
+        return Observation(samples.time, state, residual, seen[0].inflation)
 
     def _gains(self, count: int, lanes: torch.Size) -> Tensor:
         """Gains (S, order, sensors), or (L, S, order, sensors) if they differ by batch member."""
@@ -182,15 +175,11 @@ def bind_parameters(network: TankNetwork, space: ParameterSpace | None, theta: T
     return network.bind(space, theta)
 
 
-def _first_readings(readings: Tensor) -> Tensor:
-    """First available reading of each sensor, (*batch, S, sensors) -> (*batch, sensors); NaN if there is none."""
-    first = torch.isfinite(readings).to(torch.int8).argmax(dim=-2, keepdim=True)
-    return readings.gather(-2, first).squeeze(-2)
-
-
 def initial_levels(network: TankNetwork, samples: Samples, values: PlaceValues) -> Tensor:
     """Levels (*batch, tanks) from the first reading of each sensor within ABSENT samples; nominal without one."""
     start = [level.expand(samples.batch) for level in network.start_levels(values)]
-    readings = _first_readings(samples.readings[..., :ABSENT, :]).unbind(-1)
-    levels = levels_from_readings(network, readings, start, samples.time[0], values)
+    readings = samples.readings[..., :ABSENT, :]
+    first = torch.isfinite(readings).to(torch.int8).argmax(dim=-2, keepdim=True)
+    of_each = readings.gather(-2, first).squeeze(-2).unbind(-1)
+    levels = levels_from_readings(network, of_each, start, samples.time[0], values)
     return torch.stack(torch.broadcast_tensors(*levels), dim=-1)

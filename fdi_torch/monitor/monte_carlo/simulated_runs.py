@@ -168,13 +168,11 @@ def moving_set_points(
     gain, highest = RATE / pace * area / (slope * pumped), levels.new_tensor([p.max_flow for p in pumps])
 
     def make() -> Controller:
-        controller, clock = LevelControl(steady, resting, reading, gain, RESET / pace, highest / pumped), [0.0]
+        controller = LevelControl(steady, resting, reading, gain, RESET / pace, highest / pumped)
+        swings = _swings(steady, pace)
 
         def command(readings: Tensor, span: Tensor) -> Tensor:
-            clock[0] += float(span)
-            minute = int(clock[0] / (MINUTE * pace) + ROUNDING)
-            signs = torch.tensor([1.0 if (minute + i) % 2 else -1.0 for i in range(len(pumps))], dtype=levels.dtype)
-            controller.set_points = slope * (resting + swing * signs * (0.4 + 0.3 * (minute % 3))) + offset
+            controller.set_points = slope * (resting + swing * swings(span)) + offset
             return controller(readings, span)
 
         return command
@@ -184,21 +182,28 @@ def moving_set_points(
 
 def moving_commands(plant: PlantDescription, steady: Tensor, share: float) -> Callable[[], Controller]:
     """Open loop: commands (channels,) that change by up to `share` of themselves every 60 time scales of the plant."""
-    pace = time_scale(plant)
 
     def make() -> Controller:
-        clock = [0.0]
-
-        def command(readings: Tensor, span: Tensor) -> Tensor:
-            clock[0] += float(span)
-            minute = int(clock[0] / (MINUTE * pace) + ROUNDING)
-            signs = torch.tensor([1.0 if (minute + i) % 2 else -1.0 for i in range(len(steady))], dtype=steady.dtype)
-            now = steady * (1.0 + share * signs * (0.4 + 0.3 * (minute % 3)))
-            return now.expand(len(readings), -1)
-
-        return command
+        swings = _swings(steady, time_scale(plant))
+        return lambda readings, span: (steady * (1.0 + share * swings(span))).expand(len(readings), -1)
 
     return make
+
+
+def _swings(like: Tensor, pace: float) -> Callable[[Tensor], Tensor]:
+    """Time passed since the last call, s -> a share of a swing for each channel, with a sign that alternates each
+    minute; pace: of the plant.
+    """
+    clock = 0.0
+
+    def after(span: Tensor) -> Tensor:
+        nonlocal clock
+        clock += float(span)
+        minute = int(clock / (MINUTE * pace) + ROUNDING)
+        signs = torch.tensor([1.0 if (minute + i) % 2 else -1.0 for i in range(len(like))], dtype=like.dtype)
+        return signs * (0.4 + 0.3 * (minute % 3))
+
+    return after
 
 
 Numbers = Mapping[str, float | list[float] | list[str]]
