@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
-from fdi_torch.plant.operating_range import timed_starts
+from fdi_torch.plant.operating_range import onset_grid
 
 
 class Plugging(Effect):
@@ -30,7 +30,9 @@ class Plugging(Effect):
         )
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
-        return timed_starts([{"size": 0.1}, {"size": -0.1}], operating_range)
+        # One that grows is a drifting coefficient.
+        times = [{}, *({"onset": instant} for instant in onset_grid(operating_range))]
+        return [{"size": size} | onset for onset in times for size in (0.1, -0.1)]
 
     def equivalents(
         self, place: str, plant: PlantDescription, values: Mapping[str, float]
