@@ -189,7 +189,7 @@ class _ProjectedRegression:
 
     def pairs(self, screening: ScreeningResult) -> Pairs:
         """The regression on pairs of the most promising options."""
-        chosen = {*most_visible(screening.options, screening.strength).values()}
+        chosen = set(most_visible(screening.options, screening.strength).values())
         best: dict[tuple[str, str], int] = {}
         for i in torch.argsort(screening.gain, descending=True).tolist():
             best.setdefault(screening.options[i].cause, i)
