@@ -173,6 +173,8 @@ def test_a_server_that_is_stopped_and_started_again_loses_no_event(
                 proxy.cut()
                 plc.close()
                 plc.start()
+                if restored:  # longer than SILENT, which counts from the end of the loss
+                    time.sleep(6.0)
                 proxy.mend()
                 assert connected_again.wait(60.0)
             plc.write(sample)
@@ -180,7 +182,7 @@ def test_a_server_that_is_stopped_and_started_again_loses_no_event(
 
     thread = once_subscribed(replay)
     path = config(tmp_path, recording=None, source=source(proxy.port))
-    events = monitored(["--config", path, "--idle", "14"], capsys)
+    events = monitored(["--config", path, "--idle", "30"], capsys)
     thread.join()
     proxy.cut()
     assert told(events) == told(expected)

@@ -21,7 +21,7 @@ WAIT = 15.0
 ALIVE = 1.0
 """Interval at which the server's state is read, and time within which it must answer, s."""
 SILENT = 5.0
-"""Time without a value after a loss and between new subscriptions, s."""
+"""Time without a value on a renewed connection after which the nodes are subscribed to anew, s."""
 LONGEST_RETRY = 30.0
 """Longest waiting time between attempts to connect, s; the first is 1 s, doubled after each."""
 QUEUE = 1000
@@ -44,7 +44,7 @@ class OpcUaSource:
         self._url = f"opc.tcp://{address.place}/{address.path}".rstrip("/")
         self._place, self._tags, self._period, self._publish = address.place, tags, period, publish
         self._lost_at: float | None = None
-        self._subscribed_at: float | None = None  # the last time since a loss
+        self._silent_since = time.monotonic()  # on a renewed connection
         self._subscription: Any = None
         self._waiting: list[Value] | None = []  # values before each node has sent its first; None from then on
         self._inbox, self._stop, self._connected = Inbox(), threading.Event(), threading.Event()
@@ -122,15 +122,16 @@ class OpcUaSource:
                 await asyncio.wait_for(client.disconnect(), 2.0 * ALIVE)
 
     async def _ensure_subscribed(self, client: Any) -> None:
-        """Subscribe anew if no value has come for a while since a loss. The library restores a subscription once: if
-        the restarted server answers too late, it would remain without nodes."""
-        since = self._lost_at if self._subscribed_at is None else self._subscribed_at
-        if self._lost_at is None or since is None or client.uaclient.state.name != "CONNECTED":
-            return
-        if time.monotonic() - since > SILENT:
-            self._subscribed_at = time.monotonic()
+        """Subscribe anew if no value has come for a while on a renewed connection. The library restores a subscription
+        once: if the restarted server answers too late, it would remain without nodes."""
+        lost_at, now = self._lost_at, time.monotonic()
+        if lost_at is None or client.uaclient.state.name != "CONNECTED":
+            self._silent_since = now
+        elif now - self._silent_since > SILENT:
+            self._silent_since = now
             with suppress(Exception):  # before the new one, which may get the same number from a restarted server
                 await asyncio.wait_for(self._subscription.delete(), SILENT)
+            self._lost_at = lost_at  # a value that came meanwhile was the last of the old subscription
             with suppress(Exception):
                 await asyncio.wait_for(self._subscribe(client), SILENT)
 
@@ -161,7 +162,7 @@ class OpcUaSource:
         self._connected.set()
 
     async def _lost(self, error: Exception) -> None:
-        self._lost_at, self._subscribed_at = time.monotonic(), None
+        self._lost_at = time.monotonic()
         self._inbox.put([f"connection to {self._place} lost ({_text(error)}); trying again"])
 
 
