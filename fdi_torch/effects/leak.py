@@ -8,7 +8,7 @@ import torch
 
 from fdi_torch.plant.constants import leak_pipe
 from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
-from fdi_torch.plant.operating_range import interior_points, onset_grid
+from fdi_torch.plant.operating_range import interior_points, timed_starts
 
 
 class Leak(Effect):
@@ -37,9 +37,8 @@ class Leak(Effect):
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         low, high = operating_range.levels[place]
         at_height = [{"size": 0.1, "height": height} for height in (0.5 * low, *interior_points((low, high), 3))]
-        growing = {"size": 0.1, "onset": 0.3 * operating_range.duration, "ramp": 0.7 * operating_range.duration}
-        opened = [{"size": 0.1, "onset": instant} for instant in onset_grid(operating_range)]
-        return [{"size": 0.1}, *at_height, *opened, growing]
+        permanent, *timed = timed_starts([{"size": 0.1}], operating_range)
+        return [permanent, *at_height, *timed]
 
     def equivalents(
         self, place: str, plant: PlantDescription, values: Mapping[str, float]
