@@ -191,12 +191,12 @@ def test_the_two_effects_that_explain_most_together_are_fitted_together(monkeypa
 def test_onsets_are_as_dense_as_the_random_flows_require() -> None:
     fitter, null, _ = recalibrate(problem_of(nominal_plant(), [recorded(0.0, 1, seed=3)], [], Settings(LIBRARY)).data)
     placement = Placement(effect("plugging"), "P13")
-    option = Option(placement, {"P13.plugging.size": 0.1, "P13.plugging.onset": 350.0})
-    assert fine_onsets([option], fitter) == []
+    options = [Option(placement, {"P13.plugging.size": 0.1, "P13.plugging.onset": time}) for time in (300.0, 600.0)]
+    assert fine_onsets(options, fitter) == []
     counts = []
     for flow, time in ((1e-6, 100.0), (8e-6, 100.0), (8e-6, 0.0)):
         noise = StateNoise(torch.full((3,), flow, dtype=torch.float64), time, torch.ones(3, dtype=torch.float64))
-        counts.append(len(fine_onsets([option], with_disturbances(fitter, null, noise))))
+        counts.append(len(fine_onsets(options, with_disturbances(fitter, null, noise))))
     slow, fast, white = counts
     assert white == 0 and fast == pytest.approx(4 * slow, rel=0.05)
 

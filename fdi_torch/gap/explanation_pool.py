@@ -27,7 +27,7 @@ from fdi_torch.gap.marginal_likelihood import (
     with_estimated_noise,
     with_likeliest_parameters,
 )
-from fdi_torch.gap.onsets import fine_onsets, likeliest_intervals
+from fdi_torch.gap.onsets import with_fine_onsets
 from fdi_torch.gap.screening import Option, ScreeningResult, pairs_of, screen
 from fdi_torch.gap.trajectory_problem import BEHIND, SHARE
 
@@ -151,7 +151,7 @@ class ExplanationPool:
 
         own_noise: screening under its own noise. sensor_noise: screening under sensor noise alone.
         """
-        own_noise = _with_fine_onsets(parent.fitter, parent.fit, own_noise)
+        own_noise = with_fine_onsets(parent.fitter, parent.fit, own_noise, FITTED)
         relevant = [c for c in self._extensions(parent.fit, own_noise, own=True) if self._relevant(parent, c.key)]
         fits = self._fitted(parent.fitter, parent.fit, relevant)[:EVALUATED]
         if sensor_noise:
@@ -171,7 +171,7 @@ class ExplanationPool:
         none was fitted.
         """
         further = [o for o in options if o.cause not in base.key]
-        screening = _with_fine_onsets(fitter, base, screen(fitter, base, further))
+        screening = with_fine_onsets(fitter, base, screen(fitter, base, further), FITTED)
         candidates = [
             replace(c, starts=(*c.starts, self.explanations[c.key].fit.effect_values))
             if c.key in self.explanations
@@ -295,10 +295,3 @@ class ExplanationPool:
             for k, expected in self._expected_gains[key].items()
             if k in self.explanations and k not in without
         ]
-
-
-def _with_fine_onsets(fitter: Fitter, fit: Fit, screening: ScreeningResult) -> ScreeningResult:
-    """A screening with further onset times and intervals of the most promising effects."""
-    promising = screening.promising(FITTED)
-    further = fine_onsets(promising, fitter) + likeliest_intervals(promising, fitter, fit)
-    return screening + screen(fitter, fit, further) if further else screening

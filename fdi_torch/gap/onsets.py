@@ -24,7 +24,7 @@ from torch import Tensor
 
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.screening import Option, products
+from fdi_torch.gap.screening import Option, ScreeningResult, products, screen
 
 SPACING = 4.0  # times t; no onset is further than 2 t from a start, where most of its gain is left
 MOST = 127  # onset times, a limit on computing time
@@ -32,8 +32,16 @@ FEWEST = 60  # instants of intervals, which have no other starts in between
 INTERVALS = 4  # the likeliest intervals of an effect, from each of which a fit starts
 
 
+def with_fine_onsets(fitter: Fitter, fit: Fit, screening: ScreeningResult, effects: int) -> ScreeningResult:
+    """A screening with further onset times and intervals of its most promising `effects`."""
+    promising = screening.promising(effects)
+    further = fine_onsets(promising, fitter) + likeliest_intervals(promising, fitter, fit)
+    return screening + screen(fitter, fit, further) if further else screening
+
+
 def fine_onsets(options: Sequence[Option], fitter: Fitter) -> list[Option]:
-    """Further onset times of these options, as dense as the random flows in the fitter's noise require."""
+    """Further onset times of the effects that start from a grid of them, as dense as the random flows in the fitter's
+    noise require."""
     duration, count = fitter.data.longest_duration, _count(fitter)
     further: list[Option] = []
     coarse: dict[tuple[tuple[str, str], tuple[tuple[str, float], ...]], list[Option]] = {}
@@ -43,7 +51,7 @@ def fine_onsets(options: Sequence[Option], fitter: Fitter) -> list[Option]:
             others = tuple((n, v) for n, v in option.start.items() if n != onset)
             coarse.setdefault((option.cause, others), []).append(option)
     for group in coarse.values():
-        if count > len(group):
+        if count > len(group) > 1:  # a single onset is not one of a grid
             times = [duration * (k + 1) / (count + 1) for k in range(count)]
             onset = group[0].placement.full_name("onset")
             further += [replace(group[0], start={**group[0].start, onset: time}) for time in times]
