@@ -9,6 +9,7 @@ person makes: a missing term, a wrong bound, a factor, an ignored argument.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import multiprocessing
 import os
@@ -67,11 +68,16 @@ def _run(root: Path, tests: Sequence[str]) -> None:
         sys.exit(int(pytest.main(["-x", "-p", "no:cacheprovider", *tests])))
 
 
-def main(words: Sequence[str]) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Print what became of each fault; 1 if more than 15 % survived."""
+    parser = argparse.ArgumentParser("python -m tests.mutants", description="Run tests on deliberate faults.")
+    parser.add_argument("words", nargs="*", metavar="WORD", help="only faults with one in their file or description")
+    words = parser.parse_args(arguments).words
+    chosen = [m for m in mutants() if not words or any(word in f"{m.file} {m.breaks}" for word in words)]
+    if not chosen:
+        parser.error(f"expected a word of a fault's file or description, got {' '.join(words)}")
     for library in ("torch", "scipy.optimize", "scipy.stats", "pydantic", "matplotlib.pyplot", "pytest"):
         __import__(library)
-    chosen = [m for m in mutants() if not words or any(word in f"{m.file} {m.breaks}" for word in words)]
     survivors = 0
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / ROOT.name

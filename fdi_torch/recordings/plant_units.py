@@ -154,10 +154,10 @@ GROUPS, SUMS = 16, 4
 """Groups of each tank's balance, and sums of successive intervals in each group."""
 DEVIATION = 0.07
 """How far an inexact constant, an unmodelled effect or a fault usually moves a coefficient from 1: less than this in
-three of four of the 1560 coefficients of 186 practice recordings that are determined to 0.1."""
+three of four of the 1567 coefficients of 186 practice recordings that are determined to 0.1."""
 SCALE = DEVIATION / math.tan(0.375 * math.pi)
 """Scale of the Cauchy distribution that has three quarters within DEVIATION. It has half within 0.03, 90 % within 0.18
-and 95 % within 0.37; of these coefficients it is 0.03, 0.20 and 0.41."""
+and 95 % within 0.37; of these coefficients it is 0.03, 0.20 and 0.43."""
 UNRELATED = 0.1
 """Probability that a tank's readings do not depend on its flows: swapped channels, a stuck sensor."""
 
@@ -307,26 +307,26 @@ def _log_evidence(sums: Tensor, rounding: float) -> float:
 
 
 def _regression(sums: Tensor, rounding: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Non-zero eigenvalues (D,) and eigenvectors (F, D) of the information of b, and b - 1 (F,), by sums (2, GROUPS,
-    SUMS, 1 + F).
+    """Eigenvalues (D,) and eigenvectors (F, D) of the information of b, and b - 1 (F,); sums (2, GROUPS, SUMS, 1 + F).
 
     In steady state without noise, the sums differ by rounding only, and their scatter does not measure their errors;
-    each counts as uncertain by `rounding`, m^3, at least. Whether a direction is determined is asked of flows scaled to
-    their root mean square, so that the answer does not depend on units.
+    each counts as uncertain by `rounding`, m^3, at least. Which D directions the readings determine is asked of flows
+    scaled to their root mean square, so that the answer does not depend on units.
     """
     flows, excess = sums[..., 1:], sums[..., 0] - sums[..., 1:].sum(dim=-1)
     rms = flows.square().mean(dim=(0, 1, 2)).sqrt()
-    size = torch.where(rms > math.sqrt(torch.finfo(rms.dtype).eps) * rms.max(), rms, torch.inf)
+    flowing = rms > math.sqrt(torch.finfo(rms.dtype).eps) * rms.max()
+    size, count = torch.where(flowing, rms, torch.inf), int(flowing.sum())
     scaled = flows / size
     instruments = 0.5 * scaled.flip(0)
     product = torch.einsum("pgni,pgnj->ij", instruments, scaled)
     off = _inverse(product) @ torch.einsum("pgni,pgn->i", instruments, excess)
     scores = torch.einsum("pgni,pgn->gi", instruments, excess - scaled @ off)
-    variance = scores.T @ scores * GROUPS / max(GROUPS - len(size), 1) + rounding**2 * product
-    eigenvalues, eigenvectors = torch.linalg.eigh(product @ _inverse(variance) @ product)
-    determined = eigenvalues > len(size) * torch.finfo(sums.dtype).eps * eigenvalues[-1]
-    root = size.nan_to_num(posinf=0.0)[:, None] * eigenvectors[:, determined] * eigenvalues[determined].sqrt()
-    directions, lengths, _ = torch.linalg.svd(root, full_matrices=False)
+    variance = scores.T @ scores * GROUPS / max(GROUPS - count, 1) + rounding**2 * product
+    variances, axes = torch.linalg.eigh(variance)
+    known = variances > math.sqrt(torch.finfo(sums.dtype).eps) * variances[-1]
+    root = product @ axes[:, known] / variances[known].sqrt()
+    directions, lengths, _ = torch.linalg.svd(torch.where(flowing, size, 0.0)[:, None] * root, full_matrices=False)
     return lengths.square(), directions, off / size
 
 
