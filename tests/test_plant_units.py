@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -160,7 +158,7 @@ def test_flows_follow_from_levels_not_from_readings(folder: Path) -> None:
     run = recorded(plant, {})
     shifted = replace(plant, sensors=tuple(replace(sensor, offset=0.3) for sensor in plant.sensors))
     then, now = volumes_along(plant, run), volumes_along(shifted, replace(run, outputs=run.outputs + 0.3))
-    torch.testing.assert_close(now.sums, then.sums, rtol=1e-9, atol=1e-15)
+    torch.testing.assert_close(now.by_laws, then.by_laws, rtol=1e-9, atol=0.0)
 
 
 def test_swapped_sensors_are_no_wrong_unit(folder: Path) -> None:
@@ -227,56 +225,7 @@ def test_a_nearly_steady_level_speaks_the_more_against_a_unit_the_farther_it_is(
         noise={"std": {"h": "1 mm"}},
     )
     volumes = volumes_along(plant, leaking)
-    balances = [[volumes.scaled(metered=10.0 ** (sign * k)) for k in range(8)] for sign in (-1, 1)]
+    balances = [[replace(volumes, metered=10.0 ** (sign * k) * volumes.metered) for k in range(8)] for sign in (-1, 1)]
     for farther in balances:
         evidence = [float(balance.log_evidence()) for balance in farther]
         assert evidence == sorted(evidence, reverse=True)
-
-
-@pytest.mark.parametrize("gain", [1.0, 0.9])
-def test_a_worn_pump_between_nearly_equal_flows_is_no_wrong_unit(gain: float) -> None:
-    """A pump that runs by turns, and a weir over which the level hardly moves beside its noise: what the tanks store is
-    a small difference of large flows, of which some are 3 or 10 % off."""
-    areas = {"wet": 6, "grit": 12, "aerator": 60, "settler": 40, "clear": 20}
-    starts = {"wet": 2.0, "grit": 1.85, "aerator": 2.75, "settler": 2.65, "clear": 1.0}
-    file: dict[str, Any] = {
-        "tanks": {t: {"area": f"{a} m^2", "height": "4 m", "start_level": f"{starts[t]} m"} for t, a in areas.items()},
-        "pumps": {"feed": {"target": "wet", "max_flow": "60 l/s"}},
-        "transfers": {
-            "lift": {"source": "wet", "target": "grit", "max_flow": "60 l/s"},
-            "return": {"source": "settler", "target": "aerator", "max_flow": "20 l/s"},
-        },
-        "weirs": {
-            "inlet": {"source": "grit", "target": "aerator", "crest": "1.8 m", "width": "60 cm"},
-            "edge": {"source": "settler", "target": "clear", "crest": "2.6 m", "width": "1.2 m"},
-        },
-        "pipes": {
-            "link": {"source": "aerator", "target": "settler", "area": "300 cm^2", "discharge_coefficient": 0.6},
-            "out": {"source": "clear", "area": "100 cm^2", "discharge_coefficient": 0.6},
-        },
-        "sensors": {f"L_{t}": {"tank": t} for t in areas},
-        "tolerances": {"*.discharge_coefficient": "5 %"},
-    }
-    plant = build_plant(file, "plant.yaml")
-    file["weirs"]["edge"]["discharge_coefficient"] = 0.62
-    feed = [20.0 + 14.0 * math.sin(0.03 * k) for k in range(80)]  # l/s, each for 900 s
-    lift, wet = [0.0], starts["wet"]
-    for k in range(2400):
-        wet += (feed[k // 30] - gain * lift[-1]) * 30e-3 / areas["wet"]
-        lift.append(45.0 if wet > 2.4 else 0.0 if wet < 0.9 else lift[-1])
-    flows = [[f"{900 * k} s", f"{flow} l/s"] for k, flow in enumerate(feed)]
-    switches = [[f"{30 * k} s", f"{flow} l/s"] for k, flow in enumerate(lift[:2400])]
-    returned = [[f"{900 * k} s", f"{(4, 12, 8)[k * k % 3]} l/s"] for k in range(80)]
-    run = fdi_torch.simulate(
-        build_plant(file, "plant.yaml"),
-        inputs={"lift": {"steps": switches}, "feed": {"steps": flows}, "return": {"steps": returned}},
-        duration="72000 s",
-        sample_time="30 s",
-        faults={"lift.pump_gain": gain},
-        noise={"std": {f"L_{t}": "2 mm" for t in areas}},
-    )
-    assert wrong_units(plant, run) == ""
-    volumes = volumes_along(plant, run)
-    for unit in (1e-4, 1e-2, 1e2, 1e4):
-        area_in_another_unit = volumes.scaled([unit] * len(areas)).log_evidence()
-        assert bool((area_in_another_unit < volumes.log_evidence() - math.log(20.0)).all())

@@ -3,16 +3,14 @@
 A correction divides these numbers by the ratio of the unit in which they were written to another usual unit. The volume
 balance of each tank along the recording gives the likelihood of the plant's numbers without a simulation:
 
-    A dh/dt = sum of b_i q_i         b_i = 1 for a plant that is right
+    A dh/dt = b_1 q_metered + b_2 q_law(h)         b_1 = b_2 = 1 for a plant that is right
 
 Stored volume, metered flows (pumps, transfers) and flows by laws (pipes, weirs, known effects) follow from the readings
-and commands. Each flow has its own coefficient, because what remains of flows that nearly cancel tells little about a
-unit. Noise in the readings would make the coefficients too small: the flows are computed twice, from the even and from
-the odd samples, and the ones are instruments of the others (Fuller, 1987, "Measurement error models", section 1.4). The
-covariance of b is that of groups of consecutive sums, which count as independent (Liang and Zeger, 1986, Biometrika 73,
-13-22). By Bayes' theorem, the likelihoods of the unchanged plant file and of each correction give their probabilities.
-The corrections that together have the probability CONFIDENCE are named, unless the unchanged file is among them. A
-recording without metered flows has no absolute scale: a valve that hardly opens looks like tanks that are too small.
+and commands. The coefficients b are estimated by least squares; their covariance is that of groups of consecutive
+sums, which count as independent (Liang and Zeger, 1986, Biometrika 73, 13-22). By Bayes' theorem, the likelihoods of
+the unchanged plant file and of each correction give their probabilities. The corrections that together have the
+probability CONFIDENCE are named, unless the unchanged file is among them. A recording without metered flows has no
+absolute scale: a valve that hardly opens looks like tanks that are too small.
 
 An unusual plant is not mistaken for a wrong unit: a leak or a plugged pipe changes a coefficient of the balance by some
 factor, but rarely by one that is close to the ratio of two units. What has one channel alone is left to
@@ -22,9 +20,8 @@ factor, but rarely by one that is close to the ratio of two units. What has one 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from enum import Enum
 
 import torch
 from torch import Tensor
@@ -35,7 +32,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.inverted_sensor import INSTANT
 from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.operating_point import OperatingPoint, PlaceValues
+from fdi_torch.plant.operating_point import PlaceValues
 from fdi_torch.plant.signals import Clock
 from fdi_torch.quantities import display_unit, unit_factor
 from fdi_torch.recording import Recording
@@ -73,10 +70,8 @@ class Correction:
 
 def wrong_units(plant: PlantDescription, recording: Recording) -> str:
     """A sentence on numbers that are probably in a wrong unit, and the unit to write; empty if there are none."""
-    if not plant.metered_flows():
-        return ""
     as_is = volumes_along(plant, recording)
-    if not as_is.is_metered:
+    if not bool((as_is.metered.nan_to_num() != 0.0).any()):
         return ""
     corrections = list(_corrections(plant, recording, as_is))
     # A correction that puts a level above a pump's cut-out leaves no flow, hence no balance: it is no better for that.
@@ -103,7 +98,7 @@ def refusal(recording: Recording, problem: str) -> str:
 
 def _corrections(plant: PlantDescription, recording: Recording, as_is: Volumes) -> Iterator[Correction]:
     area = display_unit("m^2")[0]
-    all_tanks = torch.ones(len(plant.tanks), dtype=torch.float64)
+    all_tanks = torch.ones(len(plant.tanks)).to(as_is.stored)
     areas = [(f"tanks.{t.name}.area is", one, 0.0) for t, one in zip(plant.tanks, all_tanks.diag(), strict=True)]
     areas += [("the areas of all tanks are", all_tanks, 0.0)] if len(plant.tanks) > 1 else []
     if plant.pipes:
@@ -111,12 +106,12 @@ def _corrections(plant: PlantDescription, recording: Recording, as_is: Volumes) 
         areas += [("the areas of all tanks and pipes are", all_tanks, 1.0)]
     for right, ratio in _other_units("m^2", area):
         for names, tanks, pipes in areas:
-            smaller = as_is.scaled((ratio**-tanks).tolist(), by_laws=ratio**-pipes)
+            smaller = replace(as_is, stored=as_is.stored / ratio**tanks, by_laws=as_is.by_laws / ratio**pipes)
             yield Correction(names, area, right, ratio, smaller)
     channels = [component.channel for component in plant.metered_flows()]
     written = _written("m^3/s", channels[0], recording)
     for right, ratio in _other_units("m^3/s", written):
-        slower = as_is.scaled(metered=1.0 / ratio)
+        slower = replace(as_is, metered=as_is.metered / ratio)
         yield Correction(f"the flows of {', '.join(channels)} are", written, right, ratio, slower)
     columns = plant.outputs()
     written = _written("m", columns[0], recording)
@@ -148,65 +143,36 @@ def _written(kind: str, channel: str, recording: Recording) -> str:
     return written if same_kind(written, (kind,)) else display_unit(kind)[0]
 
 
-SAMPLES = 20_000
+SAMPLES = 1000
 """Most samples of a thinned recording, for speed."""
 GROUPS, SUMS = 16, 4
 """Groups of each tank's balance, and sums of successive intervals in each group."""
-DEVIATION = 0.07
+DEVIATION = 0.1
 """How far an inexact constant, an unmodelled effect or a fault usually moves a coefficient from 1: less than this in
-three of four of the 1567 coefficients of 186 practice recordings that are determined to 0.1."""
+three of four coefficients of the practice recordings that are determined to 0.1."""
 SCALE = DEVIATION / math.tan(0.375 * math.pi)
-"""Scale of the Cauchy distribution that has three quarters within DEVIATION. It has half within 0.03, 90 % within 0.18
-and 95 % within 0.37; of these coefficients it is 0.03, 0.20 and 0.43."""
+"""Scale of the Cauchy distribution that has three quarters within DEVIATION. It has half within 0.04, 90 % within 0.26
+and 95 % within 0.53; of 1009 coefficients of 186 practice recordings it is 0.04, 0.28 and 0.51."""
 UNRELATED = 0.1
 """Probability that a tank's readings do not depend on its flows: swapped channels, a stuck sensor."""
 
 
-class Term(Enum):
-    """What a term of a tank's balance is."""
-
-    STORED = "stored"
-    METERED = "metered"
-    BY_LAW = "by a law"
-
-
 @dataclass(frozen=True)
 class Volumes:
-    """Volumes of each tank, m^3, summed over successive intervals: GROUPS SUMS sums of equally many intervals in which
-    all are known; NaN for a tank with too few.
+    """Volumes (intervals, tanks), m^3, per tank: stored, entered by metered flows, and by laws. NaN where unknown."""
 
-    terms: of each tank, what is stored, and what enters by each flow, those of its effects together. sums: of each tank
-    (2, GROUPS, SUMS, terms), with the flows from the even and from the odd samples. intervals: in each sum of a tank.
-    """
-
-    terms: tuple[tuple[Term, ...], ...]
-    sums: tuple[Tensor, ...]
-    intervals: tuple[int, ...]
-
-    def scaled(self, stored: Sequence[float] | None = None, metered: float = 1.0, by_laws: float = 1.0) -> Volumes:
-        """The same with other numbers for the stored volumes of each tank, for metered flows and for flows by laws."""
-        scaled = []
-        for of_tank, terms, each in zip(self.sums, self.terms, stored or [1.0] * len(self.sums), strict=True):
-            factors = {Term.STORED: each, Term.METERED: metered, Term.BY_LAW: by_laws}
-            scaled.append(of_tank * of_tank.new_tensor([factors[term] for term in terms]))
-        return replace(self, sums=tuple(scaled))
-
-    @property
-    def is_metered(self) -> bool:
-        """Whether there is any metered flow."""
-        return any(
-            bool((sums[..., [term is Term.METERED for term in terms]].nan_to_num() != 0.0).any())
-            for terms, sums in zip(self.terms, self.sums, strict=True)
-        )
+    stored: Tensor
+    metered: Tensor
+    by_laws: Tensor
 
     def log_evidence(self) -> Tensor:
         """Log likelihood of the readings of each tank (tanks), up to a constant that all corrections share.
 
-        NaN for a tank without known sums.
+        NaN for a tank with too few intervals whose volume balance is known.
         """
-        largest = max(float(x.nan_to_num().abs().max()) / n for x, n in zip(self.sums, self.intervals, strict=True))
-        rounding = math.sqrt(torch.finfo(torch.float64).eps) * largest
-        return torch.tensor([_log_evidence(tank, rounding) for tank in self.sums])
+        terms = torch.stack([self.stored, self.metered, self.by_laws], dim=-1)
+        rounding = math.sqrt(torch.finfo(terms.dtype).eps) * float(terms.nan_to_num().abs().max())
+        return torch.tensor([_log_evidence(tank, rounding) for tank in terms.unbind(1)])
 
 
 def volumes_along(plant: PlantDescription, recording: Recording) -> Volumes:
@@ -219,6 +185,7 @@ def volumes_along(plant: PlantDescription, recording: Recording) -> Volumes:
     limits = ParameterSpace([network.constants[f"{component.name}.max_flow"] for component in plant.metered_flows()])
     values = network.bind(limits, torch.full_like(limits.nominal(), math.inf))
     levels = _levels(network, recording, values)
+    middle = [0.5 * (level[1:] + level[:-1]) for level in levels]
     inputs = (
         recording.inputs if recording.hold == "zero_order" else 0.5 * (recording.inputs[1:] + recording.inputs[:-1])
     )
@@ -227,47 +194,22 @@ def volumes_along(plant: PlantDescription, recording: Recording) -> Volumes:
     instant = recording.time.new_tensor(INSTANT)
     clock = Clock(recording.time[:-1], instant, instant)
     commands, _ = network.commands(channels, network.steady_command_memory(channels, clock, values), clock, values)
-    first, last = levels[:-1], levels[1:]
-    is_odd = torch.arange(len(first)).unsqueeze(1) % 2 == 1
-    ends = [torch.where(is_odd, *pair).unbind(1) for pair in ((last, first), (first, last))]
-    points = [network.operating_point(at, commands, clock, values) for at in ends]
-    areas, net, flows = zip(*(_areas_and_flows(network, point) for point in points), strict=True)
-    interval, terms, sums = torch.diff(recording.time), list[tuple[Term, ...]](), list[tuple[Tensor, int]]()
-    for i, tank in enumerate(plant.tanks):
-        own = [component for component in plant.flow_components() if tank.name in (component.source, component.target)]
-        stored = 0.5 * (areas[0][i] + areas[1][i]) * (last - first)[:, i]
-        volumes = []
-        for total, flow in zip(net, flows, strict=True):
-            entering = [flow[c.name] if c.target == tank.name else -flow[c.name] for c in own]
-            entering.append(total[i] - sum(entering))
-            volumes.append(torch.stack([stored, *(interval * q for q in entering)], dim=-1))
-        sums.append(_sums(torch.stack(volumes)))
-        of_flows = [Term.METERED if isinstance(component, MeteredFlow) else Term.BY_LAW for component in own]
-        terms.append((Term.STORED, *of_flows, Term.BY_LAW))
-    return Volumes(tuple(terms), *zip(*sums, strict=True))
-
-
-def _areas_and_flows(
-    network: TankNetwork, point: OperatingPoint
-) -> tuple[list[Tensor], list[Tensor], dict[str, Tensor]]:
-    """Areas, m^2, and net inflows, m^3/s, of the tanks, and the flow of each component, m^3/s."""
+    point = network.operating_point(middle, commands, clock, values)
     flows = network.flows(point)
-    at_last, net = network.last_flows(point, network.net_inflows(point, flows))
-    ones = [torch.ones_like(level) for level in point.levels.values()]
-    return [1.0 / rate for rate in network.level_rates(point, ones)], net, dict(flows | at_last)
+    last, net = network.last_flows(point, network.net_inflows(point, flows))
+    metered = [torch.zeros_like(level) for level in middle]
+    for component in plant.flow_components():
+        if isinstance(component, MeteredFlow):
+            network.transfer(metered, component.source, component.target, (flows | last)[component.name])
+    areas = [1.0 / rate for rate in network.level_rates(point, [torch.ones_like(level) for level in middle])]
+    stored = [area * torch.diff(level) for area, level in zip(areas, levels, strict=True)]
+    interval = torch.diff(recording.time)
+    entered = [[interval * q for q in each] for each in (metered, (t - q for t, q in zip(net, metered, strict=True)))]
+    return Volumes(*(torch.stack(volumes, dim=-1) for volumes in (stored, *entered)))
 
 
-def _sums(volumes: Tensor) -> tuple[Tensor, int]:
-    """Sums (2, GROUPS, SUMS, terms) of a tank's volumes (2, intervals, terms), and the number of intervals of each; NaN
-    for too few intervals."""
-    known = volumes[:, torch.isfinite(volumes).all(dim=-1).all(dim=0)]
-    length = known.shape[1] // (GROUPS * SUMS)
-    sums = known[:, : GROUPS * SUMS * length].reshape(2, GROUPS, SUMS, length, volumes.shape[-1]).sum(dim=3)
-    return (sums, length) if length else (torch.full_like(sums, torch.nan), 1)
-
-
-def _levels(network: TankNetwork, recording: Recording, values: PlaceValues) -> Tensor:
-    """Levels (samples, tanks), m; NaN without a reading."""
+def _levels(network: TankNetwork, recording: Recording, values: PlaceValues) -> list[Tensor]:
+    """Level of each tank (samples), m; NaN without a reading."""
     unknown = torch.full_like(recording.time, math.nan)
     levels = {tank.name: unknown for tank in network.description.tanks}
     for sensor in reversed(network.description.sensors):
@@ -275,14 +217,13 @@ def _levels(network: TankNetwork, recording: Recording, values: PlaceValues) -> 
             readings = recording.readings[:, recording.output_names.index(sensor.column)]
             constants = values[sensor.name]
             levels[sensor.tank] = (readings - constants["offset"]) / constants["gain"]
-    return torch.stack(list(levels.values()), dim=1)
+    return list(levels.values())
 
 
-def _log_evidence(sums: Tensor, rounding: float) -> float:
-    """Log likelihood of the stored volumes of a tank, given its `sums` (2, GROUPS, SUMS, 1 + F): stored, and by
-    each flow, from the even and from the odd samples.
+def _log_evidence(terms: Tensor, rounding: float) -> float:
+    """Log likelihood of the stored volumes of a tank, given its `terms` (intervals, 3): stored, metered, by laws.
 
-    rounding: half of the digits of the largest volume of an interval, of all tanks, m^3.
+    rounding: half of the digits of the largest volume of all tanks, m^3.
 
     The prior of b is the multivariate Cauchy distribution of centre 1 and scale SCALE, a mixture of normal ones of
     variance v; the tank is UNRELATED if b = 0. With b in the directions of the eigenvectors of its information, whose
@@ -292,10 +233,13 @@ def _log_evidence(sums: Tensor, rounding: float) -> float:
 
     where a direction that the recording does not determine, l = 0, counts nothing.
     """
-    if not bool(torch.isfinite(sums).all()):
+    terms = terms[torch.isfinite(terms).all(dim=-1)]
+    length = len(terms) // (GROUPS * SUMS)
+    if not length:
         return math.nan
+    sums = terms[: GROUPS * SUMS * length].reshape(GROUPS, SUMS, length, 3).sum(dim=2)
     information, directions, off = _regression(sums, rounding)
-    if not len(information):
+    if not bool((information > 0.0).any()):
         return math.nan
     variance = SCALE**2 * torch.logspace(-2, 16, 73).to(off)
     share = torch.log_softmax(-0.5 * (variance.log() + SCALE**2 / variance), dim=0)
@@ -307,27 +251,28 @@ def _log_evidence(sums: Tensor, rounding: float) -> float:
 
 
 def _regression(sums: Tensor, rounding: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Eigenvalues (D,) and eigenvectors (F, D) of the information of b, and b - 1 (F,); sums (2, GROUPS, SUMS, 1 + F).
+    """Eigenvalues (2) and eigenvectors (2, 2) of the information of b, and b - 1 (2), by sums (GROUPS, SUMS, 3).
 
     In steady state without noise, the sums differ by rounding only, and their scatter does not measure their errors;
-    each counts as uncertain by `rounding`, m^3, at least. Which D directions the readings determine is asked of flows
-    scaled to their root mean square, so that the answer does not depend on units.
+    each counts as uncertain by `rounding`, m^3, at least. Whether a direction is determined is asked of flows scaled to
+    their root mean square, so that the answer does not depend on units; the smaller eigenvalue is then the determinant
+    divided by the larger one.
     """
-    flows, excess = sums[..., 1:], sums[..., 0] - sums[..., 1:].sum(dim=-1)
-    rms = flows.square().mean(dim=(0, 1, 2)).sqrt()
-    flowing = rms > math.sqrt(torch.finfo(rms.dtype).eps) * rms.max()
-    size, count = torch.where(flowing, rms, torch.inf), int(flowing.sum())
+    flows, excess = sums[..., 1:], sums[..., 0] - sums[..., 1] - sums[..., 2]
+    rms = flows.square().mean(dim=(0, 1)).sqrt()
+    size = torch.where(rms > 0.0, rms, 1.0)
     scaled = flows / size
-    instruments = 0.5 * scaled.flip(0)
-    product = torch.einsum("pgni,pgnj->ij", instruments, scaled)
-    off = _inverse(product) @ torch.einsum("pgni,pgn->i", instruments, excess)
-    scores = torch.einsum("pgni,pgn->gi", instruments, excess - scaled @ off)
-    variance = scores.T @ scores * GROUPS / max(GROUPS - count, 1) + rounding**2 * product
-    variances, axes = torch.linalg.eigh(variance)
-    known = variances > math.sqrt(torch.finfo(sums.dtype).eps) * variances[-1]
-    root = product @ axes[:, known] / variances[known].sqrt()
-    directions, lengths, _ = torch.linalg.svd(torch.where(flowing, size, 0.0)[:, None] * root, full_matrices=False)
-    return lengths.square(), directions, off / size
+    product = torch.einsum("gni,gnj->ij", scaled, scaled)
+    off = _inverse(product) @ torch.einsum("gni,gn->i", scaled, excess)
+    scores = torch.einsum("gni,gn->gi", scaled, excess - scaled @ off)
+    variance = scores.T @ scores * GROUPS / (GROUPS - 2) + rounding**2 * product
+    information = product @ _inverse(variance) @ product
+    smaller, larger = torch.linalg.eigvalsh(information)
+    eigenvalues, eigenvectors = torch.linalg.eigh(size[:, None] * information * size)
+    determinant = smaller * larger * size.square().prod()
+    both = smaller > 2.0 * torch.finfo(sums.dtype).eps * larger
+    least = torch.where(both, determinant / eigenvalues[1], 0.0)
+    return torch.stack([least, eigenvalues[1]]), eigenvectors, off / size
 
 
 def _inverse(matrix: Tensor) -> Tensor:
