@@ -196,7 +196,7 @@ def test_a_bad_status_is_a_missing_reading(tmp_path: Path, plc: Plc) -> None:
     run = load_monitor(config(tmp_path, recording=None, source=source(plc.port)))
     assert run.config.source is not None
     plc.write(MESSAGES[0])
-    rows = LiveRows(run.config.source, run.plant, idle=0.8)
+    rows = LiveRows(run.config.source, run.plant, idle=3.0)
     plc.write(MESSAGES[1], bad=("h2",))
     got = [row for row in rows if not isinstance(row, str)]
     assert [t for t, _, _ in got] == [0.0, 1.0]
@@ -251,7 +251,7 @@ def test_a_level_that_has_not_changed_for_hours_does_not_set_time_zero(tmp_path:
     moving = tuple(name for name in NAMES if name != "h1")
     plc.write(MESSAGES[0] | {"t": -10800.0})
     plc.write(MESSAGES[0], only=moving)
-    rows = LiveRows(run.config.source, run.plant, idle=0.8)
+    rows = LiveRows(run.config.source, run.plant, idle=3.0)
     plc.write(MESSAGES[1], only=moving)
     got = [row for row in rows if not isinstance(row, str)]
     assert [t for t, _, _ in got] == [0.0, 1.0] and rows.origin == START.timestamp()
