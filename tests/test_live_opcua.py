@@ -20,6 +20,7 @@ from test_live_mqtt import MESSAGES, told
 from test_monitor_follow import config, monitored, texts, written
 
 from fdi_torch.cli import main
+from fdi_torch.live.opcua import SILENT
 from fdi_torch.live.values import Inbox, Item, Value
 
 asyncua = pytest.importorskip("asyncua")
@@ -173,8 +174,8 @@ def test_a_server_that_is_stopped_and_started_again_loses_no_event(
                 proxy.cut()
                 plc.close()
                 plc.start()
-                if restored:  # longer than SILENT, which counts from the end of the loss
-                    time.sleep(6.0)
+                if restored:  # SILENT counts from the end of the loss
+                    time.sleep(SILENT + 1.0)
                 proxy.mend()
                 assert connected_again.wait(60.0)
             plc.write(sample)
