@@ -3,14 +3,15 @@
 A correction divides these numbers by the ratio of the unit in which they were written to another usual unit. The volume
 balance of each tank along the recording gives the likelihood of the plant's numbers without a simulation:
 
-    A dh/dt = b_1 q_metered + b_2 q_law(h)         b_1 = b_2 = 1 for a plant that is right
+    dh/dt = sum of b_i q_i / A         b_i = 1 for a plant that is right
 
-Stored volume, metered flows (pumps, transfers) and flows by laws (pipes, weirs, known effects) follow from the readings
-and commands. The coefficients b are estimated by least squares; their covariance is that of groups of consecutive
-sums, which count as independent (Liang and Zeger, 1986, Biometrika 73, 13-22). By Bayes' theorem, the likelihoods of
-the unchanged plant file and of each correction give their probabilities. The corrections that together have the
-probability CONFIDENCE are named, unless the unchanged file is among them. A recording without metered flows has no
-absolute scale: a valve that hardly opens looks like tanks that are too small.
+Level changes, metered flows (pumps, transfers) and flows by laws (pipes, weirs, known effects) follow from the readings
+and commands. Each flow has its own coefficient, because what remains of flows that nearly cancel tells little about a
+unit. The coefficients are estimated by least squares from sums over many intervals; their covariance is that of groups
+of consecutive sums, which count as independent (Liang and Zeger, 1986, Biometrika 73, 13-22). By Bayes' theorem, the
+likelihoods of the unchanged plant file and of each correction give their probabilities. The corrections that together
+have the probability CONFIDENCE are named, unless the unchanged file is among them. A recording without metered flows
+has no absolute scale: a valve that hardly opens looks like tanks that are too small.
 
 An unusual plant is not mistaken for a wrong unit: a leak or a plugged pipe changes a coefficient of the balance by some
 factor, but rarely by one that is close to the ratio of two units. What has one channel alone is left to
@@ -53,13 +54,13 @@ CONFIDENCE = 0.95
 @dataclass(frozen=True)
 class Correction:
     """A probable mistake of units. names: the numbers concerned. written, right: the unit they have, and the one they
-    should have. ratio: of these units. volumes: balance of the plant with the numbers in the right unit."""
+    should have. ratio: of these units. balance: of the plant with the numbers in the right unit."""
 
     names: str
     written: str
     right: str
     ratio: float
-    volumes: Volumes
+    balance: Balance
 
     @property
     def text(self) -> str:
@@ -70,12 +71,14 @@ class Correction:
 
 def wrong_units(plant: PlantDescription, recording: Recording) -> str:
     """A sentence on numbers that are probably in a wrong unit, and the unit to write; empty if there are none."""
-    as_is = volumes_along(plant, recording)
-    if not bool((as_is.metered.nan_to_num() != 0.0).any()):
+    if not plant.metered_flows():
+        return ""
+    as_is = balance_along(plant, recording)
+    if not as_is.is_metered:
         return ""
     corrections = list(_corrections(plant, recording, as_is))
     # A correction that puts a level above a pump's cut-out leaves no flow, hence no balance: it is no better for that.
-    leads = torch.stack([each.volumes.log_evidence() for each in corrections]) - as_is.log_evidence()
+    leads = torch.stack([each.balance.log_evidence() for each in corrections]) - as_is.log_evidence()
     evidence = torch.cat([leads.new_zeros(1), leads.nansum(dim=1)])
     prior = torch.tensor([1.0 - PRIOR, *(PRIOR / len(corrections) for _ in corrections)])
     probability, order = torch.softmax(evidence + prior.log(), dim=0).sort(descending=True)
@@ -96,9 +99,9 @@ def refusal(recording: Recording, problem: str) -> str:
     return f"{recording.source}: {problem}; if the recording is right, state trusted: true beside the file"
 
 
-def _corrections(plant: PlantDescription, recording: Recording, as_is: Volumes) -> Iterator[Correction]:
+def _corrections(plant: PlantDescription, recording: Recording, as_is: Balance) -> Iterator[Correction]:
     area = display_unit("m^2")[0]
-    all_tanks = torch.ones(len(plant.tanks)).to(as_is.stored)
+    all_tanks = torch.ones(len(plant.tanks), dtype=torch.float64)
     areas = [(f"tanks.{t.name}.area is", one, 0.0) for t, one in zip(plant.tanks, all_tanks.diag(), strict=True)]
     areas += [("the areas of all tanks are", all_tanks, 0.0)] if len(plant.tanks) > 1 else []
     if plant.pipes:
@@ -106,19 +109,19 @@ def _corrections(plant: PlantDescription, recording: Recording, as_is: Volumes) 
         areas += [("the areas of all tanks and pipes are", all_tanks, 1.0)]
     for right, ratio in _other_units("m^2", area):
         for names, tanks, pipes in areas:
-            smaller = replace(as_is, stored=as_is.stored / ratio**tanks, by_laws=as_is.by_laws / ratio**pipes)
+            smaller = as_is.scaled(metered=ratio**tanks, by_laws=ratio ** (tanks - pipes))
             yield Correction(names, area, right, ratio, smaller)
     channels = [component.channel for component in plant.metered_flows()]
     written = _written("m^3/s", channels[0], recording)
     for right, ratio in _other_units("m^3/s", written):
-        slower = replace(as_is, metered=as_is.metered / ratio)
+        slower = as_is.scaled(metered=all_tanks / ratio, by_laws=all_tanks)
         yield Correction(f"the flows of {', '.join(channels)} are", written, right, ratio, slower)
     columns = plant.outputs()
     written = _written("m", columns[0], recording)
     for right, ratio in _other_units("m", written):
         corrected = replace(plant, sensors=tuple(replace(s, gain=ratio * s.gain) for s in plant.sensors))
         if _fits_into_tanks(corrected, recording):
-            lower = volumes_along(corrected, recording)
+            lower = balance_along(corrected, recording, unit=1.0 / ratio)
             yield Correction(f"the levels {', '.join(columns)} are", written, right, ratio, lower)
 
 
@@ -143,49 +146,106 @@ def _written(kind: str, channel: str, recording: Recording) -> str:
     return written if same_kind(written, (kind,)) else display_unit(kind)[0]
 
 
-SAMPLES = 1000
+SAMPLES = 20_000
 """Most samples of a thinned recording, for speed."""
 GROUPS, SUMS = 16, 4
 """Groups of each tank's balance, and sums of successive intervals in each group."""
-DEVIATION = 0.1
+DEVIATION = 0.07
 """How far an inexact constant, an unmodelled effect or a fault usually moves a coefficient from 1: less than this in
-three of four coefficients of the practice recordings that are determined to 0.1."""
+three of four of the 1567 coefficients of 186 practice recordings that are determined to 0.1."""
 SCALE = DEVIATION / math.tan(0.375 * math.pi)
-"""Scale of the Cauchy distribution that has three quarters within DEVIATION. It has half within 0.04, 90 % within 0.26
-and 95 % within 0.53; of 1009 coefficients of 186 practice recordings it is 0.04, 0.28 and 0.51."""
+"""Scale of the Cauchy distribution that has three quarters within DEVIATION. It has half within 0.03, 90 % within 0.18
+and 95 % within 0.37; of these coefficients it is 0.03, 0.20 and 0.43."""
+HALF_OF_DIGITS = math.sqrt(torch.finfo(torch.float64).eps)
 UNRELATED = 0.1
 """Probability that a tank's readings do not depend on its flows: swapped channels, a stuck sensor."""
 
 
 @dataclass(frozen=True)
-class Volumes:
-    """Volumes (intervals, tanks), m^3, per tank: stored, entered by metered flows, and by laws. NaN where unknown."""
+class TankBalance:
+    """How the level of a tank changes, by its sensor and by its flows: GROUPS SUMS sums of equally many successive
+    intervals in which all are known, m.
 
-    stored: Tensor
+    measured: (GROUPS, SUMS), exact to `digits`, m. by_flow: (GROUPS, SUMS, F). metered: which of the F flows are (F,).
+    intervals: in each sum; none if too few are known.
+    """
+
+    measured: Tensor
+    digits: float
+    by_flow: Tensor
     metered: Tensor
-    by_laws: Tensor
+    intervals: int
+
+    def scaled(self, metered: float, by_laws: float) -> TankBalance:
+        """The same with other numbers for metered flows and for flows by laws."""
+        return replace(self, by_flow=self.by_flow * torch.where(self.metered, metered, by_laws))
+
+    def log_evidence(self, rounding: float) -> float:
+        """Log likelihood of the measured changes, up to a constant that all corrections share; NaN without intervals.
+
+        rounding: least uncertainty of the flows in a sum, m.
+
+        The variance of the sums is unknown; with GROUPS independent ones, the best fit of mean square s^2 has the
+        likelihood s^-GROUPS. The prior of b is the multivariate Cauchy distribution of centre 1 and scale SCALE, a
+        mixture of normal ones of variance v; the readings are UNRELATED if b = 0. With b in the directions of the
+        eigenvectors of its information, whose eigenvalues are l, each normal one gives
+
+            -2 log L = sum(log(1 + v l) + l (b - 1)^2 / (1 + v l)),
+
+        where a direction that the recording does not determine, l = 0, counts nothing.
+        """
+        if not self.intervals:
+            return math.nan
+        information, directions, off, left = _regression(self.by_flow, self.measured - self.by_flow.sum(-1), rounding)
+        if not len(information):
+            return math.nan
+        variance = SCALE**2 * torch.logspace(-2, 16, 73).to(off)
+        share = torch.log_softmax(-0.5 * (variance.log() + SCALE**2 / variance), dim=0)
+        wider = 1.0 + variance[:, None] * information
+        squares = information * (off @ directions).square()
+        related = torch.logsumexp(share - 0.5 * (wider.log() + squares / wider).sum(-1), dim=0)
+        unrelated = -0.5 * (information * ((1.0 + off) @ directions).square()).sum()
+        either = torch.logaddexp(related + math.log1p(-UNRELATED), unrelated + math.log(UNRELATED))
+        return float(either - 0.5 * GROUPS * (left + self.digits**2).log())
+
+
+@dataclass(frozen=True)
+class Balance:
+    """The balance of each tank."""
+
+    tanks: tuple[TankBalance, ...]
+
+    def scaled(self, metered: Tensor, by_laws: Tensor) -> Balance:
+        """The same with other numbers for metered flows and for flows by laws, of each tank (tanks)."""
+        factors = zip(self.tanks, metered.tolist(), by_laws.tolist(), strict=True)
+        return Balance(tuple(tank.scaled(*each) for tank, *each in factors))
+
+    @property
+    def is_metered(self) -> bool:
+        """Whether there is any metered flow."""
+        return any(bool((tank.by_flow[..., tank.metered] != 0.0).any()) for tank in self.tanks)
 
     def log_evidence(self) -> Tensor:
         """Log likelihood of the readings of each tank (tanks), up to a constant that all corrections share.
 
-        NaN for a tank with too few intervals whose volume balance is known.
+        NaN for a tank without known sums.
         """
-        terms = torch.stack([self.stored, self.metered, self.by_laws], dim=-1)
-        rounding = math.sqrt(torch.finfo(terms.dtype).eps) * float(terms.nan_to_num().abs().max())
-        return torch.tensor([_log_evidence(tank, rounding) for tank in terms.unbind(1)])
+        known = [tank for tank in self.tanks if tank.intervals]
+        largest = max((float(tank.by_flow.abs().max()) / tank.intervals for tank in known), default=0.0)
+        return torch.tensor([tank.log_evidence(HALF_OF_DIGITS * largest) for tank in self.tanks])
 
 
-def volumes_along(plant: PlantDescription, recording: Recording) -> Volumes:
-    """The volumes between samples of a recording whose inputs are known, thinned to about SAMPLES.
+def balance_along(plant: PlantDescription, recording: Recording, unit: float = 1.0) -> Balance:
+    """The balance between samples of a recording whose inputs are known, thinned to about SAMPLES.
 
-    Metered flows are not limited here, since they are proportional to a wrong unit only below their greatest flow.
+    unit: of the level changes, m. Metered flows are not limited here, since they are proportional to a wrong unit only
+    below their greatest flow.
     """
     recording = recording.every(math.ceil(len(recording) / SAMPLES))
     network = build_network(plant)
     limits = ParameterSpace([network.constants[f"{component.name}.max_flow"] for component in plant.metered_flows()])
     values = network.bind(limits, torch.full_like(limits.nominal(), math.inf))
     levels = _levels(network, recording, values)
-    middle = [0.5 * (level[1:] + level[:-1]) for level in levels]
     inputs = (
         recording.inputs if recording.hold == "zero_order" else 0.5 * (recording.inputs[1:] + recording.inputs[:-1])
     )
@@ -194,18 +254,25 @@ def volumes_along(plant: PlantDescription, recording: Recording) -> Volumes:
     instant = recording.time.new_tensor(INSTANT)
     clock = Clock(recording.time[:-1], instant, instant)
     commands, _ = network.commands(channels, network.steady_command_memory(channels, clock, values), clock, values)
+    middle = [0.5 * (level[1:] + level[:-1]) for level in levels]
     point = network.operating_point(middle, commands, clock, values)
     flows = network.flows(point)
-    last, net = network.last_flows(point, network.net_inflows(point, flows))
-    metered = [torch.zeros_like(level) for level in middle]
-    for component in plant.flow_components():
-        if isinstance(component, MeteredFlow):
-            network.transfer(metered, component.source, component.target, (flows | last)[component.name])
-    areas = [1.0 / rate for rate in network.level_rates(point, [torch.ones_like(level) for level in middle])]
-    stored = [area * torch.diff(level) for area, level in zip(areas, levels, strict=True)]
-    interval = torch.diff(recording.time)
-    entered = [[interval * q for q in each] for each in (metered, (t - q for t, q in zip(net, metered, strict=True)))]
-    return Volumes(*(torch.stack(volumes, dim=-1) for volumes in (stored, *entered)))
+    at_last, net = network.last_flows(point, network.net_inflows(point, flows))
+    flows = flows | at_last
+    per_volume = network.level_rates(point, [torch.ones_like(level) for level in middle])
+    interval, balances = torch.diff(recording.time), []
+    for tank, level, total, per_area in zip(plant.tanks, levels, net, per_volume, strict=True):
+        own = [component for component in plant.flow_components() if tank.name in (component.source, component.target)]
+        entering = [flows[each.name] if each.target == tank.name else -flows[each.name] for each in own]
+        entering.append(total - sum(entering))  # by effects
+        metered = torch.tensor([*(isinstance(component, MeteredFlow) for component in own), False])
+        changes = torch.stack([torch.diff(level), *(interval * per_area * flow for flow in entering)], dim=-1) / unit
+        changes = changes[torch.isfinite(changes).all(dim=-1)]
+        intervals = len(changes) // (GROUPS * SUMS)
+        sums = changes[: GROUPS * SUMS * intervals].reshape(GROUPS, SUMS, intervals, 2 + len(own)).sum(dim=2)
+        digits = HALF_OF_DIGITS * float(level.nan_to_num().abs().max()) / unit
+        balances.append(TankBalance(sums[..., 0], digits, sums[..., 1:], metered, intervals))
+    return Balance(tuple(balances))
 
 
 def _levels(network: TankNetwork, recording: Recording, values: PlaceValues) -> list[Tensor]:
@@ -220,61 +287,30 @@ def _levels(network: TankNetwork, recording: Recording, values: PlaceValues) -> 
     return list(levels.values())
 
 
-def _log_evidence(terms: Tensor, rounding: float) -> float:
-    """Log likelihood of the stored volumes of a tank, given its `terms` (intervals, 3): stored, metered, by laws.
+def _regression(flows: Tensor, excess: Tensor, rounding: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Eigenvalues (D,) and eigenvectors (F, D) of the information of b, b - 1 (F,) and the mean square that is left.
 
-    rounding: half of the digits of the largest volume of all tanks, m^3.
-
-    The prior of b is the multivariate Cauchy distribution of centre 1 and scale SCALE, a mixture of normal ones of
-    variance v; the tank is UNRELATED if b = 0. With b in the directions of the eigenvectors of its information, whose
-    eigenvalues are l, each normal one gives
-
-        -2 log L = sum(log(1 + v l) + l (b - 1)^2 / (1 + v l)),
-
-    where a direction that the recording does not determine, l = 0, counts nothing.
+    flows (GROUPS, SUMS, F), excess (GROUPS, SUMS): m. In steady state without noise, the sums differ by rounding only,
+    and their scatter does not measure their errors; each counts as uncertain by `rounding`, m, at least. Which D
+    directions the readings determine is asked of flows scaled to their root mean square, so that the answer does not
+    depend on units.
     """
-    terms = terms[torch.isfinite(terms).all(dim=-1)]
-    length = len(terms) // (GROUPS * SUMS)
-    if not length:
-        return math.nan
-    sums = terms[: GROUPS * SUMS * length].reshape(GROUPS, SUMS, length, 3).sum(dim=2)
-    information, directions, off = _regression(sums, rounding)
-    if not bool((information > 0.0).any()):
-        return math.nan
-    variance = SCALE**2 * torch.logspace(-2, 16, 73).to(off)
-    share = torch.log_softmax(-0.5 * (variance.log() + SCALE**2 / variance), dim=0)
-    wider = 1.0 + variance[:, None] * information
-    squares = information * (off @ directions).square()
-    related = torch.logsumexp(share - 0.5 * (wider.log() + squares / wider).sum(-1), dim=0)
-    unrelated = -0.5 * (information * ((1.0 + off) @ directions).square()).sum()
-    return float(torch.logaddexp(related + math.log1p(-UNRELATED), unrelated + math.log(UNRELATED)))
-
-
-def _regression(sums: Tensor, rounding: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Eigenvalues (2) and eigenvectors (2, 2) of the information of b, and b - 1 (2), by sums (GROUPS, SUMS, 3).
-
-    In steady state without noise, the sums differ by rounding only, and their scatter does not measure their errors;
-    each counts as uncertain by `rounding`, m^3, at least. Whether a direction is determined is asked of flows scaled to
-    their root mean square, so that the answer does not depend on units; the smaller eigenvalue is then the determinant
-    divided by the larger one.
-    """
-    flows, excess = sums[..., 1:], sums[..., 0] - sums[..., 1] - sums[..., 2]
     rms = flows.square().mean(dim=(0, 1)).sqrt()
-    size = torch.where(rms > 0.0, rms, 1.0)
+    flowing = rms > HALF_OF_DIGITS * rms.max()
+    size, count = torch.where(flowing, rms, torch.inf), int(flowing.sum())
     scaled = flows / size
     product = torch.einsum("gni,gnj->ij", scaled, scaled)
     off = _inverse(product) @ torch.einsum("gni,gn->i", scaled, excess)
-    scores = torch.einsum("gni,gn->gi", scaled, excess - scaled @ off)
-    variance = scores.T @ scores * GROUPS / (GROUPS - 2) + rounding**2 * product
-    information = product @ _inverse(variance) @ product
-    smaller, larger = torch.linalg.eigvalsh(information)
-    eigenvalues, eigenvectors = torch.linalg.eigh(size[:, None] * information * size)
-    determinant = smaller * larger * size.square().prod()
-    both = smaller > 2.0 * torch.finfo(sums.dtype).eps * larger
-    least = torch.where(both, determinant / eigenvalues[1], 0.0)
-    return torch.stack([least, eigenvalues[1]]), eigenvectors, off / size
+    left = excess - scaled @ off
+    scores = torch.einsum("gni,gn->gi", scaled, left)
+    variance = scores.T @ scores * GROUPS / max(GROUPS - count, 1) + rounding**2 * product
+    variances, axes = torch.linalg.eigh(variance)
+    known = variances > HALF_OF_DIGITS * variances[-1]
+    root = product @ axes[:, known] / variances[known].sqrt()
+    directions, lengths, _ = torch.linalg.svd(torch.where(flowing, size, 0.0)[:, None] * root, full_matrices=False)
+    return lengths.square(), directions, off / size, left.square().mean()
 
 
 def _inverse(matrix: Tensor) -> Tensor:
     """Pseudoinverse of a symmetric matrix; directions below half of the digits count as zero."""
-    return torch.linalg.pinv(matrix, hermitian=True, rtol=math.sqrt(torch.finfo(matrix.dtype).eps))
+    return torch.linalg.pinv(matrix, hermitian=True, rtol=HALF_OF_DIGITS)
