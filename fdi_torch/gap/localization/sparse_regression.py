@@ -23,6 +23,9 @@ from torch import Tensor
 
 VISIBLE = 1e-6  # chi-square units; columns with less influence are ignored
 COLLINEAR = 1e-9  # share of a column that the columns in use leave over; with less, it cannot be added
+# Least precision of the coefficient of a column of unit norm, above the rounding errors of the Gram matrix: columns that
+# depend on each other would otherwise have no Cholesky factor.
+LEAST_PRECISION = 1e-12
 CONVERGED = 1e-2  # nats
 MOST_CHANGES = 500  # a guard against cycles by rounding
 WIDEST = 30.0  # e-folds below the largest strength, within which the precision of several columns is searched
@@ -111,16 +114,9 @@ class _Problem:
         precision = torch.full_like(self.target, math.inf)
         if start is not None:
             known = slice(len(start))
-            precision[known] = torch.where(self.visible[known], start / self.size[known].square(), math.inf)
-        while (dependent := self._first_dependent(precision)) is not None:
-            precision[self.regressor == self.regressor[dependent]] = math.inf
+            scaled = (start / self.size[known].square()).clamp(min=LEAST_PRECISION)
+            precision[known] = torch.where(self.visible[known], scaled, math.inf)
         return precision
-
-    def _first_dependent(self, precision: Tensor) -> int | None:
-        """The first column in use that is, up to rounding, a linear combination of those before it; None if none is."""
-        used = torch.isfinite(precision).nonzero().flatten()
-        _, order = torch.linalg.cholesky_ex(self.unit[used][:, used] + torch.diag(precision[used]))
-        return int(used[int(order) - 1]) if int(order) else None
 
     def posterior(self, precision: Tensor) -> _Posterior:
         return _Posterior.of(self.unit, self.target, precision)
@@ -163,23 +159,24 @@ class _Problem:
     def _best_of_single(self, precision: Tensor, among: Tensor | None = None) -> _Change:
         """The best change of the precision of one column, its regressor. among (M,) bool: the columns considered.
 
-        Equations 16 to 33 of the paper; `sparsity` is S, `quality` is Q.
+        Equations 16 to 33 of the paper; `sparsity` is S, `quality` is Q. For a column in use, they follow from the mean
+        and the variance of its coefficient without the difference of two nearly equal numbers.
         """
         posterior, used = self.posterior(precision), torch.isfinite(precision)
-        sparsity, quality = posterior.sparsity, self.target - self.unit @ posterior.mean
-        now = torch.where(used, precision, 1.0)
+        mean, now, variance = posterior.mean, torch.where(used, precision, 1.0), posterior.variance
+        sparsity = torch.where(used, now * (1.0 - now * variance), posterior.sparsity)
+        quality = torch.where(used, now * mean, self.target - self.unit @ mean)
         # s and q: what S and Q would be without the column itself.
-        factor = torch.where(used, now / (now - sparsity), 1.0)
-        s, q = factor * sparsity, factor * quality
+        s = torch.where(used, 1.0 / variance - now, sparsity)
+        q = torch.where(used, mean / variance, quality)
         excess = q * q - s
-        likeliest = torch.where(excess > 0.0, s * s / excess.clamp(min=1e-300), math.inf)
+        likeliest = torch.where(excess > 0.0, (s * s / excess.clamp(min=1e-300)).clamp(min=LEAST_PRECISION), math.inf)
         ratio = (quality * quality / sparsity.clamp(min=1e-300)).clamp(min=1e-300)
         added = 0.5 * (ratio - 1.0 - torch.log(ratio)) - self.costs
         change = torch.where(excess > 0.0, 1.0 / likeliest, 0.0) - 1.0 / now
         left = (1.0 + sparsity * change).clamp(min=1e-300)
         estimated = 0.5 * (quality * quality * change / left - torch.log(left))
-        share = (1.0 - sparsity / now).clamp(min=1e-300)
-        removed = 0.5 * (quality * quality / (sparsity - now) - torch.log(share)) + self.costs
+        removed = self.costs - 0.5 * (mean * mean / variance + torch.log(now * variance))
         may_be_added = ~used & (excess > 0.0) & (sparsity > COLLINEAR)
         keep = used & (excess > 0.0) & (estimated >= removed)
         gain = torch.where(used, torch.where(keep, estimated, removed), torch.where(may_be_added, added, -math.inf))
@@ -208,9 +205,10 @@ class _Problem:
             a = torch.exp(log_precision).unsqueeze(1)
             return 0.5 * (q * q / (a + s) - torch.log1p(s / a)).sum(dim=1) - self.costs[columns[0]]
 
+        least = torch.log(LEAST_PRECISION * size.square().max())
         center, width = torch.log(s[-1].clamp(min=VISIBLE)) - 0.5 * WIDEST, 0.5 * WIDEST
         for count in (61, 51):
-            tried = center + width * torch.linspace(-1.0, 1.0, count, dtype=s.dtype)
+            tried = (center + width * torch.linspace(-1.0, 1.0, count, dtype=s.dtype)).clamp(min=least)
             gains = gained(tried)
             center, width = tried[gains.argmax()], 2.0 * width / (count - 1)
         now = self.size[columns[0]].square() * precision[columns[0]]
@@ -234,10 +232,12 @@ class _Change:
 
 @dataclass(frozen=True)
 class _Posterior:
-    """mean (M,): zero for columns that are not used. root (U, U): L of the curvature L L' of the U columns in use.
-    explained (U, M): L^-1 C_u'C_j of each column. sparsity (M,): C_j' (I - C S C') C_j."""
+    """mean, variance (M,): of the coefficients, 0 and 1 for columns that are not used. root (U, U): L of the curvature
+    L L' of the U columns in use. explained (U, M): L^-1 C_u'C_j of each column. sparsity (M,): C_j' (I - C S C') C_j.
+    """
 
     mean: Tensor
+    variance: Tensor
     root: Tensor
     explained: Tensor
     sparsity: Tensor
@@ -248,15 +248,17 @@ class _Posterior:
 
     def parameters(self, precision: Tensor) -> float:
         """Effective number of coefficients, the sum of 1 - a S_jj (MacKay, 1992)."""
-        inverse = torch.linalg.solve_triangular(self.root, torch.eye(len(self.root)).to(self.root), upper=False)
-        return len(self.root) - float(precision[torch.isfinite(precision)] @ inverse.square().sum(dim=0))
+        used = torch.isfinite(precision)
+        return len(self.root) - float(precision[used] @ self.variance[used])
 
     @staticmethod
     def of(unit: Tensor, target: Tensor, precision: Tensor) -> _Posterior:
         used = torch.isfinite(precision).nonzero().flatten()
         root = torch.linalg.cholesky(unit[used][:, used] + torch.diag(precision[used]))
-        mean = torch.zeros_like(target)
+        mean, variance = torch.zeros_like(target), torch.ones_like(target)
         mean[used] = torch.cholesky_solve(target[used].unsqueeze(1), root).squeeze(1)
+        inverse = torch.linalg.solve_triangular(root, torch.eye(len(root)).to(root), upper=False)
+        variance[used] = inverse.square().sum(dim=0)
         explained = torch.linalg.solve_triangular(root, unit[used], upper=False)
         sparsity = (torch.diagonal(unit) - explained.square().sum(dim=0)).clamp(min=0.0)
-        return _Posterior(mean, root, explained, sparsity)
+        return _Posterior(mean, variance, root, explained, sparsity)
