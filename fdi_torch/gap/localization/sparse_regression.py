@@ -23,8 +23,8 @@ from torch import Tensor
 
 VISIBLE = 1e-6  # chi-square units; columns with less influence are ignored
 COLLINEAR = 1e-9  # share of a column that the columns in use leave over; with less, it cannot be added
-# Least precision of the coefficient of a column of unit norm, above the rounding errors of the Gram matrix: columns that
-# depend on each other would otherwise have no Cholesky factor.
+# Least precision of the coefficient of a column of unit norm, above the rounding errors of the Gram matrix: without it,
+# columns that depend on each other have no Cholesky factor.
 LEAST_PRECISION = 1e-12
 CONVERGED = 1e-2  # nats
 MOST_CHANGES = 500  # a guard against cycles by rounding
