@@ -63,6 +63,8 @@ def test_regressors_with_memory_follow_their_equations() -> None:
         [0.0, 0.0, 1.0, 1.0, 1.0],
         [0.0, 0.25, 1.75, 1.75, 0.25],
     ]
+    at_ends = backlash(torch.tensor([0.0, 0.5, 2.0, 1.5, 0.0]), torch.ones(2, 1), torch.tensor([[-1.0], [1.0]]))
+    assert at_ends.tolist() == [[-1.0, -0.5, 1.0, 1.0, 1.0], [1.0, 1.0, 1.0, 1.0, 1.0]]
     assert delayed(torch.tensor([1.0, 3.0, 5.0, 9.0]), step.float(), 3.0).tolist() == [1.0, 1.0, 2.0, 4.0]
     rates = torch.tensor([[1.0], [2.0]], dtype=torch.float64)
     assert rate_limited(torch.tensor([0.0, 5.0, 5.0, 1.0]), step, rates).tolist() == [
@@ -265,6 +267,16 @@ def test_a_stiction_with_a_band_between_those_of_the_grid_is_one_regressor(
     found = localize(fitter, fit, noise, ("Q1", "T1", "P13")).discrepancies
     assert found[0].location == "Q1" and found[0].parameters < 1.0
     assert found[0].gain > found[1].gain + 50.0
+
+
+@pytest.mark.parametrize("start", [-1.0, 1.0])
+def test_a_pump_that_starts_at_an_end_of_its_play_is_one_regressor(start: float) -> None:
+    """What moved before the recording began rests there."""
+    command = torch.cat([torch.full((200,), 45e-6, dtype=torch.float64), random_steps(15e-6, 75e-6, 25, 80, 3)])
+    band = 0.16 * (command.max() - command.min()).reshape(1, 1)
+    fitter, fit, noise = delivering(command, backlash(command, band, start)[0], 3)
+    found = localize(fitter, fit, noise, ("Q1", "T1", "P13")).discrepancies
+    assert found[0].location == "Q1" and found[0].parameters < 1.0
 
 
 def test_a_valve_that_sticks_is_found_at_its_pipe() -> None:

@@ -17,6 +17,7 @@ from fdi_torch.gap.forcing import Forcing
 from fdi_torch.gap.localization.regressor_families import Breakpoints, Curves, Pulses, Relays
 from fdi_torch.gap.localization.regressors import (
     BACKLASH_BANDS,
+    BACKLASH_STARTS,
     FINE_STICTION_BANDS,
     LAGS,
     RAMPS,
@@ -87,7 +88,8 @@ class SignalRanges:
         return Relays(s[name], one, relay_thresholds(self(name), FINER_RELAYS * RELAYS))
 
     def fine_backlashes(self, s: Signals, name: str) -> Curves:
-        return Curves(torch.stack(backlashes(s[name], self(name), finer(BACKLASH_BANDS, FINER))))
+        bands = finer(BACKLASH_BANDS, FINER)
+        return Curves(torch.stack(backlashes(s[name], self(name), bands, BACKLASH_STARTS)))
 
 
 # Local signals (K,), step lengths (K,) s -> regressors (K,), or of several coefficients with one variance (N, K)

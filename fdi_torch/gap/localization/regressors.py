@@ -26,6 +26,7 @@ LAGS = (3.0, 10.0, 30.0, 100.0, 300.0)  # time constants, s
 DELAYS = (4.0, 8.0, 16.0, 32.0)  # s; neighbours together make a delay between them
 DECAY_TIMES = (10.0, 40.0, 160.0)  # s, of the decay after a step up or down
 BACKLASH_BANDS = (0.03, 0.08, 0.16, 0.3)  # backlash, as shares of the signal's range
+BACKLASH_STARTS = (-1.0, 0.0, 1.0)  # what moved before the recording rests at an end of its band
 STICTION_BANDS = (0.1, 0.2, 0.3, 0.4)  # as shares of the signal's range
 FINE_STICTION_BANDS = tuple(0.005 * j for j in range(2, 101))  # the output is no continuous function of the band
 TRAVEL_TIMES = (8.0, 20.0, 40.0, 80.0, 160.0, 320.0)  # s, through the full range at the rate limit
@@ -68,10 +69,15 @@ def finer(values: Sequence[float], factor: int) -> list[float]:
     return [*between, values[-1]]
 
 
-def backlashes(x: Tensor, ends: tuple[float, float], bands: Sequence[float] = BACKLASH_BANDS) -> list[Tensor]:
-    """Difference between x after a backlash and x, for each band."""
-    band = x.new_tensor(bands).unsqueeze(1) * (ends[1] - ends[0])
-    return list((backlash(x, band) - x).unbind())
+def backlashes(
+    x: Tensor,
+    ends: tuple[float, float],
+    bands: Sequence[float] = BACKLASH_BANDS,
+    starts: Sequence[float] = (0.0,),
+) -> list[Tensor]:
+    """Difference between x after a backlash and x, for each band and start."""
+    band, start = torch.cartesian_prod(x.new_tensor(bands), x.new_tensor(starts)).split(1, dim=1)
+    return list((backlash(x, band * (ends[1] - ends[0]), start) - x).unbind())
 
 
 def rate_limits(
@@ -137,11 +143,11 @@ def decayed(x: Tensor, step: Tensor, tau: float) -> Tensor:
     return _scanned(torch.exp(-step / tau), x, torch.zeros_like(x[0]))
 
 
-def backlash(x: Tensor, band: Tensor) -> Tensor:
+def backlash(x: Tensor, band: Tensor, start: Tensor | float = 0.0) -> Tensor:
     """Play operator: the output (B, K) follows x (K,) when x is more than the band (B, 1) away.
 
-    Each step clamps the output to [x - band, x + band]. The composition of clamps is a clamp, so that all steps are
-    composed in log2(K) rounds.
+    start (B, 1): distance of the output from x before the first step, in bands. Each step clamps the output to
+    [x - band, x + band]. The composition of clamps is a clamp, so that all steps are composed in log2(K) rounds.
     """
     low, high = x - band, x + band
     reach = 1
@@ -152,7 +158,7 @@ def backlash(x: Tensor, band: Tensor) -> Tensor:
             for y in (low, high)
         )
         reach *= 2
-    return torch.minimum(torch.maximum(x[0], low), high)
+    return torch.minimum(torch.maximum(x[0] + start * band, low), high)
 
 
 def stiction(x: Tensor, band: Tensor) -> Tensor:
