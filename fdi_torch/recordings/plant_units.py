@@ -152,11 +152,12 @@ GROUPS, SUMS = 16, 4
 """Groups of each tank's balance, and sums of successive intervals in each group."""
 DEVIATION = 0.07
 """How far an inexact constant, an unmodelled effect or a fault usually moves a coefficient from 1: less than this in
-three of four of the 1567 coefficients of 186 practice recordings that are determined to 0.1."""
+three of four of the 1583 coefficients of 186 practice recordings that are determined to 0.1."""
 SCALE = DEVIATION / math.tan(0.375 * math.pi)
 """Scale of the Cauchy distribution that has three quarters within DEVIATION. It has half within 0.03, 90 % within 0.18
-and 95 % within 0.37; of these coefficients it is 0.03, 0.20 and 0.43."""
+and 95 % within 0.37; of these coefficients it is 0.03, 0.21 and 0.45."""
 HALF_OF_DIGITS = math.sqrt(torch.finfo(torch.float64).eps)
+"""Share of a number below which what is left of a sum counts as rounding."""
 UNRELATED = 0.1
 """Probability that a tank's readings do not depend on its flows: swapped channels, a stuck sensor."""
 
