@@ -17,7 +17,8 @@ from fdi_torch.cli import MISUSE, NOT_EXPLAINED, main
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_in
-from fdi_torch.recordings.plant_units import balance_along, wrong_units
+from fdi_torch.recordings.plant_units import wrong_units
+from fdi_torch.recordings.volume_balance import balance_along
 
 PLANT = """
 tanks:
@@ -135,6 +136,16 @@ def test_a_recording_without_metered_flows_or_too_short_says_nothing(folder: Pat
     unmetered = replace(run, inputs=0.0 * run.inputs)
     assert wrong_units(large, unmetered) == ""
     assert wrong_units(large, replace(unmetered, outputs=0.0 * run.outputs)) == ""
+
+
+def test_a_sensor_that_shows_zero_throughout_is_no_wrong_unit(folder: Path) -> None:
+    """No flow fits a level that never changes, and its rounding says nothing of a unit."""
+    plant = load_plant(folder / "rig.yaml")
+    run = recorded(plant, {})
+    for column in range(2):
+        outputs = run.outputs.clone()
+        outputs[:, column] = 0.0
+        assert wrong_units(plant, replace(run, outputs=outputs)) == ""
 
 
 def test_flows_that_no_recording_can_tell_apart_are_no_wrong_unit(folder: Path) -> None:

@@ -2,7 +2,7 @@
 
 Path: cli.check.run → config.plant_file.chosen_plant → jobs.recording_check.checked →
 config.loaded_recordings.read_recording → recordings.check.check_recording → gap.preprocess.acquisition.examined →
-recordings.plant_units.wrong_units → recordings.plant_units.balance_along
+recordings.plant_units.wrong_units → recordings.volume_balance.balance_along
 """
 
 from __future__ import annotations
