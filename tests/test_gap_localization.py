@@ -12,6 +12,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
+from fdi_torch.config.plant_file import build_plant
 from fdi_torch.effects import effect
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.estimate.linear_parameters import without
@@ -22,6 +23,7 @@ from fdi_torch.gap.localization.discrepancy_ascent import Ascent
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.fine_positions import Positions
 from fdi_torch.gap.localization.localize import localize
+from fdi_torch.gap.localization.predicted_levels import LevelFilter
 from fdi_torch.gap.localization.regressor_families import Relays
 from fdi_torch.gap.localization.regressors import (
     backlash,
@@ -300,6 +302,33 @@ def test_a_pump_that_stalls_below_a_command_is_one_regressor() -> None:
     assert found[0].gain > found[1].gain + 5.0
 
 
+def test_a_law_that_empties_a_tank_of_the_model_is_found_about_the_measured_levels() -> None:
+    """Random flows move no level of an empty tank, so that the noise of its sensor would have to explain the law."""
+    pipe = {"area": "0.4 cm^2", "discharge_coefficient": 0.6}
+    parts = {
+        "tanks": {name: {"area": "150 cm^2", "height": "1 m"} for name in ("well", "basin", "sump")},
+        "pumps": {"feed": {"target": "well", "max_flow": "60 cm^3/s"}},
+        "transfers": {"lift": {"source": "well", "target": "basin", "max_flow": "90 cm^3/s"}},
+        "pipes": {
+            "P13": {"source": "basin", "target": "sump", **pipe},
+            "out": {"source": "sump", "target": "outside", **pipe},
+        },
+        "sensors": {f"h_{name}": {"tank": name} for name in ("well", "basin", "sump")},
+        "tolerances": {"*.discharge_coefficient": "5 %"},
+    }
+    feed, level, runs, running = random_steps(25e-6, 45e-6, 30, 50, 1), 0.35, [], False
+    for flow in feed.tolist():
+        running = level > 0.2 and (running or level > 0.5)
+        runs.append(float(running))
+        level += (flow - 66e-6 * runs[-1]) / 150e-4
+    pumped = torch.tensor(runs, dtype=torch.float64)
+    inputs, actual = (torch.stack([feed, flow * pumped], dim=1) for flow in (80e-6, 66e-6))
+    fitter, fit, noise = commanded(build_plant({"name": "lift", **parts}, "rig.yaml"), inputs, actual, 1)
+    assert float(fit.linearised.readings[0, :, 0].min()) < 1e-3
+    found = localize(fitter, fit, noise, ("lift", "well", "h_well")).discrepancies
+    assert found[0].location == "lift" and found[0].gain > found[1].gain + 100.0
+
+
 def test_a_law_with_many_changes_is_found_although_random_flows_explain_each_of_them() -> None:
     """A pump that delivers less now and then, at random."""
     generator = torch.Generator().manual_seed(5)
@@ -307,7 +336,7 @@ def test_a_law_with_many_changes_is_found_although_random_flows_explain_each_of_
     less = torch.rand(20, generator=generator, dtype=torch.float64).repeat_interleave(125) < 0.5
     fitter, fit, noise = delivering(command, command * torch.where(less, 0.8, 1.0), 5)
     regression = DiscrepancyRegression(fitter, fit, (), 120)
-    ascent = Ascent(fitter, fit, noise, 0.0)
+    ascent = Ascent(fitter, LevelFilter(noise), 0.0)
     under_all = ascent.with_finer_positions(ascent.evaluate(regression, regression.of("Q1"), "Q1", noise))
     assert ascent.under_less_and_less_noise(regression, "Q1", noise).gain > under_all.gain + 100.0
     found = localize(fitter, fit, noise, ("Q1", "T1", "P13")).discrepancies
@@ -319,7 +348,7 @@ def test_the_regressors_of_a_selection_are_the_same_about_the_same_levels(
 ) -> None:
     fitter, fit, noise = sticking
     regression = DiscrepancyRegression(fitter, fit, (), 20)
-    found = Ascent(fitter, fit, noise, 0.0).under_less_and_less_noise(regression, "Q1", noise)
+    found = Ascent(fitter, LevelFilter(noise), 0.0).under_less_and_less_noise(regression, "Q1", noise)
     used, selection = found.regressed.used, found.selection
     assert len(selection.positions) > 0
     again = regression.of("Q1", selection.positions)

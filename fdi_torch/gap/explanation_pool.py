@@ -254,7 +254,7 @@ class ExplanationPool:
         """Remove each effect of the best explanation and try others in its place, while that improves it."""
         while True:
             best = max(self.explanations.values(), key=lambda e: e.log_evidence)
-            for cause in best.key:
+            for cause in sorted(best.key):
                 known = self.explanations.get(best.key - {cause})
                 reduced = self.without(best, cause)
                 if reduced is not known and options:

@@ -90,7 +90,7 @@ class HypothesisWeights:
             return math.inf
         difference = unknown.predicted - fit.linearised.readings[0]
         size = unexplained_norm(fitter, fit.space, fit.theta, fit.linearised.jacobian[0], difference)
-        return relative_size(fitter, fit, size, [c for c in named.key if c[1] == unknown.location])
+        return relative_size(fitter, fit, size, [c for c in sorted(named.key) if c[1] == unknown.location])
 
     def _log_likelihood(self, explanation: RankedExplanation) -> float:
         fitter, fit = explanation.fitter, explanation.fit

@@ -28,7 +28,6 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
 from fdi_torch.simulate.linearised import Linearised
-from fdi_torch.simulate.resampling import interpolate
 
 
 @dataclass(frozen=True)
@@ -86,40 +85,21 @@ def estimate_disturbances(
     return estimate_state_noise(propagation, sensors, residual, jacobian, weight, deviation, unit, start, climb)
 
 
-def predicted_levels(fitter: Fitter, fit: Fit) -> Tensor:
-    """States (1, K+1, n) of all recordings: the fitted trajectory plus the effect of the disturbances, predicted
-    from earlier readings.
-
-    An innovation is independent of all that follows from earlier readings (Ljung, 1999, "System identification",
-    section 3.2). Smoothed levels contain the disturbance of the same step; functions of them, in particular of their
-    rates, would explain random flows.
-    """
-    data, levels = fitter.data, fit.linearised.levels.clone()
-    whitening = fitter.whitening
-    if whitening is None:
-        return levels
-    correction = whitening.predicted(data.readings - fit.linearised.readings[0])
-    first = 0
-    for part, rows in zip(data.parts, data.rows, strict=True):
-        nodes = part.experiment.nodes
-        at_nodes = [interpolate(nodes, part.experiment.sample_times, x) for x in correction[rows].unbind(1)]
-        levels[0, first : first + len(nodes)] += torch.stack(at_nodes, dim=1)
-        first += len(nodes)
-    tanks = len(data.plant.tanks)
-    return torch.cat([levels[..., :tanks].clamp(min=0.0), levels[..., tanks:]], dim=-1)
-
-
 def propagation_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> Propagation:
     """Propagation of flow disturbances to the readings along a trajectory, for all recordings in sequence."""
     data = fitter.data
-    joint = fitter.engine(fit.candidate, list(fit.effect_values))
-    theta = fit.theta.unsqueeze(0)
-    pieces = joint.apart(theta, linearised) if isinstance(joint, JointCollocation) else [(joint, theta, linearised)]
+    pieces = pieces_of(fitter, fit, linearised)
     matrices = [_between_samples(engine, theta, piece, _areas(fitter)) for engine, theta, piece in pieces]
     transition, forcing, output = (with_blanks(each, dim=0) for each in zip(*matrices, strict=True))
     starts = torch.zeros(len(data.mask), dtype=torch.bool)
     starts[[rows.start for rows in data.rows]] = True
     return Propagation(transition, forcing, output, data.row_spacing, starts, data.mask)
+
+
+def pieces_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:
+    """For each recording, its collocation, its parameters (1, P) and its part of a trajectory."""
+    joint, theta = fitter.engine(fit.candidate, list(fit.effect_values)), fit.theta.unsqueeze(0)
+    return joint.apart(theta, linearised) if isinstance(joint, JointCollocation) else [(joint, theta, linearised)]
 
 
 def _between_samples(engine: Collocation, theta: Tensor, linearised: Linearised, areas: Tensor) -> Sequence[Tensor]:

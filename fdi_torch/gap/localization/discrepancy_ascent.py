@@ -22,6 +22,7 @@ from fdi_torch.gap.localization.localized_discrepancy import (
     log_likelihood,
     unexplained_norm,
 )
+from fdi_torch.gap.localization.predicted_levels import LevelFilter
 from fdi_torch.gap.localization.single_regressor_gain import largest_influence
 from fdi_torch.gap.localization.sparse_regression import SparseFit, regressor_costs
 from fdi_torch.gap.localization.whitened_discrepancy import WhitenedDiscrepancy
@@ -103,6 +104,7 @@ class EvaluatedDiscrepancy:
             self.noise,
             self.estimate,
             self._quantities,
+            self.regression.level_filter,
         )
 
     @property
@@ -120,11 +122,12 @@ def gain_of(discrepancy: EvaluatedDiscrepancy | LocalizedDiscrepancy) -> float:
 class Ascent:
     """Maximises the evidence of a discrepancy beside a fit: over its noise, its regressors, and the fit's parameters.
 
-    fitter, noise: with the disturbance noise without the discrepancy. base: log evidence of the fit alone.
+    fitter: with the disturbance noise without the discrepancy. level_filter: predicts the levels. base: log evidence of
+    the fit alone.
     """
 
-    def __init__(self, fitter: Fitter, fit: Fit, noise: StateNoise, base: float) -> None:
-        self.fitter, self.fit, self.noise, self.base = fitter, fit, noise, base
+    def __init__(self, fitter: Fitter, level_filter: LevelFilter, base: float) -> None:
+        self.fitter, self.level_filter, self.base = fitter, level_filter, base
         self.largest, self.generator = largest_influence(fitter), torch.Generator().manual_seed(0)
 
     def evaluate(
@@ -168,8 +171,7 @@ class Ascent:
         data, right = self.fitter.data, Fitter(self.fitter.data, self.fitter.noise)
         if any(s.name == place for s in data.plant.sensors):
             right = Fitter(replace(data, readings=data.readings - explained), self.fitter.noise)
-        along = with_disturbances(right, fit, self.noise) if self.fitter.whitening else right
-        regression = DiscrepancyRegression(along, fit, selection.frequencies, STEPS)
+        regression = DiscrepancyRegression(right, fit, selection.frequencies, STEPS, self.level_filter)
         return self.evaluate(regression, regression.of(place, selection.positions), place, noise, selection.precision)
 
     def under_less_and_less_noise(

@@ -26,10 +26,10 @@ from fdi_torch.gap.localization.component_regressors import (
     reading_regressors,
 )
 from fdi_torch.gap.localization.discrepancy_columns import Columns, Discrepancy, Position
+from fdi_torch.gap.localization.predicted_levels import LevelFilter, predicted_levels
 from fdi_torch.gap.localization.recording_linearisation import RecordingLinearisation
 from fdi_torch.gap.localization.regressor_families import Breakpoints, Pulses, Relays
 from fdi_torch.gap.localization.regressors import harmonics, step_functions, time_functions
-from fdi_torch.gap.marginal_likelihood import predicted_levels
 from fdi_torch.plant.description import OUTSIDE, Sensor
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
@@ -89,13 +89,22 @@ class DiscrepancyRegression:
     """Influence of the discrepancies of all components of a data set, about one fit.
 
     frequencies: candidates for that of the sinusoids, Hz. steps: number of step functions of time, over all recordings.
+    level_filter: predicts the levels; by default that of the fitter, about the fit.
     """
 
-    def __init__(self, fitter: Fitter, fit: Fit, frequencies: Sequence[float], steps: int) -> None:
-        self.fitter, self.fit = fitter, fit
+    def __init__(
+        self,
+        fitter: Fitter,
+        fit: Fit,
+        frequencies: Sequence[float],
+        steps: int,
+        level_filter: LevelFilter | None = None,
+    ) -> None:
+        self.fitter, self.fit, self.level_filter = fitter, fit, level_filter
         self.frequencies = torch.tensor(frequencies, dtype=fit.theta.dtype)
         self.engine = fitter.engine(fit.candidate, list(fit.effect_values))
-        self.theta, self.levels = fit.theta.unsqueeze(0), predicted_levels(fitter, fit)
+        self.theta = fit.theta.unsqueeze(0)
+        self.levels = level_filter.levels(fitter, fit) if level_filter else predicted_levels(fitter, fit.linearised)
         self.linearised = self.engine.linearise(self.theta, self.levels)
         self.pieces = self._pieces(replace(self.linearised, levels=self.levels))
         self._last: tuple[str, list[Regressors], Linearised] | None = None

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 
 import torch
 
@@ -20,6 +21,7 @@ from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_ascent import STEPS, Ascent, gain_of
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
+from fdi_torch.gap.localization.fine_positions import CONVERGED
 from fdi_torch.gap.localization.localized_discrepancy import (
     LocalizedDiscrepancy,
     is_rounding_error,
@@ -27,6 +29,7 @@ from fdi_torch.gap.localization.localized_discrepancy import (
     log_likelihood,
     nearly_without_disturbances,
 )
+from fdi_torch.gap.localization.predicted_levels import LevelFilter, measured_filter
 from fdi_torch.gap.localization.random_processes import drifting_sensors, random_flows
 from fdi_torch.gap.localization.regressors import likely_frequencies, step_functions
 from fdi_torch.gap.localization.single_regressor_gain import SingleRegressorGains
@@ -67,14 +70,14 @@ def localize(
         return Localization((), 0.0)
     white = fitter.residual(fit.linearised.readings)[0]
     frequencies = likely_frequencies(white, fitter.data.row_spacing, fitter.data.longest_duration)
-    regression = DiscrepancyRegression(fitter, fit, frequencies, STEPS)
-    if not math.isfinite(base + log_evidence(fitter, fit, noise, regression.linearised)):
+    evidence, likely, regression = _about_predicted(fitter, fit, noise, base, frequencies)
+    if not math.isfinite(base + evidence):
         return Localization((), 0.0)
-    likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
-    itself = max(log_evidence(fitter, fit, likely, regression.linearised) - base, 0.0)
+    itself = max(evidence - base, 0.0)
     if hopeless or not places:
         return Localization((), itself)
-    ascent = Ascent(fitter, fit, noise, base)
+    assert regression.level_filter is not None
+    ascent = Ascent(fitter, regression.level_filter, base)
     noises = likely, nearly_without_disturbances(likely)
     first_order = _first_order_gains(regression, noises, fit, places, base)
     evaluated: dict[str, LocalizedDiscrepancy] = {}
@@ -96,6 +99,30 @@ def localize(
     return Localization(_likeliest_of_each_place([*evaluated.values(), *processes]), itself)
 
 
+def _about_predicted(
+    fitter: Fitter, fit: Fit, noise: StateNoise, base: float, frequencies: Sequence[float]
+) -> tuple[float, StateNoise, DiscrepancyRegression]:
+    """The log evidence of a fit about predicted levels, with the most likely noise, and the regression there.
+
+    A linear plant has the same evidence about all levels. If it has another one about the predicted levels than about
+    the fit, they are predicted about the measured levels too, and the likelier of both are taken.
+    """
+    about_each = []
+    for measured in (False, True):
+        level_filter = measured_filter(fitter, fit) if measured else LevelFilter(noise)
+        regression = DiscrepancyRegression(fitter, fit, frequencies, STEPS, level_filter)
+        linearised, likely = regression.linearised, level_filter.noise
+        evidence = log_evidence(fitter, fit, likely, linearised)
+        is_linear = abs(evidence - base) < CONVERGED
+        if math.isfinite(evidence):
+            likely = estimate_disturbances(fitter, fit, linearised, start=likely, climb=False).noise
+            evidence = log_evidence(fitter, fit, likely, linearised)
+        about_each.append((evidence, likely, regression))
+        if is_linear:
+            break
+    return max(about_each, key=itemgetter(0))
+
+
 def _likeliest_of_each_place(discrepancies: Sequence[LocalizedDiscrepancy]) -> tuple[LocalizedDiscrepancy, ...]:
     """The discrepancy with the largest gain at each place, the likeliest place first."""
     best: dict[str, LocalizedDiscrepancy] = {}
@@ -113,13 +140,13 @@ def localize_beside(
     explains of them. needed: gain in log evidence below which it is irrelevant.
     """
     base = log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
-    if at.selection is None:
+    if at.selection is None or at.level_filter is None:
         regression = DiscrepancyRegression(fitter, fit, (), STEPS)
         likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
         processes = [*drifting_sensors(regression, likely, [at.location], base, needed)]
         processes += random_flows(regression, likely, [at.location], base, needed)
         return max(processes, key=gain_of, default=None)
-    ascent = Ascent(fitter, fit, noise, base)
+    ascent = Ascent(fitter, at.level_filter, base)
     first = ascent.about(fit, at.explained, at.noise, at.location, at.selection)
     return ascent.climbed(ascent.with_finer_positions(first), needed).localized(fitter)
 

@@ -14,6 +14,7 @@ from fdi_torch.estimate.linear_parameters import decomposed, without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_columns import Selection
+from fdi_torch.gap.localization.predicted_levels import LevelFilter
 from fdi_torch.gap.localization.regressors import HARMONICS
 from fdi_torch.gap.marginal_likelihood import occam, with_disturbances
 from fdi_torch.parameters import ParameterSpace
@@ -72,6 +73,7 @@ class LocalizedDiscrepancy:
     the fit explains, in units of the sensor noise. selection: its regressors; None of a random process. fit, noise: the
     fit refitted, and the most likely disturbance noise, with the discrepancy. estimate: of the fit's parameters beside
     it. quantities: what it changes, of 'area' (of a tank) and 'flow' (or the reading of a sensor).
+    level_filter: predicts the levels about which its plant is linearised; None of a random process.
     """
 
     location: str
@@ -86,6 +88,7 @@ class LocalizedDiscrepancy:
     noise: StateNoise
     estimate: Estimate
     quantities: frozenset[str] = frozenset({"flow"})
+    level_filter: LevelFilter | None = None
 
     @property
     def pulses(self) -> tuple[tuple[float, float], ...]:

@@ -1,0 +1,89 @@
+"""Levels predicted from earlier readings, about which a plant is linearised for its discrepancies.
+
+An innovation is independent of all that follows from earlier readings (Ljung, 1999, "System identification", section
+3.2). Smoothed levels contain the disturbance of the same step; functions of them, in particular of their rates, would
+explain random flows.
+
+The filter that predicts is linearised itself: about the trajectory of a fit or, where a wrong law leads that far away
+from the readings, for example to a dry tank, about the levels that the sensors measure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.gap.candidate import Fit
+from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.marginal_likelihood import estimate_disturbances, pieces_of, with_disturbances
+from fdi_torch.plant.inverted_sensor import levels_from_readings
+from fdi_torch.simulate.linearised import Linearised
+from fdi_torch.simulate.resampling import interpolate
+
+
+@dataclass(frozen=True)
+class LevelFilter:
+    """The filter that predicts levels. noise: its noise, that without a discrepancy. along (1, K+1, n): the trajectory
+    about which it is linearised; None: that of the fit."""
+
+    noise: StateNoise
+    along: Tensor | None = None
+
+    def linearised(self, fitter: Fitter, fit: Fit) -> Linearised:
+        """The trajectory of a fit, or the plant at its parameters linearised about `along`."""
+        if self.along is None:
+            return fit.linearised
+        engine = fitter.engine(fit.candidate, list(fit.effect_values))
+        return engine.linearise(fit.theta.unsqueeze(0), self.along)
+
+    def levels(self, fitter: Fitter, fit: Fit) -> Tensor:
+        """States (1, K+1, n) of all recordings at the parameters of a fit."""
+        linearised = self.linearised(fitter, fit)
+        return predicted_levels(with_disturbances(fitter, fit, self.noise, linearised), linearised)
+
+
+def measured_filter(fitter: Fitter, fit: Fit) -> LevelFilter:
+    """The filter about the measured levels, with the noise that is most likely there."""
+    along = measured_levels(fitter, fit)
+    engine = fitter.engine(fit.candidate, list(fit.effect_values))
+    linearised = engine.linearise(fit.theta.unsqueeze(0), along)
+    return LevelFilter(estimate_disturbances(fitter, fit, linearised).noise, along)
+
+
+def predicted_levels(fitter: Fitter, linearised: Linearised) -> Tensor:
+    """States (1, K+1, n) of all recordings, predicted by the filter of a fitter, which is linearised about a
+    trajectory; those of the trajectory without a filter."""
+    data, whitening = fitter.data, fitter.whitening
+    if whitening is None:
+        return linearised.levels.clone()
+    levels = linearised.levels.clone()
+    correction = whitening.predicted(data.readings - linearised.readings[0])
+    first = 0
+    for part, rows in zip(data.parts, data.rows, strict=True):
+        nodes = part.experiment.nodes
+        at_nodes = [interpolate(nodes, part.experiment.sample_times, x) for x in correction[rows].unbind(1)]
+        levels[0, first : first + len(nodes)] += torch.stack(at_nodes, dim=1)
+        first += len(nodes)
+    tanks = len(data.plant.tanks)
+    return torch.cat([levels[..., :tanks].clamp(min=0.0), levels[..., tanks:]], dim=-1)
+
+
+def measured_levels(fitter: Fitter, fit: Fit) -> Tensor:
+    """States (1, K+1, n) of all recordings with the levels that the readings show; those of the fit where none do."""
+    data, measured = fitter.data, []
+    for (engine, theta, linearised), part, rows in zip(
+        pieces_of(fitter, fit, fit.linearised), data.parts, data.rows, strict=True
+    ):
+        nodes, times, states = part.experiment.nodes, part.experiment.sample_times, linearised.levels[0].unbind(-1)
+        readings = []
+        for y, valid in zip(data.readings[rows].unbind(1), data.mask[rows].unbind(1), strict=True):
+            readings.append(
+                interpolate(nodes, times[valid], y[valid]) if valid.any() else torch.full_like(nodes, torch.nan)
+            )
+        values, tanks = engine.network.bind(engine.space, theta), len(data.plant.tanks)
+        levels = levels_from_readings(engine.network, readings, states[:tanks], nodes, values)
+        measured.append(torch.stack([*levels, *states[tanks:]], dim=-1))
+    return torch.cat(measured).unsqueeze(0)
