@@ -11,6 +11,7 @@ import torch
 
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import effect
+from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.cause_hypothesis import CauseHypothesis, causes_in_order
@@ -104,3 +105,19 @@ def test_held_parameters_keep_their_values_and_the_others_are_fitted(sound: tupl
     assert held.values[name] == factor and held.converged
     moved = [n for n in null.space.names if abs(held.values[n] - null.values[n]) > 1e-3 * abs(null.values[n])]
     assert moved and held.cost > null.cost + 10.0
+
+
+def test_the_order_in_which_effects_are_removed_does_not_depend_on_hashes() -> None:
+    """Each refit begins where the last one ended, so that another order may end in another explanation."""
+    key = frozenset((f"effect_{name}", "T1") for name in "dbaec")
+    removed: list[CauseName] = []
+
+    class Pool(ExplanationPool):
+        def without(self, explanation: RankedExplanation, cause: CauseName) -> RankedExplanation:
+            removed.append(cause)
+            return explanation
+
+    pool = Pool(None, None, 1)  # type: ignore[arg-type]
+    pool.explanations[key] = SimpleNamespace(key=key, log_evidence=0.0)  # type: ignore[assignment]
+    pool.exchange_effects(())
+    assert removed == sorted(key)

@@ -23,28 +23,45 @@ struct Model {
     const uint8_t *seen, *fresh; // (S, C), (S)
 };
 
+// Doubles in a vector register. The compiler keeps wider vectors in memory.
+#if defined(__AVX512F__)
+constexpr int REGISTER = 8;
+#elif defined(__AVX__)
+constexpr int REGISTER = 4;
+#else
+constexpr int REGISTER = 2;
+#endif
+
 // to += sum over j < B of m_j x_j for R rows and V columns, which stay in registers. `to` and x have rows of W, and the
 // element of m for row r and term j lies at m[r * down + j * along].
 template <int B, int W, int R, int V>
 inline void add_tile(const double* __restrict m, int down, int along, const double* __restrict x,
                      double* __restrict to) {
-    typedef double Columns __attribute__((vector_size(V * sizeof(double)), aligned(sizeof(double)), may_alias));
-    Columns total[R];
-#pragma GCC unroll 8
-    for (int r = 0; r < R; ++r) total[r] = *reinterpret_cast<const Columns*>(to + r * W);
+    constexpr int wide = std::min(V, REGISTER), count = V / wide;
+    typedef double Columns __attribute__((vector_size(wide * sizeof(double)), aligned(sizeof(double)), may_alias));
+    Columns total[R][count], term[count];
+#pragma GCC unroll 16
+    for (int r = 0; r < R; ++r)
+#pragma GCC unroll 4
+        for (int v = 0; v < count; ++v) total[r][v] = *reinterpret_cast<const Columns*>(to + r * W + v * wide);
     for (int j = 0; j < B; ++j) {
-        const Columns term = *reinterpret_cast<const Columns*>(x + j * W);
-#pragma GCC unroll 8
-        for (int r = 0; r < R; ++r) total[r] += m[r * down + j * along] * term;
+#pragma GCC unroll 4
+        for (int v = 0; v < count; ++v) term[v] = *reinterpret_cast<const Columns*>(x + j * W + v * wide);
+#pragma GCC unroll 16
+        for (int r = 0; r < R; ++r)
+#pragma GCC unroll 4
+            for (int v = 0; v < count; ++v) total[r][v] += m[r * down + j * along] * term[v];
     }
-#pragma GCC unroll 8
-    for (int r = 0; r < R; ++r) *reinterpret_cast<Columns*>(to + r * W) = total[r];
+#pragma GCC unroll 16
+    for (int r = 0; r < R; ++r)
+#pragma GCC unroll 4
+        for (int v = 0; v < count; ++v) *reinterpret_cast<Columns*>(to + r * W + v * wide) = total[r][v];
 }
 
 // The same for A rows.
 template <int A, int B, int W, int V>
 inline void add_columns(const double* m, int down, int along, const double* x, double* to) {
-    constexpr int R = 8;
+    constexpr int R = 12 * std::min(V, REGISTER) / V;  // twelve registers of sums
     for (int i = 0; i < A / R; ++i) add_tile<B, W, R, V>(m + i * R * down, down, along, x, to + i * R * W);
     add_tile<B, W, A % R, V>(m + A / R * R * down, down, along, x, to + A / R * R * W);
 }

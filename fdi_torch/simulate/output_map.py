@@ -133,11 +133,16 @@ class SampleGrid:
         on_nodes = bool(((self.share - self.share.round()).abs() < 1e-9).all())
         self.node = node if on_nodes else None
         self.same = on_nodes and torch.equal(node, torch.arange(len(experiment.nodes)))
+        self.one_per_step = torch.equal(self.step, torch.arange(len(experiment.nodes) - 1))
 
     def of(self, path: Float[Tensor, "*batch nodes"]) -> Float[Tensor, "*batch S"]:
         """The path at the samples."""
         if self.same:
             return path
         if self.node is not None:
-            return path[..., self.node]
-        return path[..., self.step] * (1.0 - self.share) + path[..., self.step + 1] * self.share
+            return path.index_select(-1, self.node)
+        if self.one_per_step:
+            before, after = path[..., :-1], path[..., 1:]
+        else:
+            before, after = (path.index_select(-1, index) for index in (self.step, self.step + 1))
+        return before * (1.0 - self.share) + after * self.share
