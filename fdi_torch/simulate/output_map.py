@@ -140,9 +140,14 @@ class SampleGrid:
         if self.same:
             return path
         if self.node is not None:
-            return path.index_select(-1, self.node)
+            return _at(path, self.node)
         if self.one_per_step:
             before, after = path[..., :-1], path[..., 1:]
         else:
-            before, after = (path.index_select(-1, index) for index in (self.step, self.step + 1))
+            before, after = _at(path, self.step), _at(path, self.step + 1)
         return before * (1.0 - self.share) + after * self.share
+
+
+def _at(path: Tensor, nodes: Tensor) -> Tensor:
+    """The path at some nodes. PyTorch gathers several times as fast as it indexes the last dimension."""
+    return path.gather(-1, nodes.expand(*path.shape[:-1], -1))
