@@ -23,7 +23,7 @@ from fdi_torch.gap.localization.discrepancy_ascent import Ascent
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.fine_positions import Positions
 from fdi_torch.gap.localization.localize import localize
-from fdi_torch.gap.localization.predicted_levels import LevelFilter
+from fdi_torch.gap.localization.predicted_levels import LevelFilter, measured_levels
 from fdi_torch.gap.localization.regressor_families import Relays
 from fdi_torch.gap.localization.regressors import (
     backlash,
@@ -327,6 +327,24 @@ def test_a_law_that_empties_a_tank_of_the_model_is_found_about_the_measured_leve
     assert float(fit.linearised.readings[0, :, 0].min()) < 1e-3
     found = localize(fitter, fit, noise, ("lift", "well", "h_well")).discrepancies
     assert found[0].location == "lift" and found[0].gain > found[1].gain + 100.0
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_no_level_is_predicted_from_its_own_or_a_later_reading(
+    sticking: tuple[Fitter, Fit, StateNoise], measured: bool
+) -> None:
+    fitter, fit, noise = sticking
+    first = 1000
+
+    def levels(change: float) -> Tensor:
+        readings = fitter.data.readings.clone()
+        readings[first:] += change
+        changed = Fitter(replace(fitter.data, readings=readings), fitter.noise)
+        return LevelFilter(noise, measured_levels(changed, fit) if measured else None).levels(changed, fit)[0]
+
+    node = int((fitter.data.experiment.nodes <= fitter.data.experiment.sample_times[first]).sum())
+    before, after = levels(0.0), levels(0.01)
+    assert torch.equal(before[:node], after[:node]) and not torch.equal(before, after)
 
 
 def test_a_law_with_many_changes_is_found_although_random_flows_explain_each_of_them() -> None:

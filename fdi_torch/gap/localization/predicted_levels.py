@@ -32,25 +32,22 @@ class LevelFilter:
     noise: StateNoise
     along: Tensor | None = None
 
-    def linearised(self, fitter: Fitter, fit: Fit) -> Linearised:
-        """The trajectory of a fit, or the plant at its parameters linearised about `along`."""
-        if self.along is None:
-            return fit.linearised
-        engine = fitter.engine(fit.candidate, list(fit.effect_values))
-        return engine.linearise(fit.theta.unsqueeze(0), self.along)
-
     def levels(self, fitter: Fitter, fit: Fit) -> Tensor:
         """States (1, K+1, n) of all recordings at the parameters of a fit."""
-        linearised = self.linearised(fitter, fit)
+        linearised = fit.linearised if self.along is None else _linearised(fitter, fit, self.along)
         return predicted_levels(with_disturbances(fitter, fit, self.noise, linearised), linearised)
 
 
 def measured_filter(fitter: Fitter, fit: Fit) -> LevelFilter:
     """The filter about the measured levels, with the noise that is most likely there."""
     along = measured_levels(fitter, fit)
+    return LevelFilter(estimate_disturbances(fitter, fit, _linearised(fitter, fit, along)).noise, along)
+
+
+def _linearised(fitter: Fitter, fit: Fit, levels: Tensor) -> Linearised:
+    """The plant at the parameters of a fit, linearised about levels."""
     engine = fitter.engine(fit.candidate, list(fit.effect_values))
-    linearised = engine.linearise(fit.theta.unsqueeze(0), along)
-    return LevelFilter(estimate_disturbances(fitter, fit, linearised).noise, along)
+    return engine.linearise(fit.theta.unsqueeze(0), levels)
 
 
 def predicted_levels(fitter: Fitter, linearised: Linearised) -> Tensor:
@@ -72,18 +69,21 @@ def predicted_levels(fitter: Fitter, linearised: Linearised) -> Tensor:
 
 
 def measured_levels(fitter: Fitter, fit: Fit) -> Tensor:
-    """States (1, K+1, n) of all recordings with the levels that the readings show; those of the fit where none do."""
-    data, measured = fitter.data, []
-    for (engine, theta, linearised), part, rows in zip(
-        pieces_of(fitter, fit, fit.linearised), data.parts, data.rows, strict=True
-    ):
-        nodes, times, states = part.experiment.nodes, part.experiment.sample_times, linearised.levels[0].unbind(-1)
+    """States (1, K+1, n) of all recordings with the levels that the readings of one sample before show; those of the
+    fit where none do.
+
+    A plant that is linearised about a reading contains its noise, and predicts the reading too well.
+    """
+    data, tanks, measured = fitter.data, len(fitter.data.plant.tanks), []
+    pieces = pieces_of(fitter, fit, fit.linearised)
+    for (engine, theta, linearised), rows in zip(pieces, data.rows, strict=True):
+        experiment, states = engine.experiment, linearised.levels[0].unbind(-1)
+        nodes, times = experiment.nodes, torch.cat([experiment.sample_times[1:], experiment.sample_times[-1:]])
         readings = []
         for y, valid in zip(data.readings[rows].unbind(1), data.mask[rows].unbind(1), strict=True):
-            readings.append(
-                interpolate(nodes, times[valid], y[valid]) if valid.any() else torch.full_like(nodes, torch.nan)
-            )
-        values, tanks = engine.network.bind(engine.space, theta), len(data.plant.tanks)
+            known = bool(valid.any())
+            readings.append(interpolate(nodes, times[valid], y[valid]) if known else torch.full_like(nodes, torch.nan))
+        values = engine.network.bind(engine.space, theta)
         levels = levels_from_readings(engine.network, readings, states[:tanks], nodes, values)
         measured.append(torch.stack([*levels, *states[tanks:]], dim=-1))
     return torch.cat(measured).unsqueeze(0)
