@@ -324,6 +324,19 @@ def test_the_correlation_time_is_the_nearest_of_the_candidates(
     assert found.log_likelihood > whole.likelihood(truth)[0] - 1.0
 
 
+@pytest.mark.parametrize("start_time", [0.0, 15.0, 400.0])
+def test_disturbances_are_found_from_a_start_without_any(start_time: float) -> None:
+    """Such a start is the noise of another explanation, one that needs no random flows."""
+    p, sensors, ones = two_tanks(1000), SensorNoise(STD, WHITE), torch.ones(2, dtype=DOUBLE)
+    truth = StateNoise(INTENSITY, 15.0, ones)
+    residual = simulated(p, sensors, truth, 1)
+    whole = problem(p, sensors, residual)
+    start = StateNoise(1e-6 * INTENSITY, start_time, ones)
+    parts = residual, whole.jacobian, whole.pull, whole.off, INTENSITY
+    found = estimate_state_noise(p, sensors, *parts, start)
+    assert found.log_likelihood > whole.likelihood(truth)[0] - 1.0
+
+
 def test_intensities_are_tied_except_for_one_apart() -> None:
     together, apart = (
         StateNoise(INTENSITY * torch.tensor([1.0, 50.0]), 15.0, torch.ones(2), apart=k) for k in (None, 1)

@@ -133,12 +133,18 @@ class _Problem:
 
         At each time the other noise parameters are optimised. with_time: sets the correlation time of a noise model.
         """
+
+        def at(noise: StateNoise, time: float) -> Likelihood:
+            # The likelihood is flat in the logarithms of flows that move no level.
+            flows = torch.maximum(noise.intensity, self.unit)
+            return self.solve(with_time(replace(noise, intensity=flows), time))
+
         middle = min(range(len(times)), key=lambda i: abs(times[i] - first_time))
-        first = best = self.solve(with_time(start, times[middle]))
+        first = best = at(start, times[middle])
         for step in (1, -1):
             i = middle + step
             while 0 <= i < len(times):
-                candidate = self.solve(with_time(best.noise, times[i]))
+                candidate = at(best.noise, times[i])
                 if candidate.log_likelihood <= best.log_likelihood:
                     break
                 best, i = candidate, i + step
