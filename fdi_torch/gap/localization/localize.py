@@ -104,8 +104,9 @@ def _about_predicted(
 ) -> tuple[float, StateNoise, DiscrepancyRegression]:
     """The log evidence of a fit about predicted levels, with the most likely noise, and the regression there.
 
-    A linear plant has the same evidence about all levels. If it has another one about the predicted levels than about
-    the fit, they are predicted about the measured levels too, and the likelier of both are taken.
+    The evidence of a linear plant does not depend on the levels about which it is linearised. If the evidence about the
+    predicted levels differs from that about the fit, levels are also predicted by a filter that is linearised about the
+    measured ones, and the likelier prediction is used.
     """
     about_each = []
     for measured in (False, True):

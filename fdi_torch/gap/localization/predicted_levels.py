@@ -26,8 +26,10 @@ from fdi_torch.simulate.resampling import interpolate
 
 @dataclass(frozen=True)
 class LevelFilter:
-    """The filter that predicts levels. noise: its noise, that without a discrepancy. along (1, K+1, n): the trajectory
-    about which it is linearised; None: that of the fit."""
+    """The filter that predicts levels. noise: of flows and sensors, as estimated without a discrepancy.
+
+    along (1, K+1, n): the levels about which the filter is linearised, m; None: the trajectory of the fit.
+    """
 
     noise: StateNoise
     along: Tensor | None = None
