@@ -186,7 +186,10 @@ def killed_after(folder: Path, seconds: float) -> tuple[float, dict[int, float]]
     time.sleep(seconds)
     killed = time.time()
     writer.kill()
-    lines = [first, *writer.communicate(timeout=20)[0].splitlines(keepends=True)]
+    # `communicate` would read past what `readline` has buffered, and could begin within a line.
+    with writer.stdout:
+        lines = [first, *writer.stdout]
+    writer.wait(timeout=20)
     times = {int(line.split()[0]): float(line.split()[1]) for line in lines if line.endswith("\n")}
     return killed, times
 
