@@ -96,7 +96,6 @@ def test_offsets_and_rounding_of_the_leak_rig_are_named_and_its_leak_is_located(
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="from a misfit this large, most fits of a flow with an onset end in local minima")
 def test_the_leak_of_the_leak_rig_is_named_with_its_onset(leak_rig: tuple[Answer, Answer]) -> None:
     causes = {(c.effect, c.location): c for c in leak_rig[1].causes}
     draw = causes["unmetered_flow", "T2"]
