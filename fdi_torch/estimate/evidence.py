@@ -37,6 +37,7 @@ class Odds:
 
 
 ODDS = Odds()
+TOLERANCE = 0.1  # nats; a smaller gain in log evidence ends a search
 RARE = 0.02  # odds relative to the best model below which candidates that were not yet fitted are ignored
 
 

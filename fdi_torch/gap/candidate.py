@@ -32,8 +32,7 @@ class Candidate:
 class Fit:
     """The best fit of a candidate: parameters theta (P,), cost (chi-square with priors), linearised trajectory.
 
-    trajectory: computes the latter. converged: whether less than DECREMENT remained to gain. False if the fit was given
-    up or ran out of evaluations.
+    trajectory: computes the latter. converged: as that of `DescentResult`.
     """
 
     candidate: Candidate

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from fdi_torch.estimate.evidence import RARE
+from fdi_torch.estimate.evidence import RARE, TOLERANCE
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit, Key
@@ -37,7 +37,6 @@ BEAM = 2  # explanations of one size that are extended
 FITTED = 8  # effects fitted about each explanation and noise, by first-order gain
 STARTS = 8  # initial values of one effect, by first-order gain
 EVALUATED = 3  # of these fits, the best whose evidence is computed
-CONVERGED = 0.1  # nats; a smaller gain ends the alternation between noise and fit
 PAIRS = 3  # pairs of effects fitted together
 
 
@@ -87,7 +86,7 @@ class ExplanationPool:
         extended, or with one that has only some of its effects. At its end, improbable onsets and the like are dropped.
         """
         before, candidate = self.explanations.get(fit.key), fit.candidate
-        if before and evidence_under(before.fitter, fit, self.choices) < before.log_evidence + CONVERGED:
+        if before and evidence_under(before.fitter, fit, self.choices) < before.log_evidence + TOLERANCE:
             return before
         rivals = self.best_of(len(fit.key))[BEAM - 1 :] + [e for k, e in self.explanations.items() if k < fit.key]
         rival = max((e.log_evidence for e in rivals), default=-math.inf)
@@ -107,12 +106,12 @@ class ExplanationPool:
             behind = rival - best.log_evidence
             if behind > 0.5 * BEHIND and gain < SHARE * behind:
                 break
-            if climb and not gain > CONVERGED:
+            if climb and not gain > TOLERANCE:
                 fit = with_likeliest_parameters(best.fitter, best.fit, candidate.starts, self.choices)
                 best = replace(best, fit=fit, log_evidence=evidence_under(best.fitter, fit, self.choices))
                 break
             # The search for the correlation time, which takes longest, begins where the rest has converged.
-            climb = not gain > CONVERGED
+            climb = not gain > TOLERANCE
             fit, start = (best.fit, best.noise) if climb else (there.fit, there.noise)
         if before is None or best.log_evidence > before.log_evidence:
             self.explanations[fit.key] = best

@@ -51,8 +51,8 @@ def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
         )
     if not result.best.converged:
         remarks.append(
-            "the fit of the likeliest explanation has not converged: its sizes may be off by more than their standard "
-            "errors; use a longer recording, or fewer effects by --library"
+            "the fit of the likeliest explanation has not converged: its sizes may be off by more than half of their "
+            "standard errors; use a longer recording, or fewer effects by --library"
         )
     remarks += [_masked_outliers(s) for group in result.outliers for s in group]
     remarks += [*_nominal_values_out_of_range(data.plant), *_values_at_bounds(result), *_periods(result)]

@@ -9,13 +9,14 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.evidence import TOLERANCE
 from fdi_torch.estimate.levenberg_marquardt import Competition, RefineSettings, levenberg_marquardt
-from fdi_torch.estimate.linearisation import Linearisation, are_all_lanes
+from fdi_torch.estimate.linearisation import ABANDONED, Linearisation, are_all_lanes
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.linearised import Linearised
 
-# A fit has converged if a further step is predicted to gain less than this share of the chi-square per reading, or of
-# one if that is more. Parameters are then within a tenth of a standard error, misfit included.
+# A descent ends if a further step is predicted to gain less than this share of the chi-square per reading, or of one if
+# that is more. Parameters are then within a tenth of a standard error, misfit included.
 DECREMENT = 0.01
 CAP = 200  # evaluations, a guard against descents without an end
 # A start is given up if it is so many chi-square units behind and gains less than a quarter of that in a step.
@@ -148,7 +149,12 @@ class TrajectoryProblem:
 
 @dataclass(frozen=True)
 class DescentResult:
-    """End points of descents: theta (L, P), cost (L,) chi-square, linearised trajectories, converged (L,) bool."""
+    """End points of descents: theta (L, P), cost (L,) chi-square, linearised trajectories.
+
+    converged (L,) bool: whether a further step is predicted to gain less log-likelihood than TOLERANCE, times
+    chi-square per reading if that exceeds one. Parameters are then within half a standard error. A descent may end
+    before DECREMENT because its steps are refused, as near a kink. A start that was given up has not converged.
+    """
 
     theta: Tensor
     cost: Tensor
@@ -174,7 +180,10 @@ def descend(
     low, high = box or problem.box[:2]
     minimum = levenberg_marquardt(problem.linearise, theta, low, high, settings, neighbourhood=problem)
     assert isinstance(minimum.state, FittedTrajectory)
-    return DescentResult(minimum.theta, 2.0 * minimum.cost, minimum.state.linearised, minimum.converged)
+    cost = 2.0 * minimum.cost
+    near = minimum.newton_decrement < TOLERANCE * (cost / max(readings, 1)).clamp(min=1.0)
+    converged = near & (minimum.status != ABANDONED)
+    return DescentResult(minimum.theta, cost, minimum.state.linearised, converged)
 
 
 def _fitted(model: Linearisation) -> FittedTrajectory:

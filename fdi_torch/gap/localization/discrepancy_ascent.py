@@ -10,12 +10,13 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.evidence import TOLERANCE
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_columns import Discrepancy, Selection
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
-from fdi_torch.gap.localization.fine_positions import CONVERGED, Positions
+from fdi_torch.gap.localization.fine_positions import Positions
 from fdi_torch.gap.localization.localized_discrepancy import (
     Estimate,
     LocalizedDiscrepancy,
@@ -200,14 +201,14 @@ class Ascent:
             best = self.with_finer_positions(best)
             if turn == 0 or bool((best.regressed.used & best.discrepancy.sinusoids).any()):
                 best = max(best, self._with_finer_frequency(best), key=gain_of)
-            if best.gain < max(not_refitted + CONVERGED, SHARE * (needed - best.gain)):
+            if best.gain < max(not_refitted + TOLERANCE, SHARE * (needed - best.gain)):
                 break
             refitted = self._refitted(best)
             if refitted.gain > best.gain:
                 best = refitted
             else:
                 not_refitted = best.gain
-            if best.gain - before < max(CONVERGED, SHARE * (needed - best.gain)):
+            if best.gain - before < max(TOLERANCE, SHARE * (needed - best.gain)):
                 break
         return best
 
@@ -222,7 +223,7 @@ class Ascent:
         while finer := positions.best(current.discrepancy, current.regressed.precision):
             extended = self._changed(current, finer)
             gain = extended.gain - current.gain
-            if gain < CONVERGED or current.gain + MOST_REGRESSORS * gain < least:
+            if gain < TOLERANCE or current.gain + MOST_REGRESSORS * gain < least:
                 break
             current = extended
         return current

@@ -19,6 +19,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.evidence import TOLERANCE
 from fdi_torch.estimate.linear_parameters import without
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_columns import Discrepancy, Position
@@ -43,7 +44,6 @@ from fdi_torch.simulate.joint_collocation import with_blanks
 
 TRIED = 8  # positions, or frequencies, with the largest estimated gains, whose gains are computed exactly
 HALVINGS = 4  # of the spacing between a relay's thresholds; then it is 1/16 of that of the fine grid
-CONVERGED = 0.1  # nats; a search for a discrepancy ends at a smaller gain
 FREQUENCIES = 17  # from 1/T below a frequency to 1/T above it
 FREQUENCY_ERROR = 1.0 / 600.0  # of the best frequency, in units of 1/T
 
@@ -215,7 +215,7 @@ def best_parameters(
             tried = tried[possible(tried)]
             gained = gains(tried)
             k = int(gained.argmax())
-            if not float(gained[k]) > largest + CONVERGED:
+            if not float(gained[k]) > largest + TOLERANCE:
                 break
             best, largest = tried[k], float(gained[k])
     return best

@@ -15,13 +15,12 @@ from operator import itemgetter
 
 import torch
 
-from fdi_torch.estimate.evidence import RARE
+from fdi_torch.estimate.evidence import RARE, TOLERANCE
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_ascent import STEPS, Ascent, gain_of
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
-from fdi_torch.gap.localization.fine_positions import CONVERGED
 from fdi_torch.gap.localization.localized_discrepancy import (
     LocalizedDiscrepancy,
     is_rounding_error,
@@ -114,7 +113,7 @@ def _about_predicted(
         regression = DiscrepancyRegression(fitter, fit, frequencies, STEPS, level_filter)
         linearised, likely = regression.linearised, level_filter.noise
         evidence = log_evidence(fitter, fit, likely, linearised)
-        is_linear = abs(evidence - base) < CONVERGED
+        is_linear = abs(evidence - base) < TOLERANCE
         if math.isfinite(evidence):
             likely = estimate_disturbances(fitter, fit, linearised, start=likely, climb=False).noise
             evidence = log_evidence(fitter, fit, likely, linearised)
