@@ -99,7 +99,8 @@ def test_a_discrepancy_is_tried_at_other_places_beside_the_same_effects(monkeypa
     explanation = SimpleNamespace()
     at_tank, at_outlet = (
         cast(
-            CauseHypothesis, SimpleNamespace(weight=weight, explanation=explanation, discrepancy=object(), unknown=None)
+            CauseHypothesis,
+            SimpleNamespace(weight=weight, explanation=explanation, all_causes=(), discrepancy=object(), unknown=None),
         )
         for weight in (3.0, 5.0)
     )
@@ -133,6 +134,7 @@ def test_a_discrepancy_is_tried_at_other_places_beside_the_effect_that_names_it(
                 weight=weight,
                 explanation=explanation,
                 causes=tuple(explanation.key),
+                all_causes=(),
                 discrepancy=object(),
                 unknown=SimpleNamespace(location=place),
                 unknown_at=place,

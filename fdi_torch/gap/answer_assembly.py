@@ -67,8 +67,7 @@ def build_answer(result: DiagnosisResult, holdouts: Sequence[DataSet]) -> Answer
 
 def _names(result: DiagnosisResult, hypothesis: CauseHypothesis) -> tuple[CauseName, ...]:
     """All causes of a hypothesis, something unknown among them."""
-    unknown = ((UNKNOWN, hypothesis.unknown_at),) if hypothesis.unknown_at else ()
-    return (*hypothesis.causes, *unknown, *result.from_readings)
+    return (*hypothesis.all_causes, *result.from_readings)
 
 
 def _where(result: DiagnosisResult) -> list[tuple[str, float]]:

@@ -15,7 +15,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 from fdi_torch.estimate.kalman import StateNoise
-from fdi_torch.gap.answer import CauseName
+from fdi_torch.gap.answer import UNKNOWN, CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.explanation_pool import RankedExplanation
@@ -45,6 +45,11 @@ class CauseHypothesis:
     @property
     def unknown_at(self) -> str | None:
         return self.unknown.location if self.unknown else None
+
+    @property
+    def all_causes(self) -> tuple[CauseName, ...]:
+        """The causes, the unknown among them."""
+        return (*self.causes, (UNKNOWN, self.unknown.location)) if self.unknown else self.causes
 
     @property
     def noise(self) -> StateNoise:

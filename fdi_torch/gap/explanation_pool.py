@@ -135,6 +135,11 @@ class ExplanationPool:
         self.evaluate(explanation.fitter.fit(candidate, fit, target), explanation.noise)
         return self.explanations[explanation.key - {cause}]
 
+    @property
+    def best(self) -> RankedExplanation:
+        """The likeliest explanation."""
+        return max(self.explanations.values(), key=lambda e: e.log_evidence)
+
     def best_of(self, effects: int) -> list[RankedExplanation]:
         """Explanations with this number of effects, the likeliest first."""
         return sorted((e for e in self.explanations.values() if len(e.key) == effects), key=lambda e: -e.log_evidence)
@@ -209,11 +214,10 @@ class ExplanationPool:
 
         It may gain more than its first-order gain by the largest factor among all extensions that were fitted so far.
         """
-        best = max(e.log_evidence for e in self.explanations.values())
         pairs = [pair for k in self._expected_gains for pair in self._gains(k)]
         factor = max([1.0, *(actual / gain for actual, gain in pairs if gain > PRIOR_GAIN)])
         expected = self._expected_gains[parent.key][key]
-        return factor * expected.gain + expected.prior + parent.log_evidence - best > math.log(RARE)
+        return factor * expected.gain + expected.prior + parent.log_evidence - self.best.log_evidence > math.log(RARE)
 
     def _improves(self, fit: Fit, costs: Mapping[Key, float]) -> bool:
         """Whether a fit is likelier, by chi-square and prior odds, than every explanation with fewer of its effects.
@@ -252,13 +256,13 @@ class ExplanationPool:
     def exchange_effects(self, options: Sequence[Option]) -> None:
         """Remove each effect of the best explanation and try others in its place, while that improves it."""
         while True:
-            best = max(self.explanations.values(), key=lambda e: e.log_evidence)
+            best = self.best
             for cause in sorted(best.key):
                 known = self.explanations.get(best.key - {cause})
                 reduced = self.without(best, cause)
                 if reduced is not known and options:
                     self.extend_by(reduced, options)
-            if max(self.explanations.values(), key=lambda e: e.log_evidence) is best:
+            if self.best is best:
                 return
 
     def unexamined(self) -> float:
@@ -276,7 +280,7 @@ class ExplanationPool:
         """Candidates that were not fitted: expected lead in log evidence over the best explanation, parent, and
         expected gain.
         """
-        best = max(self.explanations.values(), key=lambda e: e.log_evidence)
+        best = self.best
         for key, expected_gains in self._expected_gains.items():
             # The effects of the best explanation, which are true if it is, gain more than others.
             parent, true = self.explanations[key], {key | {cause} for cause in best.key}

@@ -30,7 +30,7 @@ from fdi_torch.gap.localization.localized_discrepancy import (
 )
 from fdi_torch.gap.marginal_likelihood import log_prior, with_disturbances
 from fdi_torch.gap.screening import Option
-from fdi_torch.gap.structure_search import SearchResult
+from fdi_torch.gap.structure_search import Report, SearchResult
 
 
 class HypothesisSearch:
@@ -39,8 +39,14 @@ class HypothesisSearch:
     options: effects that may be added. places: where something unknown may be.
     """
 
-    def __init__(self, pool: ExplanationPool, options: Sequence[Option], places: Sequence[str]) -> None:
-        self.pool, self.options, self.places = pool, options, places
+    def __init__(
+        self,
+        pool: ExplanationPool,
+        options: Sequence[Option],
+        places: Sequence[str],
+        report: Report = lambda causes: None,
+    ) -> None:
+        self.pool, self.options, self.places, self._report = pool, options, places, report
         self.weights = HypothesisWeights(pool, options, len(places))
         # By the explanation's id, and the place; and the explanations' ids.
         self._evaluated: dict[tuple[int, str], list[CauseHypothesis]] = {}
@@ -53,6 +59,7 @@ class HypothesisSearch:
         hypotheses = list(named)
         for explanation in {e.key: e for e in (result.null, likeliest(named).explanation)}.values():
             hypotheses += self._everywhere(explanation, likeliest(hypotheses))
+            self._report(likeliest(hypotheses).all_causes)
         hypotheses = self._after_fits_at_unknowns(hypotheses)
         trials = self._climbed(likeliest(hypotheses))
         best = likeliest([*hypotheses, *trials])
@@ -103,6 +110,7 @@ class HypothesisSearch:
         that improves it. The discrepancy moves beside the same effects, or beside one more in its former place."""
         evaluated: list[CauseHypothesis] = []
         while True:
+            self._report(best.all_causes)
             trials = [*self._with_fewer_effects(best), *self._with_more_effects(best)]
             if best.discrepancy and all(h.weight <= best.weight for h in trials):
                 trials += self._everywhere(best.explanation, best)
