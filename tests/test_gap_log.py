@@ -57,8 +57,8 @@ def test_a_gap_log_contains_the_whole_answer(logged: Path) -> None:
 
 def test_the_log_tells_the_likeliest_causes_while_they_are_searched(logged: Path) -> None:
     said = [message.payload["message"] for message in read_run(logged).messages("/log")]
-    assert "which effects; likeliest so far: pump gain at Q2" in said
-    assert "where; likeliest so far: pump gain at Q2" in said
+    assert "which effects, so far pump gain at Q2" in said
+    assert "where, so far pump gain at Q2" in said
 
 
 def test_a_verdict_replays_from_its_log_to_the_last_bit(logged: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, Protocol
 import orjson
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from fdi_torch.disk import named_errors
@@ -162,10 +162,12 @@ class Screen:
     def _bar(self) -> Progress:
         columns = (
             TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            TextColumn("{task.fields[text]}", markup=False),
+            BarColumn(bar_width=20),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[text]}", markup=False, table_column=Column(ratio=1, no_wrap=True)),
         )
-        return Progress(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=self._err, transient=True)
+        return Progress(*columns, console=self._err, transient=True, expand=True)
 
     def _lines(self, title: str) -> Advance:
         self.note(f"{title} ...")

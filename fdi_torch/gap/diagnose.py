@@ -99,7 +99,7 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
 def _report(progress: ProgressCallback, share: float, stage: str, causes: Collection[CauseName]) -> None:
     """Tell the likeliest causes so far."""
     named = [{"effect": effect, "location": place} for effect, place in sorted(causes)]
-    progress(share, f"{stage}; likeliest so far: {explanation_words(named)}")
+    progress(share, f"{stage}, so far {explanation_words(named)}")
 
 
 def verdict_of(credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: Sequence[CauseName]) -> Verdict:
