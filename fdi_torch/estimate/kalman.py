@@ -30,7 +30,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fdi_torch.simulate.build import load_library
+from fdi_torch.simulate.build import REGISTER, load_library
 
 
 @dataclass(frozen=True)
@@ -276,6 +276,7 @@ class _Model(ctypes.Structure):
 def _library(tanks: int, channels: int, layers: int) -> ctypes.CDLL:
     """kalman.hpp compiled for these sizes; layers: 1 if the noise of the channels is correlated in time, else 0."""
     sizes = f"#define TANKS {tanks}\n#define CHANNELS {channels}\n#define LAYERS {layers}\n"
-    source = sizes + Path(__file__).with_name("kalman.hpp").read_text(encoding="utf-8")
+    headers = REGISTER, Path(__file__).with_name("kalman.hpp")
+    source = "".join([sizes, *(header.read_text(encoding="utf-8") for header in headers)])
     names = ("gains", "innovations", "transposed", "score", "predictions", "levels")
     return load_library(source, *(f"kalman_{name}" for name in names))

@@ -26,7 +26,7 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation
-from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
+from fdi_torch.simulate.joint_collocation import with_blanks
 from fdi_torch.simulate.linearised import Linearised
 
 
@@ -98,8 +98,7 @@ def propagation_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> Propagat
 
 def pieces_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:
     """For each recording, its collocation, its parameters (1, P) and its part of a trajectory."""
-    joint, theta = fitter.engine(fit.candidate, list(fit.effect_values)), fit.theta.unsqueeze(0)
-    return joint.apart(theta, linearised) if isinstance(joint, JointCollocation) else [(joint, theta, linearised)]
+    return fitter.engine(fit.candidate, list(fit.effect_values)).apart(fit.theta.unsqueeze(0), linearised)
 
 
 def _between_samples(engine: Collocation, theta: Tensor, linearised: Linearised, areas: Tensor) -> Sequence[Tensor]:

@@ -23,7 +23,7 @@ from fdi_torch.plant.effect import Placement, Stage
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.operating_range import OperatingRange
 from fdi_torch.simulate.collocation import Collocation
-from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
+from fdi_torch.simulate.joint_collocation import with_blanks
 from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.scan import scan_in_time
 
@@ -208,11 +208,7 @@ class _ProjectedRegression:
 def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tensor:
     """Changes of the readings (S, C, M), in their unit, for each start."""
     engine = fitter.engine(fit.candidate, list(fit.effect_values))
-    pieces = (
-        engine.apart(fit.theta.unsqueeze(0), fit.linearised)
-        if isinstance(engine, JointCollocation)
-        else [(engine, fit.theta, fit.linearised)]
-    )
+    pieces = engine.apart(fit.theta.unsqueeze(0), fit.linearised)
     return with_blanks([_columns(fitter, fit, options, *piece) for piece in pieces], dim=0)
 
 
@@ -225,7 +221,6 @@ def _columns(
     union = fitter.network([*(p for p in fit.candidate.placements if p.prefix not in tried), *tried.values()])
     values = zip(engine.space.names, theta.flatten().tolist(), strict=True)
     constants = {n: v for n, v in values if n in union.constants}
-    theta = theta.reshape(1, -1)
     present = {p.prefix for p in engine.network.placements} - tried.keys()
     forcing_model = Forcing(
         engine.network,

@@ -26,13 +26,13 @@ from fdi_torch.gap.localization.component_regressors import (
     reading_regressors,
 )
 from fdi_torch.gap.localization.discrepancy_columns import Columns, Discrepancy, Position
-from fdi_torch.gap.localization.predicted_levels import LevelFilter, predicted_levels
+from fdi_torch.gap.localization.predicted_levels import LevelFilter
 from fdi_torch.gap.localization.recording_linearisation import RecordingLinearisation
 from fdi_torch.gap.localization.regressor_families import Breakpoints, Pulses, Relays
 from fdi_torch.gap.localization.regressors import harmonics, step_functions, time_functions
 from fdi_torch.plant.description import OUTSIDE, Sensor
 from fdi_torch.plant.scales import time_scale
-from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
+from fdi_torch.simulate.joint_collocation import with_blanks
 from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.resampling import interpolate
 
@@ -88,27 +88,19 @@ class Regressors:
 class DiscrepancyRegression:
     """Influence of the discrepancies of all components of a data set, about one fit.
 
-    frequencies: candidates for that of the sinusoids, Hz. steps: number of step functions of time, over all recordings.
-    level_filter: predicts the levels; by default that of the fitter, about the fit.
+    frequencies: candidates for that of the sinusoids, Hz. level_filter: predicts the levels.
     """
 
-    def __init__(
-        self,
-        fitter: Fitter,
-        fit: Fit,
-        frequencies: Sequence[float],
-        steps: int,
-        level_filter: LevelFilter | None = None,
-    ) -> None:
+    def __init__(self, fitter: Fitter, fit: Fit, frequencies: Sequence[float], level_filter: LevelFilter) -> None:
         self.fitter, self.fit, self.level_filter = fitter, fit, level_filter
         self.frequencies = torch.tensor(frequencies, dtype=fit.theta.dtype)
         self.engine = fitter.engine(fit.candidate, list(fit.effect_values))
         self.theta = fit.theta.unsqueeze(0)
-        self.levels = level_filter.levels(fitter, fit) if level_filter else predicted_levels(fitter, fit.linearised)
+        self.levels = level_filter.levels(fitter, fit)
         self.linearised = self.engine.linearise(self.theta, self.levels)
         self.pieces = self._pieces(replace(self.linearised, levels=self.levels))
         self._last: tuple[str, list[Regressors], Linearised] | None = None
-        self.steps = step_functions(steps, len(fitter.data.readings), len(self.pieces))
+        self.steps = step_functions(len(fitter.data.readings), len(self.pieces))
 
     def of(self, place: str, positions: Sequence[Position] = ()) -> Discrepancy:
         """The discrepancy of all regressors of the grid, and of those at some positions between them."""
@@ -171,8 +163,7 @@ class DiscrepancyRegression:
         """Influence (S, C, M) of local functions (M, K) along one recording on its readings, not whitened."""
         piece, channel = self.pieces[recording], self.sensor(place)
         if channel is None:
-            component = discrepancy_model_at(place, self.fitter.data.plant)
-            rates = (self._rate_changes(piece, component, some) for some in functions.split(BATCH))
+            rates = (self._rate_changes(piece, place, some) for some in functions.split(BATCH))
             return side_by_side([piece.to_readings(some) for some in rates])
         columns = functions.new_zeros(functions.shape[1], self.fitter.data.readings.shape[1], len(functions))
         columns[:, channel] = functions.T
@@ -184,13 +175,7 @@ class DiscrepancyRegression:
         return self.pieces[recording].to_readings(rates)
 
     def _pieces(self, linearised: Linearised) -> list[RecordingLinearisation]:
-        whole = self.engine
-        parts = (
-            whole.apart(self.theta, linearised)
-            if isinstance(whole, JointCollocation)
-            else [(whole, self.theta, linearised)]
-        )
-        pieces = []
+        parts, pieces = self.engine.apart(self.theta, linearised), []
         for rows, (engine, theta, linearised_part) in zip(self.fitter.data.rows, parts, strict=True):
             values = engine.network.bind(engine.space, theta.unsqueeze(-2))
             present = [p.prefix for p in engine.network.placements]
@@ -236,13 +221,18 @@ class DiscrepancyRegression:
             regressors.append(Regressors(functions, widths, fine, in_time, s["time"], one, self.frequencies))
         return regressors, self.engine.linearise(self.theta, levels)
 
-    def _rate_changes(self, piece: RecordingLinearisation, component: DiscrepancyModel, flows: Tensor) -> Tensor:
-        """Map flows (M, K) from source to target to changes of the rates (n, M, K)."""
+    def _rate_changes(self, piece: RecordingLinearisation, place: str, flows: Tensor) -> Tensor:
+        """Map flows (M, K) at a place to changes of the rates (n, M, K)."""
         inflows: list[Tensor | None] = [None] * len(self.fitter.data.plant.tanks)
-        for end, sign in ((component.source, -1.0), (component.target, 1.0)):
-            if end != OUTSIDE:
-                inflows[self.tank(end)] = sign * flows
+        for tank, sign in self.ends(place):
+            inflows[tank] = sign * flows
         return piece.forcing.by_inflows(inflows, len(flows))
+
+    def ends(self, place: str) -> list[tuple[int, float]]:
+        """The tanks whose balances the discrepancy flow at a place changes, each with the sign."""
+        component = discrepancy_model_at(place, self.fitter.data.plant)
+        ends = (component.source, -1.0), (component.target, 1.0)
+        return [(self.tank(tank), sign) for tank, sign in ends if tank != OUTSIDE]
 
     def _functions_of_time(self, piece: RecordingLinearisation, time: Tensor) -> Tensor:
         """Steps and ramps, (M, K)."""

@@ -22,11 +22,9 @@ from torch import Tensor
 from fdi_torch.estimate.linear_parameters import decomposed, without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.localization.component_regressors import discrepancy_model_at
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.regressor_families import Pulses
 from fdi_torch.gap.localization.sparse_regression import regressor_costs
-from fdi_torch.plant.description import OUTSIDE
 from fdi_torch.simulate.linearised import Linearised
 
 SIGNS = 64  # random sign vectors; the diagonal of C'C is then accurate to about 20 %
@@ -59,8 +57,8 @@ class SingleRegressorGains:
     under: fitter with the disturbance noise.
     """
 
-    def __init__(self, regression: DiscrepancyRegression, under: Fitter, fit: Fit, generator: torch.Generator) -> None:
-        self.regression, self.under, self.fit = regression, under, fit
+    def __init__(self, regression: DiscrepancyRegression, under: Fitter, generator: torch.Generator) -> None:
+        self.regression, self.under, self.fit, fit = regression, under, regression.fit, regression.fit
         self._largest = largest_influence(under)
         self._basis = parameter_basis(under, fit, regression.linearised)
         residual = whitened_residual(under, fit, regression.linearised)
@@ -69,14 +67,14 @@ class SingleRegressorGains:
 
     def at(self, place: str) -> SingleRegressorGain:
         channel = self.regression.sensor(place)
-        weights = self._inflow_weights(place) if channel is None else self._reading_weights(place, channel)
+        if channel is None:
+            weights = inflow_weights(self.regression, place, self._adjoints)
+        else:
+            weights = self._reading_weights(place, channel)
         grid, families = self._products(place, weights), position_products(self.regression, place, weights)
         groups = [(grid, len(grid)), *zip(families, choices_of(self.regression, place), strict=True)]
         gains = (_largest_gain(group, choices, self._largest) for group, choices in groups if len(group))
         return max(gains, key=lambda g: g.net)
-
-    def _inflow_weights(self, place: str) -> list[Tensor]:
-        return inflow_weights(self.regression, place, self._adjoints)
 
     def _reading_weights(self, place: str, channel: int) -> list[Tensor]:
         """Per recording, the weights (1 + SIGNS, K) of a sensor's readings, about the model's level of its tank."""
@@ -197,11 +195,5 @@ def _whitened_adjoint(under: Fitter, columns: Tensor, basis: Tensor) -> Tensor:
 
 def inflow_weights(regression: DiscrepancyRegression, place: str, adjoints: Adjoints) -> list[Tensor]:
     """Per recording, the weights (., K) of a flow at a place."""
-    component, weights = discrepancy_model_at(place, regression.fitter.data.plant), []
-    for inflows in adjoints.inflows:
-        net = torch.zeros_like(inflows[0])
-        for end, sign in ((component.source, -1.0), (component.target, 1.0)):
-            if end != OUTSIDE:
-                net += sign * inflows[regression.tank(end)]
-        weights.append(net)
-    return weights
+    ends = regression.ends(place)
+    return [torch.stack([sign * inflows[tank] for tank, sign in ends]).sum(dim=0) for inflows in adjoints.inflows]
