@@ -99,7 +99,7 @@ def _noise_free(
     planned = replace(recording, outputs=blank, output_names=names, output_units=units, mask=torch.isfinite(blank))
     data = data_set_of(plant, nominal_effects, planned, step)
     std = noise * torch.tensor([abs(s.gain) for s in plant.sensors], dtype=torch.float64)
-    white = Noise(std, torch.zeros_like(std))
+    white = Noise.white(std)
     engine = Fitter(data, white).engine(Candidate(), ())
     theta = engine.space.nominal().unsqueeze(0)
     readings = engine.converge(theta).readings[0]

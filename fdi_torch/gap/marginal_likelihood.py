@@ -18,7 +18,7 @@ from torch import Tensor
 
 from fdi_torch.estimate.evidence import log_det
 from fdi_torch.estimate.evidence import log_prior as prior_of_set
-from fdi_torch.estimate.kalman import KalmanWhitening, Propagation, SensorNoise, StateNoise
+from fdi_torch.estimate.kalman import KalmanFilter, KalmanWhitening, Propagation, SensorNoise, StateNoise
 from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
@@ -55,7 +55,7 @@ def with_disturbances(fitter: Fitter, fit: Fit, noise: StateNoise, linearised: L
 
     def whitening() -> KalmanWhitening:
         along = propagation_of(fitter, fit, linearised or fit.linearised)
-        return KalmanWhitening(along, _sensors(fitter), noise)
+        return KalmanFilter(along, _sensors(fitter)).under(noise)
 
     return Fitter(fitter.data, fitter.noise, Recomputed(whitening))
 

@@ -103,7 +103,7 @@ def detection_time(fitter: Fitter) -> float:
     whitening = fitter.whitening
     if whitening is None:
         return math.inf
-    propagation, noise = whitening.propagation, whitening.noise
+    propagation, noise = whitening.own.propagation, whitening.noise
     areas = torch.tensor([t.area for t in fitter.data.plant.tanks], dtype=torch.float64)
     sensitivity = propagation.output.abs().amax(dim=0)[:, : len(areas)]
     std = fitter.noise.std * noise.scale

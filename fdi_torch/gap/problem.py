@@ -61,17 +61,16 @@ class DiagnosisProblem:
     """library: the effects to search. known_effects: limits of sensors, and stuck sensors, that the readings show
     without a model. data: the recordings, for the plant with these effects and without sensors that are stuck
     throughout. holdouts: the hold-outs, likewise. outliers: masked readings of the recordings, and of the hold-outs.
-    most, named_only: as in `Settings`. remarks: on what was changed in the plant."""
+    remarks: on what was changed in the plant."""
 
     library: tuple[Placement, ...]
     recordings: tuple[Recording, ...]
     known_effects: list[Placement]
     data: DataSet
     holdouts: tuple[DataSet, ...]
-    most: int
-    named_only: bool = False
-    outliers: tuple[Sequence[SensorOutliers], Sequence[SensorOutliers]] = ((), ())
-    remarks: Sequence[str] = ()
+    settings: Settings
+    outliers: tuple[Sequence[SensorOutliers], Sequence[SensorOutliers]]
+    remarks: Sequence[str]
 
 
 def problem_of(
@@ -107,8 +106,10 @@ def problem_of(
     data, *holdout_data = (
         checked_data_set(plant, nominal_effects, r, settings.step) for r in (recordings, *((h,) for h in holdouts))
     )
-    more = settings.most, settings.named_only, (outliers, holdout_outliers), rims
-    return DiagnosisProblem(library, tuple(recordings), known_effects, data, tuple(holdout_data), *more)
+    masked = outliers, holdout_outliers
+    return DiagnosisProblem(
+        library, tuple(recordings), known_effects, data, tuple(holdout_data), settings, masked, rims
+    )
 
 
 def _without_outliers(

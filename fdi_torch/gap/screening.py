@@ -41,7 +41,7 @@ class Option:
 
     @property
     def cause(self) -> tuple[str, str]:
-        return self.placement.effect.name, self.placement.location
+        return self.placement.cause
 
     @property
     def permanent(self) -> bool:
@@ -148,12 +148,20 @@ def products(fitter: Fitter, fit: Fit, options: Sequence[Option], besides: Seque
 
     besides: parameters of the fit that are not projected out.
     """
-    return _ProjectedRegression.of(fitter, fit, besides).products(options)
+    regression = _ProjectedRegression.of(fitter, fit, besides)
+    white, shared, score = regression.projected(effect_columns(fitter, fit, options))
+    return score, (white @ white.mT).sum(dim=0) - shared @ shared.T
 
 
 def pairs_of(fitter: Fitter, fit: Fit, screening: ScreeningResult) -> Pairs:
     """The regression on pairs of the most promising options of a screening under the same noise."""
-    return _ProjectedRegression.of(fitter, fit).pairs(screening)
+    chosen = set(most_visible(screening.options, screening.strength).values())
+    best: dict[tuple[str, str], int] = {}
+    for i in torch.argsort(screening.gain, descending=True).tolist():
+        best.setdefault(screening.options[i].cause, i)
+    chosen |= set(best.values())
+    options = tuple(screening.options[i] for i in sorted(chosen))
+    return Pairs(options, *products(fitter, fit, options))
 
 
 @dataclass(frozen=True)
@@ -165,7 +173,6 @@ class _ProjectedRegression:
     """
 
     fitter: Fitter
-    fit: Fit
     remaining: Tensor
     basis: Tensor
 
@@ -178,31 +185,19 @@ class _ProjectedRegression:
         basis, _ = decomposed((jacobian[..., kept] * scale).flatten(0, 1), weight)
         remaining = without(basis, torch.cat([residual.flatten(), -deviation]).unsqueeze(1))
         remaining, basis = (x[: residual.numel()].reshape(*residual.shape, -1) for x in (remaining, basis))
-        return _ProjectedRegression(fitter, fit, remaining[..., 0], basis)
+        return _ProjectedRegression(fitter, remaining[..., 0], basis)
 
-    def screened(self, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """Score and strength of M options, (M,) each; columns (S, C, M): change of the readings by each option."""
+    def projected(self, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Whitened changes of the readings by M options (C, M, S), their products with the basis (M, P), and their
+        score (M,); columns (S, C, M): these changes."""
         white = self.fitter.whiten(columns).permute(1, 2, 0)
         shared = (white @ self.basis.permute(1, 0, 2)).sum(dim=0)
-        score = (white @ self.remaining.T.unsqueeze(-1)).sum(dim=0).squeeze(-1)
+        return white, shared, (white @ self.remaining.T.unsqueeze(-1)).sum(dim=0).squeeze(-1)
+
+    def screened(self, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """Score and strength of M options, (M,) each."""
+        white, shared, score = self.projected(columns)
         return score, torch.linalg.vecdot(white, white).sum(dim=0) - torch.linalg.vecdot(shared, shared)
-
-    def pairs(self, screening: ScreeningResult) -> Pairs:
-        """The regression on pairs of the most promising options."""
-        chosen = set(most_visible(screening.options, screening.strength).values())
-        best: dict[tuple[str, str], int] = {}
-        for i in torch.argsort(screening.gain, descending=True).tolist():
-            best.setdefault(screening.options[i].cause, i)
-        chosen |= set(best.values())
-        options = tuple(screening.options[i] for i in sorted(chosen))
-        return Pairs(options, *self.products(options))
-
-    def products(self, options: Sequence[Option]) -> tuple[Tensor, Tensor]:
-        """Score (M,) and gram (M, M) of options."""
-        white = self.fitter.whiten(effect_columns(self.fitter, self.fit, options)).permute(1, 2, 0)
-        shared = (white @ self.basis.permute(1, 0, 2)).sum(dim=0)
-        score = (white @ self.remaining.T.unsqueeze(-1)).sum(dim=0).squeeze(-1)
-        return score, (white @ white.mT).sum(dim=0) - shared @ shared.T
 
 
 def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tensor:

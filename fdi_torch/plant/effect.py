@@ -157,6 +157,11 @@ class Placement:
     def prefix(self) -> str:
         return f"{self.location}.{self.effect.name}"
 
+    @property
+    def cause(self) -> tuple[str, str]:
+        """Name of the effect, and place."""
+        return self.effect.name, self.location
+
     def full_name(self, parameter: str) -> str:
         """'T1.leak.size' for the parameter 'size' of a leak at T1."""
         return str(ParameterName(self.location, self.effect.name, parameter))

@@ -124,8 +124,7 @@ def _run(data: DataSet, start_samples: int, skipped: int) -> Prediction:
     if not bool(early.any()):
         source = data.recording.source
         raise ValueError(f"{source}: expected readings among the first {start_samples} samples, got none")
-    std = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
-    fitter = Fitter(replace(data, mask=early), Noise(1e-2 * std, torch.zeros_like(std)))
+    fitter = Fitter(replace(data, mask=early), Noise.rough(data.readings))
     engine, theta = _start_from_segment(fitter, skipped) if skipped else _start_from_samples(fitter)
     run = engine.converge(theta)
     readings = run.readings[0]

@@ -105,9 +105,10 @@ def refit(
     fixed = {*plant.tolerances, *held_names}
     start = {n: v for n, v in _initial_values(plant, recordings).items() if n not in fixed}
     free = [p for p in placements if p.prefix in by_prefix(start)]
-    std = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
-    size = 1e-2 * std if white is None else white * std.new_tensor([abs(s.gain) for s in plant.sensors])
-    fitter = Fitter(data, Noise(size, torch.zeros_like(std)))
+    noise = Noise.rough(data.readings)
+    if white is not None:
+        noise = Noise.white(white * data.readings.new_tensor([abs(s.gain) for s in plant.sensors]))
+    fitter = Fitter(data, noise)
     null = _with_a_trajectory(fit_by_continuation(fitter, Candidate()), recordings)
     fit, base = null, null if white is None else None
     for _ in range(TURNS if white is None else 1):

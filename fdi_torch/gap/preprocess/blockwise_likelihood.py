@@ -166,7 +166,7 @@ def blockwise_fit(
 def _fitter(data: DataSet, variance: Tensor, means: Tensor) -> Fitter:
     """A fitter that gives each channel the weight of its v_c."""
     std = torch.sqrt(variance * data.mask.sum(dim=0).clamp(min=1) / means.clamp(min=1.0))
-    return Fitter(data, Noise(std, torch.zeros_like(std)))
+    return Fitter(data, Noise.white(std))
 
 
 def prior_chi_square(fit: Fit, theta: Tensor) -> float:

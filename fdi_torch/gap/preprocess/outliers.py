@@ -105,7 +105,7 @@ def _fitted_readings(data: DataSet) -> Tensor:
     """Readings (S, C) of the plant with its constants fitted."""
     readings = torch.where(data.mask, data.readings, torch.nan)
     size = (readings - readings.nanmedian(dim=0).values).abs().nanmedian(dim=0).values.clamp(min=1e-9)
-    return Fitter(data, Noise(1e-2 * size, torch.zeros_like(size))).fit(Candidate()).linearised.readings[0]
+    return Fitter(data, Noise.white(1e-2 * size)).fit(Candidate()).linearised.readings[0]
 
 
 def _channel_outliers(recording: Recording, model: Tensor, channel: int) -> list[Outlier]:
