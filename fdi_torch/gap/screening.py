@@ -44,9 +44,15 @@ class Option:
         return self.placement.cause
 
     @property
-    def permanent(self) -> bool:
-        """Whether it acts from the beginning of the recording."""
-        return self.placement.full_name("onset") not in self.start
+    def instants(self) -> list[str]:
+        """Full names of the start's times, if it is one of a grid of onsets, or of intervals."""
+        names = [self.placement.full_name(name) for name in self.placement.effect.instants]
+        return names if all(name in self.start for name in names) else []
+
+    @property
+    def late(self) -> bool:
+        """Whether it acts from an onset on instead of from the beginning of the recording."""
+        return len(self.instants) == 1
 
 
 @dataclass(frozen=True)
@@ -111,7 +117,7 @@ def most_visible(options: Sequence[Option], strength: Tensor) -> dict[tuple[str,
     Onsets make causes separable that are not if they act from the beginning.
     """
     best: dict[tuple[str, str], int] = {}
-    for i in sorted(range(len(options)), key=lambda i: (options[i].permanent, float(strength[i])), reverse=True):
+    for i in sorted(range(len(options)), key=lambda i: (not options[i].late, float(strength[i])), reverse=True):
         best.setdefault(options[i].cause, i)
     return best
 
