@@ -56,7 +56,6 @@ class HybridResult:
     estimate: Estimate
     diagnosis: Diagnosis
     search: EvolutionResult
-    refinement: Refined
     likelihood: Problem
     correlation: Tensor
     predicted: tuple[Tensor, ...]
@@ -201,7 +200,6 @@ def conclude(
         estimate=estimate,
         diagnosis=diagnosis,
         search=search_result,
-        refinement=refinement,
         likelihood=likelihood,
         correlation=raw.correlations(theta.unsqueeze(1), lanes)[0, 0],
         predicted=tuple(predicted),
