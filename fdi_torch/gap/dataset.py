@@ -16,6 +16,7 @@ from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import Experiment, lay_out
+from fdi_torch.simulate.joint_collocation import with_blanks
 from fdi_torch.simulate.resampling import interpolate, step_means
 
 FEWEST = 0.5
@@ -130,20 +131,9 @@ def data_set_of(
     averaged: whether readings of one integration step are replaced by their mean, as in `resampling`.
     """
     each = [recordings] if isinstance(recordings, Recording) else recordings
-    first, *further = [_part(plant, recording, step, averaged) for recording in each]
-    readings, mask = [first.readings], [first.mask]
-    for part in further:
-        readings += [torch.zeros_like(part.readings[:1]), part.readings]
-        mask += [torch.zeros_like(part.mask[:1]), part.mask]
-    return DataSet(
-        plant,
-        tuple(nominal_effects),
-        first.recording,
-        first.experiment,
-        torch.cat(readings),
-        torch.cat(mask),
-        tuple(further),
-    )
+    first, *further = parts = [_part(plant, recording, step, averaged) for recording in each]
+    readings, mask = (with_blanks([getattr(p, name) for p in parts], dim=0) for name in ("readings", "mask"))
+    return DataSet(plant, tuple(nominal_effects), first.recording, first.experiment, readings, mask, tuple(further))
 
 
 def at_recorded_times(data: DataSet, values: Tensor) -> Tensor:

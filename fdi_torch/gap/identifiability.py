@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import torch
@@ -52,28 +53,16 @@ class Identifiability:
 
 def identifiability(pairs: Pairs, plant: PlantDescription) -> Identifiability:
     """Identifiability from the regression on pairs of a library."""
-    strength = torch.diagonal(pairs.gram)
-    best = most_visible(pairs.options, strength)
-    hidden = tuple(cause for cause, i in best.items() if float(strength[i]) < SHOWN)
-    return Identifiability(
-        hidden, _inseparable_pairs(plant, best, pairs.gram), {c: float(strength[i]) for c, i in best.items()}
-    )
-
-
-def _inseparable_pairs(
-    plant: PlantDescription, best: Mapping[CauseName, int], gram: Tensor
-) -> tuple[tuple[CauseName, CauseName, float], ...]:
-    """Pairs of visible causes that are nearly collinear."""
-    causes = [c for c, i in best.items() if float(gram[i, i]) >= SHOWN]
-    pairs = []
-    for k, a in enumerate(causes):
-        for b in causes[k + 1 :]:
-            i, j = best[a], best[b]
-            weaker = min(float(gram[i, i]), float(gram[j, j]))
-            separation = weaker * (1.0 - float(gram[i, j]) ** 2 / (float(gram[i, i]) * float(gram[j, j])))
-            if separation < PARTED and b not in equivalence_class(a, plant, {}):
-                pairs.append((a, b, max(separation, 0.0)))
-    return tuple(sorted(pairs, key=lambda pair: pair[2]))
+    gram, best = pairs.gram, most_visible(pairs.options, torch.diagonal(pairs.gram))
+    shown = {cause: float(gram[i, i]) for cause, i in best.items()}
+    inseparable = []
+    for a, b in combinations((c for c in shown if shown[c] >= SHOWN), 2):
+        shared = float(gram[best[a], best[b]]) ** 2 / (shown[a] * shown[b])
+        separation = min(shown[a], shown[b]) * (1.0 - shared)
+        if separation < PARTED and b not in equivalence_class(a, plant, {}):
+            inseparable.append((a, b, max(separation, 0.0)))
+    hidden = tuple(cause for cause in shown if shown[cause] < SHOWN)
+    return Identifiability(hidden, tuple(sorted(inseparable, key=lambda pair: pair[2])), shown)
 
 
 def planned_identifiability(

@@ -225,14 +225,10 @@ def checked_data_set(
 
 
 def _laid_out(
-    plant: PlantDescription,
-    nominal_effects: Sequence[Placement],
-    recordings: Recording | Sequence[Recording],
-    step: float | None,
+    plant: PlantDescription, nominal_effects: Sequence[Placement], recordings: Sequence[Recording], step: float | None
 ) -> DataSet:
     """The data set in steps of `step` s, which is kept if given; by default in accurate ones."""
-    each = [recordings] if isinstance(recordings, Recording) else recordings
-    data = data_set_of(plant, nominal_effects, each, step or _step(plant, each), averaged=True)
+    data = data_set_of(plant, nominal_effects, recordings, step or _step(plant, recordings), averaged=True)
     return with_accurate_steps(data) if step is None else data
 
 
