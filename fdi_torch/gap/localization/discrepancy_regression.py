@@ -19,11 +19,11 @@ from fdi_torch.gap.localization.component_regressors import (
     DiscrepancyModel,
     FineRegressor,
     FineRegressors,
-    SignalRanges,
+    LocalSignals,
     Signals,
+    Terms,
     discrepancy_model_at,
-    fine_reading_regressors,
-    reading_regressors,
+    reading_terms,
 )
 from fdi_torch.gap.localization.discrepancy_columns import Columns, Discrepancy, Position
 from fdi_torch.gap.localization.predicted_levels import LevelFilter
@@ -100,6 +100,7 @@ class DiscrepancyRegression:
         self.linearised = self.engine.linearise(self.theta, self.levels)
         self.pieces = self._pieces(replace(self.linearised, levels=self.levels))
         self._last: tuple[str, list[Regressors], Linearised] | None = None
+        self.scale = time_scale(fitter.data.plant)
         self.steps = step_functions(len(fitter.data.readings), len(self.pieces))
 
     def of(self, place: str, positions: Sequence[Position] = ()) -> Discrepancy:
@@ -189,16 +190,11 @@ class DiscrepancyRegression:
             {n: x.reshape(-1).expand(len(p.middle)) for n, x in component.signals(p.forcing).items()}
             for p in self.pieces
         ]
-        ends, regressors = SignalRanges(signals), []
+        regressors = []
         for piece, s in zip(self.pieces, signals, strict=True):
-            step, factor = piece.engine.experiment.steps, s[component.in_time]
-            functions, widths = _stacked(component.flows(s, step, ends))
-            areas, of_areas = _stacked(component.areas(s, step, ends)) if component.areas else (None, ())
-            fine, in_time = component.fine(s, step, ends), factor * self._functions_of_time(piece, piece.middle)
-            widths = of_areas + widths
-            regressors.append(
-                Regressors(functions, widths, fine, in_time, piece.middle, factor, self.frequencies, areas)
-            )
+            at = LocalSignals(s, piece.engine.experiment.steps, self.scale, signals)
+            areas = component.areas(at) if component.areas else None
+            regressors.append(self._regressors(piece, component.terms(at), piece.middle, s[component.in_time], areas))
         return regressors
 
     def _of_sensor(self, sensor: Sensor) -> tuple[list[Regressors], Linearised]:
@@ -213,13 +209,25 @@ class DiscrepancyRegression:
                 {"reading": sensor.gain * interpolate(times, nodes, tank_levels) + sensor.offset, "time": times}
             )
             first += len(nodes)
-        ends, scale, regressors = SignalRanges(signals), time_scale(self.fitter.data.plant), []
+        regressors = []
         for piece, s in zip(self.pieces, signals, strict=True):
-            functions, widths = _stacked(reading_regressors(s, piece.engine.experiment.sample_intervals, ends, scale))
-            fine, in_time = fine_reading_regressors(s, ends), self._functions_of_time(piece, s["time"])
-            one = torch.ones_like(s["time"])
-            regressors.append(Regressors(functions, widths, fine, in_time, s["time"], one, self.frequencies))
+            at = LocalSignals(s, piece.engine.experiment.sample_intervals, self.scale, signals)
+            regressors.append(self._regressors(piece, reading_terms(at), s["time"], torch.ones_like(s["time"])))
         return regressors, self.engine.linearise(self.theta, levels)
+
+    def _regressors(
+        self,
+        piece: RecordingLinearisation,
+        terms: Sequence[Terms],
+        time: Tensor,
+        factor: Tensor,
+        areas: Terms | None = None,
+    ) -> Regressors:
+        functions, widths = _stacked([f for term in terms for f in term.grid])
+        of_areas, widths_of_areas = _stacked(areas.grid) if areas else (None, ())
+        in_time = factor * torch.stack(time_functions(time, float(piece.engine.experiment.nodes[-1]), self.steps))
+        fine = [family for term in terms for family in term.fine]
+        return Regressors(functions, widths_of_areas + widths, fine, in_time, time, factor, self.frequencies, of_areas)
 
     def _rate_changes(self, piece: RecordingLinearisation, place: str, flows: Tensor) -> Tensor:
         """Map flows (M, K) at a place to changes of the rates (n, M, K)."""
@@ -233,11 +241,6 @@ class DiscrepancyRegression:
         component = discrepancy_model_at(place, self.fitter.data.plant)
         ends = (component.source, -1.0), (component.target, 1.0)
         return [(self.tank(tank), sign) for tank, sign in ends if tank != OUTSIDE]
-
-    def _functions_of_time(self, piece: RecordingLinearisation, time: Tensor) -> Tensor:
-        """Steps and ramps, (M, K)."""
-        duration = float(piece.engine.experiment.nodes[-1])
-        return torch.stack(time_functions(time, duration, self.steps))
 
     def tank(self, name: str) -> int:
         return [t.name for t in self.fitter.data.plant.tanks].index(name)
