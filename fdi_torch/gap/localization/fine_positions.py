@@ -31,12 +31,12 @@ from fdi_torch.gap.localization.single_regressor_gain import (
     adjoints_of,
     choices_of,
     gains_of,
-    inflow_weights,
     largest_influence,
     parameter_basis,
     position_products,
     random_signs,
     strengths_of,
+    weights_of,
     whitened_residual,
 )
 from fdi_torch.gap.localization.sparse_regression import COLLINEAR, VISIBLE, regressor_costs
@@ -147,10 +147,7 @@ class Positions:
     def _weights(self, white: Tensor, basis: Tensor) -> list[Tensor]:
         """Whitened columns (S C + P, W), less what the basis explains of these, as weights (W, K) of a regressor along
         each recording."""
-        adjoints = adjoints_of(self.regression, self.under, white, basis)
-        if (channel := self.regression.sensor(self.place)) is None:
-            return inflow_weights(self.regression, self.place, adjoints)
-        return [adjoints.readings[piece.rows, channel].T for piece in self.regression.pieces]
+        return weights_of(self.regression, self.place, adjoints_of(self.regression, self.under, white, basis))
 
     def with_best_frequency(self, discrepancy: Discrepancy, precision: Tensor) -> Discrepancy:
         """The discrepancy with the frequency at which its sinusoids explain most beside the other regressors that it
