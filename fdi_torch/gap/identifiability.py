@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fdi_torch.effects import effect
+from fdi_torch.effects import effects_of
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
@@ -69,7 +69,7 @@ def planned_identifiability(
     plant: PlantDescription, recording: Recording, noise: float, library: Sequence[str] | None = None
 ) -> Identifiability:
     """Identifiability under planned inputs; readings are ignored. noise: standard deviation of a sensor's level, m."""
-    nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    nominal_effects = effects_of(plant)
     step = float(torch.median(torch.diff(recording.time)))
     fitter = _noise_free(plant, nominal_effects, recording, step, noise)
     nominal_fit = fitter.fit(Candidate())

@@ -9,7 +9,7 @@ from functools import partial
 
 import torch
 
-from fdi_torch.effects import effect
+from fdi_torch.effects import effects_of
 from fdi_torch.effects.stuck import Stuck
 from fdi_torch.gap.accurate_steps import with_accurate_steps
 from fdi_torch.gap.dataset import DataSet, data_set_of
@@ -96,7 +96,7 @@ def problem_of(
     plant = _without_stuck_sensors(plant, recordings, stuck)
     _check_readings(plant, recordings)
     library = tuple(p for p in library if p.location in plant.locations())
-    nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    nominal_effects = effects_of(plant)
     recordings, outliers = _without_outliers(plant, nominal_effects, recordings, settings.step)
     holdouts, holdout_outliers = _without_outliers(plant, nominal_effects, holdouts, settings.step)
     known_effects = limits_from_readings(plant, recordings, nominal_effects, library)

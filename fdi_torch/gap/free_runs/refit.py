@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from fdi_torch.effects import build_network, effect
+from fdi_torch.effects import build_network, effect, effects_of
 from fdi_torch.gap.answer import with_constants
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter, standard_errors
@@ -30,7 +30,6 @@ from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.names import matching
 from fdi_torch.parameters import ParameterName, by_prefix, common_name, name_in_recording
 from fdi_torch.plant.description import PlacedEffect, PlantDescription, with_tolerances
-from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of_all
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.plant_limits import expect_no_denied_rim
@@ -95,7 +94,7 @@ def refit(
     plant = replace(plant, effects=tuple(e for e in plant.effects if e.prefix not in omitted))
     plant = with_tolerances(plant, lambda name: name.prefix not in omitted)
     held_plant = with_tolerances(with_varying(plant, vary), lambda name: str(name) not in held_names)
-    placements = [Placement(effect(e.effect), e.location, e.parameters) for e in plant.effects]
+    placements = effects_of(plant)
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     for recording in recordings:
         expect_right_units(held_plant, recording)

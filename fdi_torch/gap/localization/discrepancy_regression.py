@@ -124,13 +124,13 @@ class DiscrepancyRegression:
         choices[sinusoids] *= 2 * len(grid)
         discrepancy = Discrepancy(columns, linearised, regressor, choices, frequency, sinusoids)
         for position in positions:
-            discrepancy = discrepancy.with_column(self.column(place, position), position)
+            discrepancy = discrepancy.with_column(self.columns(place, [position])[..., 0], position)
         return discrepancy
 
-    def column(self, place: str, position: Position) -> Tensor:
-        """Influence (S, C) of the regressor at a position."""
-        functions = [r.at(position, k).unsqueeze(0) for k, r in enumerate(self.at(place)[0])]
-        return with_blanks([self.influence(place, k, f) for k, f in enumerate(functions)], dim=0)[..., 0]
+    def columns(self, place: str, positions: Sequence[Position]) -> Tensor:
+        """Influence (S, C, M) of the regressors at positions."""
+        functions = [torch.stack([r.at(p, k) for p in positions]) for k, r in enumerate(self.at(place)[0])]
+        return with_blanks([self.influence(place, k, f) for k, f in enumerate(functions)], dim=0)
 
     def sinusoids(self, place: str, frequency: Tensor) -> Tensor:
         """Influence (S, C, F, W) of harmonics of each frequency (F,), with separate amplitudes in each recording."""
