@@ -34,8 +34,7 @@ MOST_DIVISION, MOST_ADDED = 8, 20_000
 def with_accurate_steps(data: DataSet) -> DataSet:
     """The data set with its steps divided until each is as accurate as the noise of the readings requires."""
     network = TankNetwork(data.plant, data.nominal_effects)
-    first, *further = (_accurate(network, part) for part in data.parts)
-    return replace(data, experiment=first.experiment, further=tuple(further))
+    return replace(data, experiments=tuple(_accurate(network, part).experiment for part in data.parts))
 
 
 def _accurate(network: TankNetwork, part: RecordingPart) -> RecordingPart:

@@ -92,7 +92,7 @@ def _noise_free(
     engine = Fitter(data, white).engine(Candidate(), ())
     theta = engine.space.nominal().unsqueeze(0)
     readings = engine.converge(theta).readings[0]
-    return Fitter(replace(data, readings=readings, recording=replace(planned, outputs=readings)), white)
+    return Fitter(replace(data, readings=readings, recordings=(replace(planned, outputs=readings),)), white)
 
 
 def unsearched_twins(

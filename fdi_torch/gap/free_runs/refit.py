@@ -22,7 +22,7 @@ from fdi_torch.gap.answer import with_constants
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.channel_noise import Noise, estimate_noise
-from fdi_torch.gap.dataset import DataSet, RecordingPart
+from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.free_runs.between_runs import DETERMINED, RunConstant
 from fdi_torch.gap.free_runs.prediction import rmse_by_sensor, with_varying
 from fdi_torch.gap.preprocess.sensor_limits import limits_of
@@ -34,7 +34,6 @@ from fdi_torch.plant.operating_range import operating_range_of_all
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.plant_limits import expect_no_denied_rim
 from fdi_torch.recordings.plant_units import expect_right_units
-from fdi_torch.simulate.experiment import Experiment
 
 TURNS = 3  # alternations between noise and fit
 WIDE = 0.5  # share of a range; a larger standard error means undetermined
@@ -233,8 +232,4 @@ def trajectory_found(fit: Fit) -> bool:
 
 
 def _smoothed(data: DataSet, widening: float) -> DataSet:
-    def wider(experiment: Experiment) -> Experiment:
-        return replace(experiment, resolution=widening * experiment.resolution)
-
-    further: list[RecordingPart] = [replace(part, experiment=wider(part.experiment)) for part in data.further]
-    return replace(data, experiment=wider(data.experiment), further=tuple(further))
+    return replace(data, experiments=tuple(replace(e, resolution=widening * e.resolution) for e in data.experiments))
