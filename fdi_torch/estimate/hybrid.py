@@ -183,7 +183,7 @@ def conclude(
     )
     first = raw.terms[0]
     levels = first.engine.levels(first.theta(theta))[0].mean(dim=0)
-    channels = [fitting.recordings[0].input_names.index(c) for c in fitting.plant.channels()]
+    channels = fitting.recordings[0].input_columns(fitting.plant.channels())
     means = fitting.recordings[0].inputs[:, channels].mean(dim=0)
     diagnosis = diagnose(
         fitting.networks[0],

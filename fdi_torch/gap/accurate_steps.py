@@ -38,8 +38,7 @@ def with_accurate_steps(data: DataSet) -> DataSet:
 
 
 def _accurate(network: TankNetwork, part: RecordingPart) -> RecordingPart:
-    recording, columns = part.recording, [s.column for s in network.description.sensors]
-    order = [recording.output_names.index(column) for column in columns]
+    recording, order = part.recording, part.recording.output_columns(network.description.outputs())
     least = least_noise(recording.outputs[:, order].nan_to_num(), recording.mask[:, order])
     noise = torch.maximum(sample_noise(part.readings.nan_to_num(), part.mask), least)
     errors = errors_by_readings(part, noise)

@@ -151,12 +151,7 @@ def at_recorded_times(data: DataSet, values: Tensor) -> Tensor:
 
 
 def _part(plant: PlantDescription, recording: Recording, step: float, averaged: bool) -> RecordingPart:
-    names = [s.column for s in plant.sensors]
-    missing = [n for n in names if n not in recording.output_names]
-    if missing:
-        columns = ", ".join(recording.output_names) or "none"
-        raise ValueError(f"{recording.source}: expected a sensor '{missing[0]}', got {columns}; map the column to it")
-    order = [recording.output_names.index(n) for n in names]
+    order = recording.output_columns(plant.outputs())
     experiment = lay_out(recording, plant.channels(), step)
     readings, mask = recording.outputs[:, order], recording.mask[:, order]
     if averaged:
