@@ -10,7 +10,6 @@ from typing import Any, Literal
 import torch
 
 from fdi_torch.clock import stamp
-from fdi_torch.names import unknown
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
 
 Hold = Literal["zero_order", "linear"]
@@ -89,6 +88,21 @@ class Recording(Shown):
     def readings(self) -> torch.Tensor:
         """The outputs (T, N), NaN where masked."""
         return torch.where(self.mask, self.outputs, torch.nan)
+
+    def input_columns(self, names: Sequence[str]) -> list[int]:
+        """Columns of these inputs. Raises ValueError for one that is not recorded."""
+        return self._indices("an input", names, self.input_names)
+
+    def output_columns(self, names: Sequence[str]) -> list[int]:
+        """Columns of these outputs. Raises ValueError for one that is not recorded."""
+        return self._indices("a sensor", names, self.output_names)
+
+    def _indices(self, kind: str, names: Sequence[str], present: Sequence[str]) -> list[int]:
+        for name in names:
+            if name not in present:
+                got = ", ".join(present) or "none"
+                raise ValueError(f"{self.source}: expected {kind} '{name}', got {got}; map the column to it")
+        return [present.index(name) for name in names]
 
     def valid_readings(self, name: str) -> torch.Tensor:
         """The valid readings (K,) of an output; none if it is not recorded."""
@@ -189,12 +203,7 @@ class Recording(Shown):
 
     def selected(self, inputs: Sequence[str], outputs: Sequence[str]) -> Recording:
         """The recording with these channels only, in this order. Raises ValueError for a missing one."""
-        for kind, names, present in (("an input", inputs, self.input_names), ("an output", outputs, self.output_names)):
-            for name in names:
-                if name not in present:
-                    raise ValueError(f"{self.source}: {unknown(kind, name, present)}")
-        input_columns = [self.input_names.index(name) for name in inputs]
-        output_columns = [self.output_names.index(name) for name in outputs]
+        input_columns, output_columns = self.input_columns(inputs), self.output_columns(outputs)
         return replace(
             self,
             inputs=self.inputs[:, input_columns],

@@ -240,6 +240,15 @@ def test_starts_lie_in_the_box_and_one_of_them_shows(plant: str, place: str) -> 
     assert bool(torch.isfinite(first_starts(plant)[place]).all())
 
 
+@everywhere
+def test_its_instants_are_times_with_several_starts(plant: str, place: str) -> None:
+    r, placement = rig(plant), rig(plant).placement(place)
+    times = [placement.full_name(name) for name in placement.effect.instants]
+    assert all(r.space[name].unit == "s" for name in times)
+    grid = {tuple(start[name] for name in times) for start in r.starts(place) if start.keys() >= set(times)}
+    assert not times or len(grid) > 1
+
+
 @at_each_kind
 def test_alone_equals_in_batch_beside_a_lane_of_nan(plant: str, place: str) -> None:
     assert torch.equal(alone(plant, place).started_in_batch, alone(plant, place).started)

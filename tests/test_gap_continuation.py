@@ -42,6 +42,6 @@ def test_continuation_runs_from_the_smoothest_plant_to_the_sharp_one(monkeypatch
     assert trajectory_found(found)
     assert Stiff.asked == [(1.0, False), (WIDENINGS[0], False), *((w, True) for w in WIDENINGS[1:]), (1.0, True)]
     Stiff.asked = []
-    easy = replace(data, experiment=replace(data.experiment, resolution=30.0 * data.experiment.resolution))
+    easy = replace(data, experiments=(replace(data.experiment, resolution=30.0 * data.experiment.resolution),))
     assert trajectory_found(fit_by_continuation(Stiff(easy, None), Candidate()))  # type: ignore[arg-type]
     assert len(Stiff.asked) == 1

@@ -16,6 +16,7 @@ from fdi_torch.gap.diagnose import Settings, recalibrate
 from fdi_torch.gap.localization import single_regressor_gain as promise
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.fine_positions import HALVINGS, around, best_parameters
+from fdi_torch.gap.localization.predicted_levels import LevelFilter
 from fdi_torch.gap.localization.regressor_families import Breakpoints, Pulses, Relays
 from fdi_torch.gap.localization.regressors import relay_thresholds
 from fdi_torch.gap.marginal_likelihood import with_estimated_noise
@@ -34,11 +35,17 @@ def surveyed(request: pytest.FixtureRequest) -> tuple[DiscrepancyRegression, Fit
     if request.param:
         lag = Candidate((Placement(effect("sensor_lag"), "h2"),), ({"h2.sensor_lag.time_constant": 3.0},))
         null = under.fit(lag, null)
-    return DiscrepancyRegression(under, null, (1.0 / 60.0,), 40), under, null
+    return DiscrepancyRegression(under, null, (1.0 / 60.0,), level_filter(under)), under, null
+
+
+def level_filter(under: Fitter) -> LevelFilter:
+    """The filter of a fitter."""
+    assert under.whitening is not None
+    return LevelFilter(under.whitening.noise)
 
 
 def gain_at(survey: DiscrepancyRegression, under: Fitter, null: Fit, place: str) -> float:
-    return promise.SingleRegressorGains(survey, under, null, torch.Generator().manual_seed(5)).at(place).net
+    return promise.SingleRegressorGains(survey, under, torch.Generator().manual_seed(5)).at(place).net
 
 
 def products(
@@ -95,7 +102,7 @@ def test_random_flows_that_the_parameters_cannot_explain_promise_nothing_at_a_so
     case = problem_of(nominal_plant(), (real,), (), Settings())
     fitter, null, _ = recalibrate(case.data)
     under, _ = with_estimated_noise(fitter, null)
-    survey = DiscrepancyRegression(under, null, (), 40)
+    survey = DiscrepancyRegression(under, null, (), level_filter(under))
     assert max(gain_at(survey, under, null, place) for place in ("P13", "P32", "OUT2")) < 10.0
 
 
@@ -107,7 +114,7 @@ def test_a_step_between_two_nodes_is_expected_to_gain_what_it_does() -> None:
     case = problem_of(nominal_plant(), (replace(recording, outputs=readings),), (), Settings())
     fitter, null, _ = recalibrate(case.data)
     under, _ = with_estimated_noise(fitter, null)
-    survey = DiscrepancyRegression(under, null, (), 40)
+    survey = DiscrepancyRegression(under, null, (), level_filter(under))
     step = torch.zeros_like(readings)
     step[404:, 2] = 1.0
     basis = promise.parameter_basis(under, null, survey.at("h3")[1])

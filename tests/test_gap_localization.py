@@ -199,7 +199,7 @@ def test_noise_and_evidence_of_a_discrepancy_refer_to_one_trajectory(
     far_from_the_plant: tuple[Fitter, Fit, StateNoise],
 ) -> None:
     fitter, fit, noise = far_from_the_plant
-    about = DiscrepancyRegression(fitter, fit, (), 20).linearised
+    about = DiscrepancyRegression(fitter, fit, (), LevelFilter(noise)).linearised
     likely = estimate_disturbances(fitter, fit, about, start=noise, climb=False)
     under = with_disturbances(fitter, fit, likely.noise, about)
     least = -0.5 * under.log_det + likely.noise.log_prior() - 0.5 * least_chi_square(under, fit, about)
@@ -211,14 +211,14 @@ def test_the_thresholds_of_a_relay_are_found_between_those_of_the_grid(nearest: 
     """An outlet that gains 1 % of flow while a relay of its head is on. nearest: thresholds of the grid near those."""
     case = problem_of(nominal_plant(), (recorded({}, 8, samples=2500),), (), Settings())
     plain, null, _ = recalibrate(case.data)
-    fitter, _ = with_estimated_noise(plain, null)
-    regression = DiscrepancyRegression(fitter, null, (), 20)
+    fitter, likely = with_estimated_noise(plain, null)
+    regression = DiscrepancyRegression(fitter, null, (), LevelFilter(likely.noise))
     (relays,) = [f for f in regression.at("OUT2")[0][0].fine if isinstance(f, Relays)]
     spacing = float(relays.thresholds[0, 1] - relays.thresholds[0, 0])
     truth = relays.thresholds[nearest] + spacing * torch.tensor([0.3, -0.4], dtype=torch.float64)
     influence = 0.01 * regression.influence("OUT2", 0, relays.functions_at(truth.unsqueeze(0)))
     observed = fitter.of(replace(fitter.data, readings=fitter.data.readings + influence[..., 0]))
-    regression = DiscrepancyRegression(observed, null, (), 20)
+    regression = DiscrepancyRegression(observed, null, (), LevelFilter(likely.noise))
     about = regression.of("OUT2")
     none = torch.full((len(about.columns),), math.inf, dtype=torch.float64)
     found = Positions(regression, "OUT2", observed, about, none, torch.Generator().manual_seed(0)).best(about, none)
@@ -353,7 +353,7 @@ def test_a_law_with_many_changes_is_found_although_random_flows_explain_each_of_
     command = (30e-6 + 30e-6 * torch.rand(25, generator=generator, dtype=torch.float64)).repeat_interleave(100)
     less = torch.rand(20, generator=generator, dtype=torch.float64).repeat_interleave(125) < 0.5
     fitter, fit, noise = delivering(command, command * torch.where(less, 0.8, 1.0), 5)
-    regression = DiscrepancyRegression(fitter, fit, (), 120)
+    regression = DiscrepancyRegression(fitter, fit, (), LevelFilter(noise))
     ascent = Ascent(fitter, LevelFilter(noise), 0.0)
     under_all = ascent.with_finer_positions(ascent.evaluate(regression, regression.of("Q1"), "Q1", noise))
     assert ascent.under_less_and_less_noise(regression, "Q1", noise).gain > under_all.gain + 100.0
@@ -365,7 +365,7 @@ def test_the_regressors_of_a_selection_are_the_same_about_the_same_levels(
     sticking: tuple[Fitter, Fit, StateNoise],
 ) -> None:
     fitter, fit, noise = sticking
-    regression = DiscrepancyRegression(fitter, fit, (), 20)
+    regression = DiscrepancyRegression(fitter, fit, (), LevelFilter(noise))
     found = Ascent(fitter, LevelFilter(noise), 0.0).under_less_and_less_noise(regression, "Q1", noise)
     used, selection = found.regressed.used, found.selection
     assert len(selection.positions) > 0
@@ -378,7 +378,7 @@ def test_the_regressors_of_a_selection_are_the_same_about_the_same_levels(
 def test_every_sample_counts_in_the_weight_of_a_discrepancy(far_from_the_plant: tuple[Fitter, Fit, StateNoise]) -> None:
     """Sums of neighbouring samples would lose chi-square in proportion to the misfit."""
     fitter, fit, noise = far_from_the_plant
-    regression = DiscrepancyRegression(fitter, fit, (), 20)
+    regression = DiscrepancyRegression(fitter, fit, (), LevelFilter(noise))
     quiet = replace(noise, intensity=1e-3 * noise.intensity)
     under, discrepancy = with_disturbances(fitter, fit, quiet, regression.linearised), regression.of("Q2")
     costs = regressor_costs(discrepancy.choices, 1e6)

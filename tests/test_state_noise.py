@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.kalman import KalmanWhitening, Propagation, SensorNoise, StateNoise, Wander
+from fdi_torch.estimate.kalman import KalmanFilter, Propagation, SensorNoise, StateNoise, Wander
 from fdi_torch.estimate.state_noise import _Problem, estimate_state_noise
 
 DOUBLE = torch.float64
@@ -113,7 +113,7 @@ def test_the_likelihood_is_that_of_a_dense_normal_distribution(time: float, corr
     expected = -0.5 * float(y @ torch.linalg.solve(covariance, y)) - 0.5 * float(torch.logdet(covariance))
     value, _ = problem(p, sensors, residual).likelihood(noise)
     assert value == pytest.approx(expected + one_order_of_magnitude(noise), rel=1e-9)
-    white = KalmanWhitening(p, sensors, noise)
+    white = KalmanFilter(p, sensors).under(noise)
     assert white.log_det == pytest.approx(float(torch.logdet(covariance)), rel=1e-9)
     squares = float(y @ torch.linalg.solve(covariance, y))
     assert float(white(residual).square().sum()) == pytest.approx(squares, rel=1e-9)
@@ -228,7 +228,7 @@ def test_slopes_are_central_differences(
 def test_innovations_under_the_true_noise_are_white_and_of_unit_variance(time: float) -> None:
     p, sensors = two_tanks(4000, (0, 1500), 0.1), SensorNoise(STD, COLOURED)
     noise = StateNoise(INTENSITY, time, torch.ones(2, dtype=DOUBLE))
-    white = KalmanWhitening(p, sensors, noise)(simulated(p, sensors, noise, 5))
+    white = KalmanFilter(p, sensors).under(noise)(simulated(p, sensors, noise, 5))
     assert float(white[~p.mask].abs().max()) == 0.0
     assert float(white[p.mask].square().mean()) == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 7200))
     for lag in (1, 2, 10):
@@ -242,8 +242,8 @@ def test_innovations_under_the_true_noise_are_white_and_of_unit_variance(time: f
 def test_a_recording_is_whitened_as_if_it_were_alone() -> None:
     sensors, noise = SensorNoise(STD, COLOURED), StateNoise(INTENSITY, 15.0, torch.ones(2, dtype=DOUBLE))
     y = simulated(two_tanks(90, (0, 40)), sensors, noise, 6)
-    together = KalmanWhitening(two_tanks(90, (0, 40)), sensors, noise)
-    pieces = [KalmanWhitening(two_tanks(n), sensors, noise) for n in (40, 50)]
+    together = KalmanFilter(two_tanks(90, (0, 40)), sensors).under(noise)
+    pieces = [KalmanFilter(two_tanks(n), sensors).under(noise) for n in (40, 50)]
     expected = torch.cat([piece(part) for piece, part in zip(pieces, (y[:40], y[40:]), strict=True)])
     torch.testing.assert_close(together(y), expected, rtol=1e-9, atol=1e-12)
     assert together.log_det == pytest.approx(sum(piece.log_det for piece in pieces), rel=1e-12)
@@ -251,7 +251,7 @@ def test_a_recording_is_whitened_as_if_it_were_alone() -> None:
 
 def test_lanes_and_columns_are_whitened_alike() -> None:
     p, sensors = two_tanks(30, masked=0.2), SensorNoise(STD, COLOURED)
-    whitening = KalmanWhitening(p, sensors, StateNoise(INTENSITY, 5.0, torch.ones(2, dtype=DOUBLE)))
+    whitening = KalmanFilter(p, sensors).under(StateNoise(INTENSITY, 5.0, torch.ones(2, dtype=DOUBLE)))
     x = torch.randn(3, 30, 2, 4, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
     white = whitening(x)
     for lane in range(3):
@@ -263,7 +263,7 @@ def test_lanes_and_columns_are_whitened_alike() -> None:
 @pytest.mark.parametrize("columns", [1, 3, 40])
 def test_what_is_transposed_has_the_same_products(correlation: Tensor, columns: int) -> None:
     p, sensors = two_tanks(90, (0, 40), masked=0.2), SensorNoise(STD, correlation)
-    whitening = KalmanWhitening(p, sensors, StateNoise(INTENSITY, 5.0, torch.ones(2, dtype=DOUBLE)))
+    whitening = KalmanFilter(p, sensors).under(StateNoise(INTENSITY, 5.0, torch.ones(2, dtype=DOUBLE)))
     y, v = torch.randn(2, 90, 2, columns, generator=torch.Generator().manual_seed(3), dtype=DOUBLE)
     products = (whitening(y) * v).sum((0, 1))
     torch.testing.assert_close((y * whitening.transposed(v)).sum((0, 1)), products, rtol=1e-9, atol=1e-9)
@@ -277,7 +277,7 @@ def test_smoothed_levels_are_the_dense_conditional_mean(time: float, correlation
     residual, seen = simulated(p, sensors, noise, 7), p.mask.flatten()
     readings, levels = dense(p, sensors, noise)
     expected = levels[:, seen] @ torch.linalg.solve(readings[seen][:, seen], residual.flatten()[seen])
-    found = KalmanWhitening(p, sensors, noise).smoothed(residual)
+    found = KalmanFilter(p, sensors).under(noise).smoothed(residual)
     torch.testing.assert_close(found.flatten(), expected, rtol=1e-8, atol=1e-12)
 
 
@@ -288,7 +288,7 @@ def test_predicted_levels_are_the_dense_conditional_mean_of_earlier_readings(tim
     noise = StateNoise(INTENSITY, time, torch.ones(2, dtype=DOUBLE))
     residual = simulated(p, sensors, noise, 7)
     readings, levels = dense(p, sensors, noise)
-    predicted = KalmanWhitening(p, sensors, noise).predicted(residual)
+    predicted = KalmanFilter(p, sensors).under(noise).predicted(residual)
     for s in range(12):
         earlier = (p.mask & (torch.arange(12) < s).unsqueeze(1)).flatten()
         weights = torch.linalg.solve(readings[earlier][:, earlier], residual.flatten()[earlier])
@@ -364,6 +364,6 @@ def test_a_plant_without_disturbances_shows_none_that_matter() -> None:
     residual = simulated(p, sensors, still, 21)
     whole = problem(p, sensors, residual)
     found = estimate_state_noise(p, sensors, residual, whole.jacobian, whole.pull, whole.off, INTENSITY)
-    moved = KalmanWhitening(p, sensors, found.noise).smoothed(residual)
+    moved = KalmanFilter(p, sensors).under(found.noise).smoothed(residual)
     assert float(moved.square().mean(dim=0).sqrt().max()) < 2e-4
     assert found.noise.scale.tolist() == pytest.approx([1.0, 1.0], abs=0.06)

@@ -62,6 +62,11 @@ def all_placements(plant: PlantDescription, effects: Iterable[Effect] = EFFECTS)
     return tuple(Placement(e, place) for e in effects for place in plant.locations() if fits(e, plant, place))
 
 
+def effects_of(plant: PlantDescription) -> list[Placement]:
+    """The effects that the plant is known to have."""
+    return [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+
+
 def build_network(plant: PlantDescription, placements: Iterable[Placement] = ()) -> TankNetwork:
     """The network of a plant with its known effects, and with further ones to be estimated.
 
@@ -69,7 +74,7 @@ def build_network(plant: PlantDescription, placements: Iterable[Placement] = ())
     """
     from fdi_torch.plant.network import TankNetwork  # a module of torch, which the catalogue does without
 
-    known = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    known = effects_of(plant)
     prefixes = {p.prefix for p in known}
     return TankNetwork(plant, [*known, *(p for p in placements if p.prefix not in prefixes)])
 

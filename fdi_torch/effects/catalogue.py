@@ -7,6 +7,7 @@ import sys
 from dataclasses import dataclass
 from typing import Any
 
+from fdi_torch.clock import MOMENTS
 from fdi_torch.effects import EFFECTS, effect
 from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
@@ -26,7 +27,6 @@ _ANY = PlantDescription(
     (Sensor("h1", "T1"), Sensor("h2", "T2")),
     **_FURTHER,
 )
-_ONSETS = ("onset", "begin")
 
 
 @dataclass(frozen=True, repr=False)
@@ -59,7 +59,7 @@ class Entry(Shown):
     def begins(self) -> str:
         """When the effect starts to act, in words."""
         for parameter in self.parameters:
-            if parameter.name in _ONSETS:
+            if parameter.name in MOMENTS:
                 return f"at `{parameter.name}` (0 s: from the start)"
         return "from the start of the recording"
 
@@ -80,7 +80,7 @@ class Entry(Shown):
         away from the nominal value; else that value.
         """
         value = parameter.nominal
-        if parameter is self.parameters[0] or (value == 0.0 and parameter.name not in (*_ONSETS, "ramp")):
+        if parameter is self.parameters[0] or (value == 0.0 and parameter.name not in (*MOMENTS, "ramp")):
             up, down = parameter.high - value, value - parameter.low
             reach = up if up >= down or value == 0.0 else -down
             value += 0.1 * (reach if abs(reach) < 1e6 else 1.0)

@@ -22,6 +22,7 @@ class Leak(Effect):
     name = "leak"
     stage = Stage.BALANCE
     places = ("tank",)
+    instants = ("onset",)
     capacity_share = True
     mistaken_for = ("plugging", "net_outlet", "valve_leak", "unmetered_flow", "cross_flow", "overflow", "evaporation")
 

@@ -20,6 +20,7 @@ class Plugging(Effect):
     name = "plugging"
     stage = Stage.FLOW
     places = ("pipe", "outlet")
+    instants = ("onset",)
     mistaken_for = ("openness", "net_outlet", "coefficient_drift", "leak", "cross_flow", "laminar_flow")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

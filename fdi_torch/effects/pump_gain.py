@@ -18,6 +18,7 @@ class PumpGain(Effect):
     name = "pump_gain"
     stage = Stage.FLOW
     places = ("pump",)
+    instants = ("onset",)
     mistaken_for = (
         "actuator_stuck",
         "pump_saturation",

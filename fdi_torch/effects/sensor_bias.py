@@ -20,6 +20,7 @@ class SensorBias(Effect):
     name = "sensor_bias"
     stage = Stage.READING
     places = ("sensor",)
+    instants = ("onset",)
     mistaken_for = ("sensor_gain", "laminar_flow", "flow_exponent", "outlet_drop", "sensor_drift")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

@@ -18,6 +18,7 @@ class SensorGain(Effect):
     name = "sensor_gain"
     stage = Stage.READING
     places = ("sensor",)
+    instants = ("onset",)
     mistaken_for = ("sensor_curvature", "sensor_bias", "sensor_stuck", "laminar_flow")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

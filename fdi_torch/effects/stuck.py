@@ -15,6 +15,7 @@ class Stuck(Effect):
     """
 
     memory = 1
+    instants = ("onset",)
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (

@@ -19,6 +19,7 @@ class UnmeteredFlow(Effect):
     name = "unmetered_flow"
     stage = Stage.BALANCE
     places = ("tank",)
+    instants = ("begin", "duration")
     mistaken_for = ("leak", "evaporation", "pump_offset", "pump_dead_zone", "coefficient_drift")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:

@@ -278,12 +278,7 @@ def readings_of(recording: Recording, plant: PlantDescription) -> Readings:
 
     Raises ValueError if a sensor's column is missing.
     """
-    columns = []
-    for sensor in plant.sensors:
-        if sensor.column not in recording.output_names:
-            recorded = ", ".join(recording.output_names) or "none"
-            raise ValueError(f"{recording.source}: expected readings of sensor '{sensor.column}', got {recorded}")
-        columns.append(recording.output_names.index(sensor.column))
+    columns = recording.output_columns(plant.outputs())
     mask = recording.mask[:, columns]
     values = torch.where(mask, recording.outputs[:, columns], torch.zeros_like(recording.outputs[:, columns]))
     return Readings(values, mask.to(values.dtype))

@@ -56,7 +56,6 @@ class HybridResult:
     estimate: Estimate
     diagnosis: Diagnosis
     search: EvolutionResult
-    refinement: Refined
     likelihood: Problem
     correlation: Tensor
     predicted: tuple[Tensor, ...]
@@ -184,7 +183,7 @@ def conclude(
     )
     first = raw.terms[0]
     levels = first.engine.levels(first.theta(theta))[0].mean(dim=0)
-    channels = [fitting.recordings[0].input_names.index(c) for c in fitting.plant.channels()]
+    channels = fitting.recordings[0].input_columns(fitting.plant.channels())
     means = fitting.recordings[0].inputs[:, channels].mean(dim=0)
     diagnosis = diagnose(
         fitting.networks[0],
@@ -201,7 +200,6 @@ def conclude(
         estimate=estimate,
         diagnosis=diagnosis,
         search=search_result,
-        refinement=refinement,
         likelihood=likelihood,
         correlation=raw.correlations(theta.unsqueeze(1), lanes)[0, 0],
         predicted=tuple(predicted),

@@ -21,19 +21,13 @@ _SHARE = 1e-6
 
 
 def fisher_information(
-    jacobian: Float[torch.Tensor, "*batch S C P"],
-    noise_std: Float[torch.Tensor, "*#batch C"],
-    weight: Float[torch.Tensor, "*#batch S C"] | None = None,
+    jacobian: Float[torch.Tensor, "*batch S C P"], noise_std: Float[torch.Tensor, "*#batch C"]
 ) -> Float[torch.Tensor, "*batch P P"]:
     """Fisher information (*batch, P, P) for independent Gaussian noise: sum of J J' / sigma^2 over all readings.
 
     jacobian (*batch, S, C, P): derivatives of the readings. noise_std (*batch, C): in each reading's unit.
-    weight (*batch, S, C): 0 masks a reading.
     """
-    scaled = jacobian / noise_std[..., None, :, None]
-    if weight is not None:
-        scaled = scaled * weight[..., None].sqrt()
-    rows = scaled.flatten(-3, -2)
+    rows = (jacobian / noise_std[..., None, :, None]).flatten(-3, -2)
     return rows.mT @ rows
 
 

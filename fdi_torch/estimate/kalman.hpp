@@ -24,13 +24,7 @@ struct Model {
 };
 
 // Doubles in a vector register. The compiler keeps wider vectors in memory.
-#if defined(__AVX512F__)
-constexpr int REGISTER = 8;
-#elif defined(__AVX__)
-constexpr int REGISTER = 4;
-#else
-constexpr int REGISTER = 2;
-#endif
+constexpr int REGISTER = REGISTER_BYTES / sizeof(double);
 
 // to += sum over j < B of m_j x_j for R rows and V columns, which stay in registers. `to` and x have rows of W, and the
 // element of m for row r and term j lies at m[r * down + j * along].

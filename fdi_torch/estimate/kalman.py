@@ -30,7 +30,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fdi_torch.simulate.build import load_library
+from fdi_torch.simulate.build import REGISTER, load_library
 
 
 @dataclass(frozen=True)
@@ -116,20 +116,19 @@ class KalmanFilter:
     """Kalman filter of one linearised trajectory, before the noise model is given; `under` supplies that."""
 
     def __init__(self, propagation: Propagation, sensors: SensorNoise) -> None:
-        p = propagation
+        self.propagation, self.sensors, p = propagation, sensors, propagation
         self.samples, self.channels, self.order = p.output.shape
-        self.sensors, self.interval = sensors, p.interval
         self.correlated = bool((sensors.correlation != 0.0).any())
         self.matrices = tuple(x.contiguous() for x in (p.transition, p.forcing, p.output))
         self.flags = tuple(x.to(torch.uint8).contiguous() for x in (p.mask, p.fresh))
 
-    def under(self, noise: StateNoise) -> Filtered:
+    def under(self, noise: StateNoise) -> KalmanWhitening:
         """The filter with its gains for this noise model."""
-        return Filtered(self, noise)
+        return KalmanWhitening(self, noise)
 
     def kept(self, time: float) -> float:
         """Decay factor exp(-dt / time) over one sampling interval; time: correlation time, s, 0 for white noise."""
-        return math.exp(-self.interval / time) if time > 0.0 else 0.0
+        return math.exp(-self.propagation.interval / time) if time > 0.0 else 0.0
 
     def with_wander(self, wander: Wander) -> tuple[tuple[Tensor, ...], float]:
         """The matrices A, B and C with the drift as last component of x, and the decay factor g of its w.
@@ -146,15 +145,15 @@ class KalmanFilter:
         return (transition, forcing, output), g
 
 
-class Filtered:
-    """Kalman filter with the gains of one noise model.
+class KalmanWhitening:
+    """Kalman filter with the gains of one noise model, which whitens residuals.
 
     gain (S, d, C): Kalman gains. white (S, C, C): inverse Cholesky factors of the innovations' covariances.
     log_det: log determinant of these covariances, summed over all valid readings.
     """
 
     def __init__(self, kalman_filter: KalmanFilter, noise: StateNoise) -> None:
-        self.own, self.wanders = kalman_filter, noise.wander is not None
+        self.own, self.noise, self.wanders = kalman_filter, noise, noise.wander is not None
         of_sensors, zeros = (noise.scale * kalman_filter.sensors.std) ** 2, torch.zeros_like(noise.scale)
         self.flows = len(noise.intensity)
         variance = torch.cat([noise.intensity**2, noise.intensity.new_zeros(kalman_filter.order - self.flows)])
@@ -176,6 +175,18 @@ class Filtered:
         self.gain = variance.new_empty(kalman_filter.samples, len(self.p0), kalman_filter.channels)
         self.white = variance.new_empty(kalman_filter.samples, kalman_filter.channels, kalman_filter.channels)
         self.log_det = float(self._run("kalman_gains", self.gain, self.white))
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Innovations of unit variance, in the shape of x (*lanes, S, C) or (*lanes, S, C, P); 0 where masked."""
+        samples, channels = self.own.samples, self.own.channels
+        has_columns = x.shape[-2:] != (samples, channels)
+        with_columns = x if has_columns else x.unsqueeze(-1)
+        lanes = with_columns.shape[:-3]
+        flat = with_columns.flatten(0, -4) if lanes else with_columns.unsqueeze(0)
+        side_by_side = flat.permute(1, 2, 0, 3).reshape(samples, channels, -1)
+        white = self.innovations(side_by_side).reshape(samples, channels, *flat.shape[::3])
+        white = white.permute(2, 0, 1, 3).reshape(with_columns.shape)
+        return white if has_columns else white.squeeze(-1)
 
     def innovations(self, y: Float[Tensor, "S C M"]) -> Float[Tensor, "S C M"]:
         """Innovations (S, C, M) of unit variance of residuals y (S, C, M); 0 where masked."""
@@ -243,29 +254,6 @@ class Score:
     shocks: Tensor
 
 
-class KalmanWhitening:
-    """Whitening of residuals by the Kalman filter. log_det: log determinant of the innovations' covariances, summed."""
-
-    def __init__(self, propagation: Propagation, sensors: SensorNoise, noise: StateNoise) -> None:
-        self.propagation, self.noise = propagation, noise
-        self._filtered = KalmanFilter(propagation, sensors).under(noise)
-        self.log_det = self._filtered.log_det
-        self.smoothed, self.transposed = self._filtered.smoothed, self._filtered.transposed
-        self.predicted = self._filtered.predicted
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """Innovations of unit variance, in the shape of x (*lanes, S, C) or (*lanes, S, C, P); 0 where masked."""
-        samples, channels = self._filtered.own.samples, self._filtered.own.channels
-        has_columns = x.shape[-2:] != (samples, channels)
-        with_columns = x if has_columns else x.unsqueeze(-1)
-        lanes = with_columns.shape[:-3]
-        flat = with_columns.flatten(0, -4) if lanes else with_columns.unsqueeze(0)
-        side_by_side = flat.permute(1, 2, 0, 3).reshape(samples, channels, -1)
-        white = self._filtered.innovations(side_by_side).reshape(samples, channels, *flat.shape[::3])
-        white = white.permute(2, 0, 1, 3).reshape(with_columns.shape)
-        return white if has_columns else white.squeeze(-1)
-
-
 class _Model(ctypes.Structure):
     """`Model` of kalman.hpp, with its fields in the same order."""
 
@@ -276,6 +264,7 @@ class _Model(ctypes.Structure):
 def _library(tanks: int, channels: int, layers: int) -> ctypes.CDLL:
     """kalman.hpp compiled for these sizes; layers: 1 if the noise of the channels is correlated in time, else 0."""
     sizes = f"#define TANKS {tanks}\n#define CHANNELS {channels}\n#define LAYERS {layers}\n"
-    source = sizes + Path(__file__).with_name("kalman.hpp").read_text(encoding="utf-8")
+    headers = REGISTER, Path(__file__).with_name("kalman.hpp")
+    source = "".join([sizes, *(header.read_text(encoding="utf-8") for header in headers)])
     names = ("gains", "innovations", "transposed", "score", "predictions", "levels")
     return load_library(source, *(f"kalman_{name}" for name in names))

@@ -69,7 +69,7 @@ class Misfit:
 
 def misfit_of(rms: Mapping[str, float], recordings: Sequence[Recording], plant: PlantDescription) -> Misfit:
     """The misfit of a model whose residuals along these recordings have the root mean square rms, SI by sensor."""
-    columns = [recordings[0].output_names.index(sensor.column) for sensor in plant.sensors]
+    columns = recordings[0].output_columns(plant.outputs())
     values = torch.cat([r.outputs[:, columns] for r in recordings]).nan_to_num()
     weight = torch.cat([r.mask[:, columns] for r in recordings])
     return channel_misfit(values.new_tensor([rms[sensor.name] for sensor in plant.sensors]), values, weight)

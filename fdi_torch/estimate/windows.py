@@ -147,7 +147,7 @@ def window_of(fitting: Fitting, std: Float[Tensor, " C"], suspects: Collection[s
     # A fault whose estimate is its bound is not known exactly: another one may grow with it at the same misfit.
     errors = certainty(refined.curvature[best]).std * max(1.0, misfit)
     levels = torch.stack([_mean_level(fitting, tank.name, data) for tank in fitting.plant.tanks])
-    channels = recording.inputs[:, [recording.input_names.index(c) for c in fitting.plant.channels()]].mean(dim=0)
+    channels = recording.inputs[:, recording.input_columns(fitting.plant.channels())].mean(dim=0)
     faults = []
     for i, parameter in enumerate(space):
         if parameter.name in suspects:

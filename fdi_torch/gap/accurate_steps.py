@@ -34,13 +34,11 @@ MOST_DIVISION, MOST_ADDED = 8, 20_000
 def with_accurate_steps(data: DataSet) -> DataSet:
     """The data set with its steps divided until each is as accurate as the noise of the readings requires."""
     network = TankNetwork(data.plant, data.nominal_effects)
-    first, *further = (_accurate(network, part) for part in data.parts)
-    return replace(data, experiment=first.experiment, further=tuple(further))
+    return replace(data, experiments=tuple(_accurate(network, part).experiment for part in data.parts))
 
 
 def _accurate(network: TankNetwork, part: RecordingPart) -> RecordingPart:
-    recording, columns = part.recording, [s.column for s in network.description.sensors]
-    order = [recording.output_names.index(column) for column in columns]
+    recording, order = part.recording, part.recording.output_columns(network.description.outputs())
     least = least_noise(recording.outputs[:, order].nan_to_num(), recording.mask[:, order])
     noise = torch.maximum(sample_noise(part.readings.nan_to_num(), part.mask), least)
     errors = errors_by_readings(part, noise)

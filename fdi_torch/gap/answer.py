@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal
@@ -10,6 +9,7 @@ from typing import Any, Literal
 import torch
 
 from fdi_torch.effects import effect
+from fdi_torch.estimate.uncertainty import plain_value
 from fdi_torch.parameters import ParameterName, by_prefix
 from fdi_torch.plant.constants import leak_pipe, nominal_capacity
 from fdi_torch.plant.description import FLOW_KINDS, PlacedEffect, PlantDescription
@@ -98,7 +98,7 @@ class Answer:
             "posterior": posterior,
             "certain": names(self.certain),
         }
-        return finite({"format": FORMAT} | answer | as_json)
+        return plain_value({"format": FORMAT} | answer | as_json, "answer")
 
 
 def adopted(plant: PlantDescription, answer: Answer, constants: bool = False) -> PlantDescription:
@@ -164,15 +164,6 @@ def with_constants(plant: PlantDescription, values: Mapping[str, float]) -> Plan
     parts = ("tanks", *(kind.part() for kind in FLOW_KINDS), "sensors")
     changes: dict[str, Any] = {part: updated(getattr(plant, part)) for part in parts}
     return replace(plant, **changes)
-
-
-def finite(value: Any) -> Any:
-    """Replace numbers that are not finite by None, since JSON has no such numbers."""
-    if isinstance(value, Mapping):
-        return {k: finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def names(causes: Iterable[CauseName]) -> list[dict[str, str]]:

@@ -145,17 +145,16 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
     """
     fitter, fit = result.fitter, result.effects_fit
     plant, stds, causes = fitter.data.plant, standard_errors(fitter, fit), []
-    placements = [p for p in fit.candidate.placements if (p.effect.name, p.location) in result.posterior.best.causes]
+    placements = [p for p in fit.candidate.placements if p.cause in result.posterior.best.causes]
     for p in placements:
         amounts = _amounts(fitter, fit, p, stds)
-        cause = (p.effect.name, p.location)
-        others = equivalence_class(cause, plant, fit.values) - {cause}
-        causes.append(Cause(*cause, amounts, tuple(sorted(others))))
+        others = equivalence_class(p.cause, plant, fit.values) - {p.cause}
+        causes.append(Cause(*p.cause, amounts, tuple(sorted(others))))
     if result.posterior.best.unknown_at:
         causes.append(Cause(UNKNOWN, result.posterior.best.unknown_at))
     steps = dict(zip((s.name for s in plant.sensors), result.quantization_steps, strict=True))
     rounded = [replace(p, values={"step": steps[p.location]}) for p in result.library if p.effect.quantizes]
-    shown = {(p.effect.name, p.location): _amounts_from_readings(p, plant) for p in (*result.limits, *rounded)}
+    shown = {p.cause: _amounts_from_readings(p, plant) for p in (*result.limits, *rounded)}
     return (*causes, *(Cause(*name, shown.get(name, {})) for name in result.from_readings))
 
 

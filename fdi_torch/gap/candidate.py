@@ -25,7 +25,7 @@ class Candidate:
 
     @property
     def key(self) -> Key:
-        return frozenset((p.effect.name, p.location) for p in self.placements)
+        return frozenset(p.cause for p in self.placements)
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,7 +66,7 @@ def likeliest(hypotheses: Collection[CauseHypothesis]) -> CauseHypothesis:
 
 def causes_in_order(fit: Fit) -> tuple[CauseName, ...]:
     """The causes of a fit in the order of its placements."""
-    return tuple((p.effect.name, p.location) for p in fit.candidate.placements)
+    return tuple(p.cause for p in fit.candidate.placements)
 
 
 def relative_size(fitter: Fitter, fit: Fit, size: float, effects: Collection[CauseName]) -> float:
@@ -79,7 +79,7 @@ def influence(fitter: Fitter, fit: Fit, effects: Collection[CauseName]) -> float
 
     To first order without the part that the other parameters, within their tolerances, would have in common with it.
     """
-    others = [p for p in fit.candidate.placements if (p.effect.name, p.location) not in effects]
+    others = [p for p in fit.candidate.placements if p.cause not in effects]
     engine = fitter.engine(Candidate(tuple(others)), list(fit.values_of(others)))
     theta = vector_of(engine.space, fit.values)
     reduced = engine.converge(theta.unsqueeze(0))

@@ -52,6 +52,16 @@ class Noise:
     mean_of: int = 0
     steps: tuple[float, ...] = ()
 
+    @staticmethod
+    def white(std: Tensor) -> Noise:
+        """White noise with standard deviations std (C,)."""
+        return Noise(std, torch.zeros_like(std))
+
+    @staticmethod
+    def rough(readings: Tensor) -> Noise:
+        """White noise for a first fit to readings (S, C): a hundredth of their standard deviation."""
+        return Noise.white(1e-2 * readings.nan_to_num().std(dim=0).clamp(min=1e-9))
+
     @property
     def energy(self) -> Tensor:
         """Sum of the squared kernel, (C,): variance of the noise over that of the innovations."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -16,6 +16,7 @@ from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import Experiment, lay_out
+from fdi_torch.simulate.joint_collocation import with_blanks
 from fdi_torch.simulate.resampling import interpolate, step_means
 
 FEWEST = 0.5
@@ -50,22 +51,35 @@ class RecordingPart:
 class DataSet:
     """A plant with its nominal effects, and one or several recordings of it.
 
-    recording, experiment: of the first recording. readings, mask (S, C): of all, with one masked row between
-    recordings. further: the other recordings.
+    readings, mask (S, C): of all recordings, with one masked row between two.
     """
 
     plant: PlantDescription
     nominal_effects: tuple[Placement, ...]
-    recording: Recording
-    experiment: Experiment
+    recordings: tuple[Recording, ...]
+    experiments: tuple[Experiment, ...]
     readings: Tensor
     mask: Tensor
-    further: tuple[RecordingPart, ...] = ()
+
+    @property
+    def recording(self) -> Recording:
+        """The first recording."""
+        return self.recordings[0]
+
+    @property
+    def experiment(self) -> Experiment:
+        """That of the first recording."""
+        return self.experiments[0]
+
+    @property
+    def further(self) -> tuple[Recording, ...]:
+        """The recordings after the first."""
+        return self.recordings[1:]
 
     @property
     def parts(self) -> tuple[RecordingPart, ...]:
-        first = len(self.experiment.sample_times)
-        return (RecordingPart(self.recording, self.experiment, self.readings[:first], self.mask[:first]), *self.further)
+        each = zip(self.recordings, self.experiments, self.rows, strict=True)
+        return tuple(RecordingPart(r, e, self.readings[rows], self.mask[rows]) for r, e, rows in each)
 
     @property
     def row_spacing(self) -> float:
@@ -75,33 +89,27 @@ class DataSet:
     @property
     def longest_duration(self) -> float:
         """Duration of the longest recording, s."""
-        return max(float(part.experiment.nodes[-1]) for part in self.parts)
+        return max(float(experiment.nodes[-1]) for experiment in self.experiments)
 
     @property
     def rows(self) -> tuple[slice, ...]:
         """The rows of each recording among all."""
         slices, first = [], 0
-        for part in self.parts:
-            slices.append(slice(first, first + len(part.readings)))
-            first += len(part.readings) + 1
+        for experiment in self.experiments:
+            slices.append(slice(first, first + len(experiment.sample_times)))
+            first = slices[-1].stop + 1
         return tuple(slices)
 
     def recorded(self, channel: int) -> Tensor:
         """All valid readings of a channel as recorded."""
         column = self.plant.sensors[channel].column
-        each = [(part.recording, part.recording.output_names.index(column)) for part in self.parts]
-        return torch.cat([r.outputs[r.mask[:, i], i] for r, i in each])
+        return torch.cat([recording.valid_readings(column) for recording in self.recordings])
 
     def alone(self, recording: int) -> DataSet:
         """A data set of one of the recordings."""
         part = self.parts[recording]
-        return replace(
-            self,
-            recording=part.recording,
-            experiment=part.experiment,
-            readings=part.readings,
-            mask=part.mask,
-            further=(),
+        return DataSet(
+            self.plant, self.nominal_effects, (part.recording,), (part.experiment,), part.readings, part.mask
         )
 
     @cached_property
@@ -114,7 +122,7 @@ class DataSet:
         """Parameters refitted with every candidate: initial levels; constants and effect parameters with tolerance."""
         constants = TankNetwork(self.plant, self.nominal_effects).constants
         common = [p.name for p in constants if math.isfinite(p.std) and p.name not in self.per_recording]
-        per_recording = [name_in_recording(n, k) for k in range(len(self.further) + 1) for n in self.per_recording]
+        per_recording = [name_in_recording(n, k) for k in range(len(self.recordings)) for n in self.per_recording]
         return (*common, *per_recording)
 
 
@@ -130,20 +138,10 @@ def data_set_of(
     averaged: whether readings of one integration step are replaced by their mean, as in `resampling`.
     """
     each = [recordings] if isinstance(recordings, Recording) else recordings
-    first, *further = [_part(plant, recording, step, averaged) for recording in each]
-    readings, mask = [first.readings], [first.mask]
-    for part in further:
-        readings += [torch.zeros_like(part.readings[:1]), part.readings]
-        mask += [torch.zeros_like(part.mask[:1]), part.mask]
-    return DataSet(
-        plant,
-        tuple(nominal_effects),
-        first.recording,
-        first.experiment,
-        torch.cat(readings),
-        torch.cat(mask),
-        tuple(further),
-    )
+    parts = [_part(plant, recording, step, averaged) for recording in each]
+    readings, mask = (with_blanks([getattr(p, name) for p in parts], dim=0) for name in ("readings", "mask"))
+    experiments = tuple(part.experiment for part in parts)
+    return DataSet(plant, tuple(nominal_effects), tuple(each), experiments, readings, mask)
 
 
 def at_recorded_times(data: DataSet, values: Tensor) -> Tensor:
@@ -153,12 +151,7 @@ def at_recorded_times(data: DataSet, values: Tensor) -> Tensor:
 
 
 def _part(plant: PlantDescription, recording: Recording, step: float, averaged: bool) -> RecordingPart:
-    names = [s.column for s in plant.sensors]
-    missing = [n for n in names if n not in recording.output_names]
-    if missing:
-        columns = ", ".join(recording.output_names) or "none"
-        raise ValueError(f"{recording.source}: expected a sensor '{missing[0]}', got {columns}; map the column to it")
-    order = [recording.output_names.index(n) for n in names]
+    order = recording.output_columns(plant.outputs())
     experiment = lay_out(recording, plant.channels(), step)
     readings, mask = recording.outputs[:, order], recording.mask[:, order]
     if averaged:

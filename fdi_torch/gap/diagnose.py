@@ -64,15 +64,15 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     present = {p.prefix for p in problem.known_effects} | {ParameterName.parse(name).prefix for name in data.nuisance}
     options = options_of([p for p in library if not p.effect.quantizes and p.prefix not in present], fitter, reach)
     pool = ExplanationPool(fitter, null, len(library))
-    result = search(pool, options, problem.most, partial(_report, progress, 0.2, "which effects"))
+    result = search(pool, options, problem.settings.most, partial(_report, progress, 0.2, "which effects"))
     progress(0.6, "where")
     report = partial(_report, progress, 0.6, "where")
-    posterior = posterior_of(pool, result, options, plant, possible_places(plant), problem.named_only, report)
+    posterior = posterior_of(pool, result, options, plant, possible_places(plant), problem.settings.named_only, report)
     credible_set = posterior.credible_set(CONTENT)
     rounded = {s.name for s, step in zip(plant.sensors, quantization_steps, strict=True) if step > 0.0}
-    from_readings = [(p.effect.name, p.location) for p in library if p.effect.quantizes and p.location in rounded]
-    from_readings += [(p.effect.name, p.location) for p in problem.known_effects]
-    if not problem.named_only and (sensor := sensor_with_outliers(problem.outliers[0])):
+    from_readings = [p.cause for p in library if p.effect.quantizes and p.location in rounded]
+    from_readings += [p.cause for p in problem.known_effects]
+    if not problem.settings.named_only and (sensor := sensor_with_outliers(problem.outliers[0])):
         from_readings.append((UNKNOWN, sensor))
     free_form_fit = _free_form(posterior, reach)
     sure = posterior.probabilities[0] >= CONTENT
@@ -122,20 +122,17 @@ def _free_form(posterior: Posterior, reach: OperatingRange) -> Fit | None:
         return None
     # The free functions shall explain what the drift of a sensor would absorb.
     fitter = with_disturbances(best.explanation.fitter, best.fit, replace(best.unknown.noise, wander=None))
-    placements = [p for p in best.fit.candidate.placements if (p.effect.name, p.location) in best.causes]
+    placements = [p for p in best.fit.candidate.placements if p.cause in best.causes]
     return fitted_free_form(fitter, best.fit, placements, best.unknown, reach)
 
 
 def recalibrate(data: DataSet) -> tuple[Fitter, Fit, list[float]]:
     """The noise of each channel, the constants fitted under it, and the quantization step of each channel."""
-    channels = len(data.plant.sensors)
-    spread = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
-    preliminary = Fitter(data, Noise(1e-2 * spread, torch.zeros(channels, dtype=spread.dtype)))
-    null = preliminary.fit(Candidate())
+    null = Fitter(data, Noise.rough(data.readings)).fit(Candidate())
     residual = data.readings - null.linearised.readings[0]
     noise = estimate_noise(residual, data.mask, rows=data.rows)
     quantization_steps = []
-    for c, values in enumerate(map(data.recorded, range(channels))):
+    for c, values in enumerate(map(data.recorded, range(len(data.plant.sensors)))):
         of_one_reading = float(noise.std[c]) * math.sqrt(len(values) / int(data.mask[:, c].sum()))
         quantization_steps.append(quantization_step(values, of_one_reading))
     # A recording without noise tells no more than the simulation, whose readings err a little.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
@@ -36,7 +36,7 @@ class Model:
     """A plant for a free run: its effects, and by full name all values that are not nominal."""
 
     placements: tuple[Placement, ...] = ()
-    values: Mapping[str, float] | None = None
+    values: Mapping[str, float] = field(default_factory=dict)
 
 
 def model_of(fit: Fit) -> Model:
@@ -111,8 +111,9 @@ def closure(holdouts: Sequence[HeldOut]) -> Closure:
 
 def free_run(data: DataSet, noise: Noise, model: Model) -> Tensor:
     """Readings (S, C) of a free run, with initial levels from the first samples."""
-    values = transferable_values(model.values or {})
-    fitter = Fitter(replace(data, mask=_first(data.mask)), noise)
+    values = transferable_values(model.values)
+    early = torch.arange(len(data.mask)).unsqueeze(1) < START_SAMPLES
+    fitter = Fitter(replace(data, mask=data.mask & early), noise)
     network = fitter.engine(Candidate(model.placements), [n for n in values if is_effect_parameter(n)]).network
     for name, value in values.items():
         if name in data.plant.varying or ParameterName.parse(name).recording:
@@ -140,12 +141,6 @@ def transferable_values(values: Mapping[str, float]) -> dict[str, float]:
         elif name.field.startswith(("sine_", "cosine_")):
             transferable[str(name)] = 0.0
     return transferable
-
-
-def _first(mask: Tensor) -> Tensor:
-    early = mask.clone()
-    early[START_SAMPLES:] = False
-    return early
 
 
 def _closed(holdouts: Sequence[HeldOut]) -> tuple[float | None, tuple[float, float] | None]:

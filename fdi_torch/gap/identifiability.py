@@ -17,12 +17,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from fdi_torch.effects import effect
+from fdi_torch.effects import effects_of
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
@@ -52,35 +53,23 @@ class Identifiability:
 
 def identifiability(pairs: Pairs, plant: PlantDescription) -> Identifiability:
     """Identifiability from the regression on pairs of a library."""
-    strength = torch.diagonal(pairs.gram)
-    best = most_visible(pairs.options, strength)
-    hidden = tuple(cause for cause, i in best.items() if float(strength[i]) < SHOWN)
-    return Identifiability(
-        hidden, _inseparable_pairs(plant, best, pairs.gram), {c: float(strength[i]) for c, i in best.items()}
-    )
-
-
-def _inseparable_pairs(
-    plant: PlantDescription, best: Mapping[CauseName, int], gram: Tensor
-) -> tuple[tuple[CauseName, CauseName, float], ...]:
-    """Pairs of visible causes that are nearly collinear."""
-    causes = [c for c, i in best.items() if float(gram[i, i]) >= SHOWN]
-    pairs = []
-    for k, a in enumerate(causes):
-        for b in causes[k + 1 :]:
-            i, j = best[a], best[b]
-            weaker = min(float(gram[i, i]), float(gram[j, j]))
-            separation = weaker * (1.0 - float(gram[i, j]) ** 2 / (float(gram[i, i]) * float(gram[j, j])))
-            if separation < PARTED and b not in equivalence_class(a, plant, {}):
-                pairs.append((a, b, max(separation, 0.0)))
-    return tuple(sorted(pairs, key=lambda pair: pair[2]))
+    gram, best = pairs.gram, most_visible(pairs.options, torch.diagonal(pairs.gram))
+    shown = {cause: float(gram[i, i]) for cause, i in best.items()}
+    inseparable = []
+    for a, b in combinations((c for c in shown if shown[c] >= SHOWN), 2):
+        shared = float(gram[best[a], best[b]]) ** 2 / (shown[a] * shown[b])
+        separation = min(shown[a], shown[b]) * (1.0 - shared)
+        if separation < PARTED and b not in equivalence_class(a, plant, {}):
+            inseparable.append((a, b, max(separation, 0.0)))
+    hidden = tuple(cause for cause in shown if shown[cause] < SHOWN)
+    return Identifiability(hidden, tuple(sorted(inseparable, key=lambda pair: pair[2])), shown)
 
 
 def planned_identifiability(
     plant: PlantDescription, recording: Recording, noise: float, library: Sequence[str] | None = None
 ) -> Identifiability:
     """Identifiability under planned inputs; readings are ignored. noise: standard deviation of a sensor's level, m."""
-    nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    nominal_effects = effects_of(plant)
     step = float(torch.median(torch.diff(recording.time)))
     fitter = _noise_free(plant, nominal_effects, recording, step, noise)
     nominal_fit = fitter.fit(Candidate())
@@ -99,11 +88,11 @@ def _noise_free(
     planned = replace(recording, outputs=blank, output_names=names, output_units=units, mask=torch.isfinite(blank))
     data = data_set_of(plant, nominal_effects, planned, step)
     std = noise * torch.tensor([abs(s.gain) for s in plant.sensors], dtype=torch.float64)
-    white = Noise(std, torch.zeros_like(std))
+    white = Noise.white(std)
     engine = Fitter(data, white).engine(Candidate(), ())
     theta = engine.space.nominal().unsqueeze(0)
     readings = engine.converge(theta).readings[0]
-    return Fitter(replace(data, readings=readings, recording=replace(planned, outputs=readings)), white)
+    return Fitter(replace(data, readings=readings, recordings=(replace(planned, outputs=readings),)), white)
 
 
 def unsearched_twins(

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from fdi_torch.estimate.evidence import log_det
 from fdi_torch.estimate.evidence import log_prior as prior_of_set
-from fdi_torch.estimate.kalman import KalmanWhitening, Propagation, SensorNoise, StateNoise
+from fdi_torch.estimate.kalman import KalmanFilter, KalmanWhitening, Propagation, SensorNoise, StateNoise
 from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
@@ -26,7 +26,7 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation
-from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
+from fdi_torch.simulate.joint_collocation import with_blanks
 from fdi_torch.simulate.linearised import Linearised
 
 
@@ -55,7 +55,7 @@ def with_disturbances(fitter: Fitter, fit: Fit, noise: StateNoise, linearised: L
 
     def whitening() -> KalmanWhitening:
         along = propagation_of(fitter, fit, linearised or fit.linearised)
-        return KalmanWhitening(along, _sensors(fitter), noise)
+        return KalmanFilter(along, _sensors(fitter)).under(noise)
 
     return Fitter(fitter.data, fitter.noise, Recomputed(whitening))
 
@@ -98,8 +98,7 @@ def propagation_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> Propagat
 
 def pieces_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:
     """For each recording, its collocation, its parameters (1, P) and its part of a trajectory."""
-    joint, theta = fitter.engine(fit.candidate, list(fit.effect_values)), fit.theta.unsqueeze(0)
-    return joint.apart(theta, linearised) if isinstance(joint, JointCollocation) else [(joint, theta, linearised)]
+    return fitter.engine(fit.candidate, list(fit.effect_values)).apart(fit.theta.unsqueeze(0), linearised)
 
 
 def _between_samples(engine: Collocation, theta: Tensor, linearised: Linearised, areas: Tensor) -> Sequence[Tensor]:

@@ -14,7 +14,6 @@ recording and are left out.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -26,9 +25,8 @@ from fdi_torch.gap.dataset import DataSet, at_recorded_times
 from fdi_torch.gap.diagnosis_result import DiagnosisResult
 from fdi_torch.gap.free_form import free_form
 from fdi_torch.gap.free_form_coefficients import coefficients_of, without_time_course
-from fdi_torch.gap.holdout import Closure, HeldOut, Model, closure, free_run, model_of
+from fdi_torch.gap.holdout import HeldOut, Model, closure, free_run, model_of
 from fdi_torch.parameters import ParameterName
-from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_unit
 
 FROZEN = {"recalibrated": "augmented_on_recalibrated", "nominal": "augmented_on_nominal"}
@@ -77,57 +75,43 @@ def closure_to_dict(holdouts: Sequence[HeldOut], result: DiagnosisResult) -> dic
     frozen: with the causes, but constants recalibrated without them, or nominal. ceiling_at: places of the free
     functions.
     """
-    scales = _Scales.of(result.fitter.data.plant)
-    errors = _numbers(closure(holdouts), scales)
+    units = {s.name: display_unit(s.unit, s.column) for s in result.fitter.data.plant.sensors}
+    different = set(units.values())
+    pooled_in = different.pop() if len(different) == 1 else ("noise levels", 1.0)
+
+    def errors(of: Sequence[HeldOut]) -> dict[str, Any]:
+        done = closure(of)
+        pooled = _in_unit(done.pooled, pooled_in)
+        each = {sensor: _in_unit(rmse, units[sensor]) for sensor, rmse in done.per_sensor.items()}
+        return {
+            **_not_frozen(pooled),
+            "frozen": {constants: pooled[model] for constants, model in FROZEN.items()},
+            "per_sensor": {sensor: _not_frozen(rmse) for sensor, rmse in each.items()},
+            "closed": done.closed,
+            "closed_ci95": done.closed_ci95,
+        }
+
     answer = {
         "metric": "free-run RMSE on the hold-out, per sensor and pooled, in the sensor's unit",
-        "unit": scales.unit,
-        "units": dict(scales.units),
-        **errors,
+        "unit": pooled_in[0],
+        "units": {sensor: unit for sensor, (unit, _) in units.items()},
+        **errors(holdouts),
         "augmented_with": [{"effect": n, "location": at} for n, at in causes_in_order(result.best)],
         "ceiling_at": causal_places(result),
         "holdouts": [h.data.recording.source for h in holdouts],
     }
     if len(holdouts) > 1:
-        answer["per_holdout"] = [
-            {"source": h.data.recording.source, **_numbers(closure([h]), scales)} for h in holdouts
-        ]
+        answer["per_holdout"] = [{"source": h.data.recording.source, **errors([h])} for h in holdouts]
     return answer
 
 
-@dataclass(frozen=True)
-class _Scales:
-    """unit, scale: of the pooled error. units, each: of every sensor."""
-
-    unit: str
-    scale: float
-    units: Mapping[str, str]
-    each: Mapping[str, float]
-
-    @classmethod
-    def of(cls, plant: PlantDescription) -> _Scales:
-        arranged = {s.name: display_unit(s.unit, s.column) for s in plant.sensors}
-        one_unit = len(set(arranged.values())) == 1
-        unit, scale = next(iter(arranged.values())) if one_unit else ("noise levels", 1.0)
-        return cls(unit, scale, {n: u for n, (u, _) in arranged.items()}, {n: x for n, (_, x) in arranged.items()})
+def _in_unit(errors: Mapping[str, float], unit: tuple[str, float]) -> dict[str, float]:
+    """Errors of each model in a unit with its scale."""
+    return {model: error * unit[1] for model, error in errors.items()}
 
 
-def _numbers(done: Closure, scales: _Scales) -> dict[str, Any]:
-    pooled, frozen = _without_frozen(done.pooled, scales.scale)
-    each = {sensor: _without_frozen(errors, scales.each[sensor])[0] for sensor, errors in done.per_sensor.items()}
-    return {
-        **pooled,
-        "frozen": frozen,
-        "per_sensor": each,
-        "closed": done.closed,
-        "closed_ci95": done.closed_ci95,
-    }
-
-
-def _without_frozen(errors: Mapping[str, float], scale: float) -> tuple[dict[str, float], dict[str, float]]:
-    names = {model: constants for constants, model in FROZEN.items()}
-    plain = {m: v * scale for m, v in errors.items() if m not in names}
-    return plain, {names[m]: v * scale for m, v in errors.items() if m in names}
+def _not_frozen(errors: Mapping[str, float]) -> dict[str, float]:
+    return {model: error for model, error in errors.items() if model not in FROZEN.values()}
 
 
 SHOWN = ("nominal", "recalibrated", "augmented", "ceiling")

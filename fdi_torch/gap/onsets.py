@@ -44,17 +44,15 @@ def fine_onsets(options: Sequence[Option], fitter: Fitter) -> list[Option]:
     noise require."""
     duration, count = fitter.data.longest_duration, _count(fitter)
     further: list[Option] = []
-    coarse: dict[tuple[tuple[str, str], tuple[tuple[str, float], ...]], list[Option]] = {}
+    grids: dict[tuple[tuple[str, str], tuple[tuple[str, float], ...]], list[Option]] = {}
     for option in options:
-        onset = option.placement.full_name("onset")
-        if onset in option.start:
-            others = tuple((n, v) for n, v in option.start.items() if n != onset)
-            coarse.setdefault((option.cause, others), []).append(option)
-    for group in coarse.values():
-        if count > len(group) > 1:  # a single onset is not one of a grid
+        if option.late:
+            others = tuple((n, v) for n, v in option.start.items() if n not in option.instants)
+            grids.setdefault((option.cause, others), []).append(option)
+    for first, *rest in grids.values():
+        if rest and 1 + len(rest) < count:  # a start that differs from all others in further parameters is no grid
             times = [duration * (k + 1) / (count + 1) for k in range(count)]
-            onset = group[0].placement.full_name("onset")
-            further += [replace(group[0], start={**group[0].start, onset: time}) for time in times]
+            further += [replace(first, start={**first.start, first.instants[0]: time}) for time in times]
     return further
 
 
@@ -64,8 +62,8 @@ def likeliest_intervals(options: Sequence[Option], fitter: Fitter, fit: Fit) -> 
     times = torch.arange(count, dtype=torch.float64) * fitter.data.longest_duration / count
     further: list[Option] = []
     for option in {o.cause: o for o in options}.values():
-        begin, lasting = (option.placement.full_name(name) for name in ("begin", "duration"))
-        if begin in option.start and lasting in option.start:
+        if len(option.instants) == 2:
+            begin, lasting = option.instants
             ends = float(times[-1]) + float(times[1])
             steps = [
                 replace(option, start={**option.start, begin: time, lasting: ends - time}) for time in times.tolist()
@@ -103,7 +101,7 @@ def detection_time(fitter: Fitter) -> float:
     whitening = fitter.whitening
     if whitening is None:
         return math.inf
-    propagation, noise = whitening.propagation, whitening.noise
+    propagation, noise = whitening.own.propagation, whitening.noise
     areas = torch.tensor([t.area for t in fitter.data.plant.tanks], dtype=torch.float64)
     sensitivity = propagation.output.abs().amax(dim=0)[:, : len(areas)]
     std = fitter.noise.std * noise.scale

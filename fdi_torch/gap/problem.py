@@ -9,7 +9,7 @@ from functools import partial
 
 import torch
 
-from fdi_torch.effects import effect
+from fdi_torch.effects import effects_of
 from fdi_torch.effects.stuck import Stuck
 from fdi_torch.gap.accurate_steps import with_accurate_steps
 from fdi_torch.gap.dataset import DataSet, data_set_of
@@ -61,17 +61,16 @@ class DiagnosisProblem:
     """library: the effects to search. known_effects: limits of sensors, and stuck sensors, that the readings show
     without a model. data: the recordings, for the plant with these effects and without sensors that are stuck
     throughout. holdouts: the hold-outs, likewise. outliers: masked readings of the recordings, and of the hold-outs.
-    most, named_only: as in `Settings`. remarks: on what was changed in the plant."""
+    remarks: on what was changed in the plant."""
 
     library: tuple[Placement, ...]
     recordings: tuple[Recording, ...]
     known_effects: list[Placement]
     data: DataSet
     holdouts: tuple[DataSet, ...]
-    most: int
-    named_only: bool = False
-    outliers: tuple[Sequence[SensorOutliers], Sequence[SensorOutliers]] = ((), ())
-    remarks: Sequence[str] = ()
+    settings: Settings
+    outliers: tuple[Sequence[SensorOutliers], Sequence[SensorOutliers]]
+    remarks: Sequence[str]
 
 
 def problem_of(
@@ -97,7 +96,7 @@ def problem_of(
     plant = _without_stuck_sensors(plant, recordings, stuck)
     _check_readings(plant, recordings)
     library = tuple(p for p in library if p.location in plant.locations())
-    nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    nominal_effects = effects_of(plant)
     recordings, outliers = _without_outliers(plant, nominal_effects, recordings, settings.step)
     holdouts, holdout_outliers = _without_outliers(plant, nominal_effects, holdouts, settings.step)
     known_effects = limits_from_readings(plant, recordings, nominal_effects, library)
@@ -107,8 +106,10 @@ def problem_of(
     data, *holdout_data = (
         checked_data_set(plant, nominal_effects, r, settings.step) for r in (recordings, *((h,) for h in holdouts))
     )
-    more = settings.most, settings.named_only, (outliers, holdout_outliers), rims
-    return DiagnosisProblem(library, tuple(recordings), known_effects, data, tuple(holdout_data), *more)
+    masked = outliers, holdout_outliers
+    return DiagnosisProblem(
+        library, tuple(recordings), known_effects, data, tuple(holdout_data), settings, masked, rims
+    )
 
 
 def _without_outliers(
@@ -224,14 +225,10 @@ def checked_data_set(
 
 
 def _laid_out(
-    plant: PlantDescription,
-    nominal_effects: Sequence[Placement],
-    recordings: Recording | Sequence[Recording],
-    step: float | None,
+    plant: PlantDescription, nominal_effects: Sequence[Placement], recordings: Sequence[Recording], step: float | None
 ) -> DataSet:
     """The data set in steps of `step` s, which is kept if given; by default in accurate ones."""
-    each = [recordings] if isinstance(recordings, Recording) else recordings
-    data = data_set_of(plant, nominal_effects, each, step or _step(plant, each), averaged=True)
+    data = data_set_of(plant, nominal_effects, recordings, step or _step(plant, recordings), averaged=True)
     return with_accurate_steps(data) if step is None else data
 
 

@@ -105,11 +105,11 @@ def _twins_outside_library(result: DiagnosisResult) -> list[str]:
     best, fitter, plant = result.posterior.best, result.fitter, result.fitter.data.plant
     if best.unknown:
         return []
-    searched = {(p.effect.name, p.location) for p in (*result.library, *fitter.data.nominal_effects)}
+    searched = {p.cause for p in (*result.library, *fitter.data.nominal_effects)}
     further = [
         p
         for p in all_placements(plant, [e for e in EFFECTS if not e.quantizes])
-        if not searched & equivalence_class((p.effect.name, p.location), plant, {})
+        if not searched & equivalence_class(p.cause, plant, {})
     ]
     options = options_of(further, fitter, result.reach)
     if not options:

@@ -23,7 +23,7 @@ from fdi_torch.plant.effect import Placement, Stage
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.operating_range import OperatingRange
 from fdi_torch.simulate.collocation import Collocation
-from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
+from fdi_torch.simulate.joint_collocation import with_blanks
 from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.scan import scan_in_time
 
@@ -41,12 +41,18 @@ class Option:
 
     @property
     def cause(self) -> tuple[str, str]:
-        return self.placement.effect.name, self.placement.location
+        return self.placement.cause
 
     @property
-    def permanent(self) -> bool:
-        """Whether it acts from the beginning of the recording."""
-        return self.placement.full_name("onset") not in self.start
+    def instants(self) -> list[str]:
+        """Full names of the start's times, if it is one of a grid of onsets, or of intervals."""
+        names = [self.placement.full_name(name) for name in self.placement.effect.instants]
+        return names if all(name in self.start for name in names) else []
+
+    @property
+    def late(self) -> bool:
+        """Whether it acts from an onset on instead of from the beginning of the recording."""
+        return len(self.instants) == 1
 
 
 @dataclass(frozen=True)
@@ -111,7 +117,7 @@ def most_visible(options: Sequence[Option], strength: Tensor) -> dict[tuple[str,
     Onsets make causes separable that are not if they act from the beginning.
     """
     best: dict[tuple[str, str], int] = {}
-    for i in sorted(range(len(options)), key=lambda i: (options[i].permanent, float(strength[i])), reverse=True):
+    for i in sorted(range(len(options)), key=lambda i: (not options[i].late, float(strength[i])), reverse=True):
         best.setdefault(options[i].cause, i)
     return best
 
@@ -148,12 +154,20 @@ def products(fitter: Fitter, fit: Fit, options: Sequence[Option], besides: Seque
 
     besides: parameters of the fit that are not projected out.
     """
-    return _ProjectedRegression.of(fitter, fit, besides).products(options)
+    regression = _ProjectedRegression.of(fitter, fit, besides)
+    white, shared, score = regression.projected(effect_columns(fitter, fit, options))
+    return score, (white @ white.mT).sum(dim=0) - shared @ shared.T
 
 
 def pairs_of(fitter: Fitter, fit: Fit, screening: ScreeningResult) -> Pairs:
     """The regression on pairs of the most promising options of a screening under the same noise."""
-    return _ProjectedRegression.of(fitter, fit).pairs(screening)
+    chosen = set(most_visible(screening.options, screening.strength).values())
+    best: dict[tuple[str, str], int] = {}
+    for i in torch.argsort(screening.gain, descending=True).tolist():
+        best.setdefault(screening.options[i].cause, i)
+    chosen |= set(best.values())
+    options = tuple(screening.options[i] for i in sorted(chosen))
+    return Pairs(options, *products(fitter, fit, options))
 
 
 @dataclass(frozen=True)
@@ -165,7 +179,6 @@ class _ProjectedRegression:
     """
 
     fitter: Fitter
-    fit: Fit
     remaining: Tensor
     basis: Tensor
 
@@ -178,41 +191,25 @@ class _ProjectedRegression:
         basis, _ = decomposed((jacobian[..., kept] * scale).flatten(0, 1), weight)
         remaining = without(basis, torch.cat([residual.flatten(), -deviation]).unsqueeze(1))
         remaining, basis = (x[: residual.numel()].reshape(*residual.shape, -1) for x in (remaining, basis))
-        return _ProjectedRegression(fitter, fit, remaining[..., 0], basis)
+        return _ProjectedRegression(fitter, remaining[..., 0], basis)
 
-    def screened(self, columns: Tensor) -> tuple[Tensor, Tensor]:
-        """Score and strength of M options, (M,) each; columns (S, C, M): change of the readings by each option."""
+    def projected(self, columns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Whitened changes of the readings by M options (C, M, S), their products with the basis (M, P), and their
+        score (M,); columns (S, C, M): these changes."""
         white = self.fitter.whiten(columns).permute(1, 2, 0)
         shared = (white @ self.basis.permute(1, 0, 2)).sum(dim=0)
-        score = (white @ self.remaining.T.unsqueeze(-1)).sum(dim=0).squeeze(-1)
+        return white, shared, (white @ self.remaining.T.unsqueeze(-1)).sum(dim=0).squeeze(-1)
+
+    def screened(self, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """Score and strength of M options, (M,) each."""
+        white, shared, score = self.projected(columns)
         return score, torch.linalg.vecdot(white, white).sum(dim=0) - torch.linalg.vecdot(shared, shared)
-
-    def pairs(self, screening: ScreeningResult) -> Pairs:
-        """The regression on pairs of the most promising options."""
-        chosen = set(most_visible(screening.options, screening.strength).values())
-        best: dict[tuple[str, str], int] = {}
-        for i in torch.argsort(screening.gain, descending=True).tolist():
-            best.setdefault(screening.options[i].cause, i)
-        chosen |= set(best.values())
-        options = tuple(screening.options[i] for i in sorted(chosen))
-        return Pairs(options, *self.products(options))
-
-    def products(self, options: Sequence[Option]) -> tuple[Tensor, Tensor]:
-        """Score (M,) and gram (M, M) of options."""
-        white = self.fitter.whiten(effect_columns(self.fitter, self.fit, options)).permute(1, 2, 0)
-        shared = (white @ self.basis.permute(1, 0, 2)).sum(dim=0)
-        score = (white @ self.remaining.T.unsqueeze(-1)).sum(dim=0).squeeze(-1)
-        return score, (white @ white.mT).sum(dim=0) - shared @ shared.T
 
 
 def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tensor:
     """Changes of the readings (S, C, M), in their unit, for each start."""
     engine = fitter.engine(fit.candidate, list(fit.effect_values))
-    pieces = (
-        engine.apart(fit.theta.unsqueeze(0), fit.linearised)
-        if isinstance(engine, JointCollocation)
-        else [(engine, fit.theta, fit.linearised)]
-    )
+    pieces = engine.apart(fit.theta.unsqueeze(0), fit.linearised)
     return with_blanks([_columns(fitter, fit, options, *piece) for piece in pieces], dim=0)
 
 
@@ -225,7 +222,6 @@ def _columns(
     union = fitter.network([*(p for p in fit.candidate.placements if p.prefix not in tried), *tried.values()])
     values = zip(engine.space.names, theta.flatten().tolist(), strict=True)
     constants = {n: v for n, v in values if n in union.constants}
-    theta = theta.reshape(1, -1)
     present = {p.prefix for p in engine.network.placements} - tried.keys()
     forcing_model = Forcing(
         engine.network,

@@ -17,7 +17,7 @@ from fdi_torch.amounts import parameter_words
 from fdi_torch.effects import placements_for
 from fdi_torch.estimate.combinations import undetermined_groups
 from fdi_torch.estimate.fitting import StartLevels, set_up
-from fdi_torch.estimate.information import certainty
+from fdi_torch.estimate.information import certainty, fisher_information
 from fdi_torch.estimate.uncertainty import plain_value
 from fdi_torch.monitor.structural_analysis import structure_of
 from fdi_torch.names import listed
@@ -30,6 +30,9 @@ SAME = 1e-6
 ROUNDING = 1e-9  # a projected signature below this share of the original counts as zero
 CONSTANT = 1e-9  # a reading whose range is below this share of its magnitude is constant
 STEP = 0.25
+FALSE_ALARM, MISS = 0.001, 0.05  # error rates that define the smallest sizes
+REACH = NormalDist().inv_cdf(1.0 - 0.5 * FALSE_ALARM) + NormalDist().inv_cdf(1.0 - MISS)
+"""Size that is detected with these error rates, in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +74,6 @@ def diagnosability(
     at: dict[str, float] | None = None,
     calibrate: Sequence[str] = (),
     start: StartLevels = "equilibrium",
-    false_alarm: float = 0.001,
-    miss: float = 0.05,
     step: float = STEP,
 ) -> Diagnosability:
     """Diagnosability for the inputs and sample times of a recording; its readings are not used.
@@ -82,22 +83,17 @@ def diagnosability(
     """
     if not faults:
         raise ValueError("expected at least one fault, got none; name some, such as T1.leak.size")
-    if not (0 < false_alarm < 1 and 0 < miss < 1):
-        raise ValueError(f"expected rates between 0 and 1, got {false_alarm:g} (false alarm) and {miss:g} (miss)")
     fitting = set_up(plant, [recording], [*faults, *calibrate], start)
     theta = fitting.space.vector(at or {})
     readings, slopes = fitting.engines(step)[0].linearise(theta)
+    count, prior, unit_noise = len(faults), torch.diag(fitting.space.std(theta) ** -2), torch.ones_like(noise_std)
     scaled = slopes / noise_std[:, None]
-    count = len(faults)
-    information = scaled.flatten(0, 1).mT @ scaled.flatten(0, 1) + torch.diag(fitting.space.std(theta) ** -2)
-    projected = without_gain_and_offset(scaled, readings)
-    joint = certainty(information)
-    correlation_certainty = certainty(
-        projected.flatten(0, 1).mT @ projected.flatten(0, 1) + torch.diag(fitting.space.std(theta) ** -2)
+    joint, correlation_certainty = (
+        certainty(fisher_information(shown, unit_noise) + prior)
+        for shown in (scaled, without_gain_and_offset(scaled, readings))
     )
     signatures = without_constants(scaled, count, fitting.space.std(theta))
     apart = sines(signatures)
-    reach = NormalDist().inv_cdf(1.0 - 0.5 * false_alarm) + NormalDist().inv_cdf(1.0 - miss)
     length = torch.linalg.vector_norm(signatures, dim=0)
     nearest = (apart + torch.eye(count, dtype=apart.dtype)).amin(dim=1) if count > 1 else torch.ones(1)
     structural = structure_of(plant, placements_for(faults)).isolable()
@@ -112,8 +108,8 @@ def diagnosability(
         rank=int((torch.linalg.svdvals(signatures / length.clamp(min=1e-300)) > SAME).sum()),
         std=tuple(joint.std[:count].tolist()),
         std_by_correlation=tuple(correlation_certainty.std[:count].tolist()),
-        smallest_detectable=_limits(reach, length, length),
-        smallest_isolable=_limits(reach, length * nearest, length),
+        smallest_detectable=_limits(length, length),
+        smallest_isolable=_limits(length * nearest, length),
         groups=tuple(_groups(plant, faults, apart)),
         remarks=tuple(g.sentence for g in undetermined_groups(fitting.space, theta, joint))
         + _remarks(readings, length, faults),
@@ -199,9 +195,9 @@ def _remarks(readings: Tensor, length: Tensor, faults: Sequence[str]) -> tuple[s
     return tuple(remarks)
 
 
-def _limits(reach: float, length: Tensor, whole: Tensor) -> tuple[float, ...]:
+def _limits(length: Tensor, whole: Tensor) -> tuple[float, ...]:
     nonzero = length > SAME * whole
-    return tuple(torch.where(nonzero, reach / torch.where(nonzero, length, 1.0), torch.inf).tolist())
+    return tuple(torch.where(nonzero, REACH / torch.where(nonzero, length, 1.0), torch.inf).tolist())
 
 
 def _rows(table: Tensor) -> tuple[tuple[float, ...], ...]:

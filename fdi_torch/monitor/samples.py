@@ -52,20 +52,9 @@ class Samples:
 
 def samples_of_recording(recording: Recording, plant: PlantDescription) -> Samples:
     """One recording as samples without a batch dimension. Raises ValueError if a channel is missing."""
-    inputs = recording.inputs[:, _columns(recording, plant.channels(), recording.input_names, "an input")]
-    sensors = tuple(sensor.column for sensor in plant.sensors)
-    columns = _columns(recording, sensors, recording.output_names, "readings of")
-    readings = torch.where(recording.mask[:, columns], recording.outputs[:, columns], torch.nan)
+    inputs = recording.inputs[:, recording.input_columns(plant.channels())]
+    readings = recording.readings[:, recording.output_columns(plant.outputs())]
     return Samples(recording.time, inputs, readings, recording.hold)
-
-
-def _columns(recording: Recording, wanted: Sequence[str], known: tuple[str, ...], kind: str) -> list[int]:
-    for name in wanted:
-        if name not in known:
-            raise ValueError(
-                f"{recording.source}: expected {kind} '{name}', got {', '.join(known) or 'none'}; map the column to it"
-            )
-    return [known.index(name) for name in wanted]
 
 
 def usual_interval(time: Tensor) -> float:

@@ -78,8 +78,8 @@ class Stepper:
         """The state `span` s later. inputs: share (0..1) of the span -> (*batch, channels)."""
         for start, step, share in substeps(begin, span, self.longest):
             clock = self._clock(state.levels, start, step, step)
-            levels, memory = self.move(state.levels, inputs(share), state.commands, clock, values)
-            state = replace(state, levels=levels, commands=memory)
+            actual, memory = self.network.commands(self._channels(inputs(share)), state.commands, clock, values)
+            state = replace(state, levels=self._runge_kutta(state.levels, actual, clock, values), commands=memory)
         return state
 
     def read(self, state: PlantState, end: float, span: float, values: PlaceValues) -> tuple[Tensor, PlantState]:
@@ -87,13 +87,6 @@ class Stepper:
         clock = self._clock(state.levels, end - span, span, span)
         readings, memory = self.network.read(self._seen(state.levels), state.readings, clock, values)
         return torch.stack(torch.broadcast_tensors(*readings), dim=-1), replace(state, readings=memory)
-
-    def move(
-        self, levels: Tensor, inputs: Tensor, memory: Memory, clock: Clock, values: PlaceValues
-    ) -> tuple[Tensor, Memory]:
-        """Levels and actuator memory after one integration step."""
-        actual, memory = self.network.commands(self._channels(inputs), memory, clock, values)
-        return self._runge_kutta(levels, actual, clock, values), memory
 
     def _runge_kutta(self, levels: Tensor, commands: list[Tensor], clock: Clock, values: PlaceValues) -> Tensor:
         step = clock.step

@@ -60,8 +60,8 @@ def own_onsets(network: TankNetwork, space: ParameterSpace) -> dict[str, str]:
     """Sizes in `space` of effects with a memory and an onset parameter, with the names of these onsets."""
     named = {}
     for placement in network.placements:
-        size, *shape = placement.effect.parameters(placement.location, network.description)
+        size, *_ = placement.effect.parameters(placement.location, network.description)
         name = placement.full_name(size.name)
-        if placement.effect.memory and any(p.name == "onset" for p in shape) and name in space:
-            named[name] = placement.full_name("onset")
+        if placement.effect.memory and len(placement.effect.instants) == 1 and name in space:
+            named[name] = placement.full_name(placement.effect.instants[0])
     return named

@@ -49,8 +49,9 @@ class Effect:
     all. smooth: whether the gradient with respect to its size is non-zero at nominal. mistaken_for: effects that
     explain nearly the same data. delays: whether it adds dead time to its signal. quantizes: whether it rounds the
     reading. startup_only: whether it acts only until its component has run for the first time. capacity_share: whether
-    its size is a share of the capacity of its tank's reference pipe. searched: whether a gap diagnosis searches it
-    without being told to.
+    its size is a share of the capacity of its tank's reference pipe. instants: its parameters that are times, of which
+    its starts form a grid: an onset, or the begin and the duration of an interval. searched: whether a gap diagnosis
+    searches it without being told to.
 
     The first parameter is the effect's size: at its nominal value the effect is absent. The others are its shape; their
     nominal values are typical ones, or those that keep the effect simple (onset 0, ramp 0).
@@ -66,6 +67,7 @@ class Effect:
     quantizes: ClassVar[bool] = False
     startup_only: ClassVar[bool] = False
     capacity_share: ClassVar[bool] = False
+    instants: ClassVar[tuple[str, ...]] = ()
     searched: ClassVar[bool] = True
     mistaken_for: ClassVar[tuple[str, ...]] = ()
 
@@ -156,6 +158,11 @@ class Placement:
     @property
     def prefix(self) -> str:
         return f"{self.location}.{self.effect.name}"
+
+    @property
+    def cause(self) -> tuple[str, str]:
+        """Name of the effect, and place."""
+        return self.effect.name, self.location
 
     def full_name(self, parameter: str) -> str:
         """'T1.leak.size' for the parameter 'size' of a leak at T1."""

@@ -130,7 +130,7 @@ def balance_along(plant: PlantDescription, recording: Recording, unit: float = 1
     inputs = (
         recording.inputs if recording.hold == "zero_order" else 0.5 * (recording.inputs[1:] + recording.inputs[:-1])
     )
-    columns = [recording.input_names.index(channel) for channel in plant.channels()]
+    columns = recording.input_columns(plant.channels())
     channels = [inputs[: len(recording) - 1, columns[channel]] for _, channel in network.actuators()]
     instant = recording.time.new_tensor(INSTANT)
     clock = Clock(recording.time[:-1], instant, instant)

@@ -27,6 +27,10 @@ _FLAGS = (
 )  # fmt: skip
 
 
+REGISTER = Path(__file__).with_name("register.hpp")
+"""Header with the width of a vector register, to be put before a source that needs it."""
+
+
 class BuildError(OSError):
     """There is no C++ compiler, it rejected the source, or there is no writable folder for the result."""
 

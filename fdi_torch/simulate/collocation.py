@@ -169,6 +169,10 @@ class Collocation:
         values = self.network.bind(self.space, theta.unsqueeze(-2))
         return self._output_map.look(levels.movedim(1, 2), values, self._columns(theta))
 
+    def apart(self, theta: Tensor, near: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:
+        """The same as of `JointCollocation`, for one recording."""
+        return [(self, theta, near)]
+
     def _columns(self, theta: Tensor) -> list[Tensor]:
         """The parameters other than start levels, each (L, 1)."""
         return [theta[:, self.space.index(name), None] for name in self._names]

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from itertools import accumulate
 from pathlib import Path
 
+from fdi_torch.simulate.build import REGISTER
 from fdi_torch.simulate.cpp_sections import SectionWriter
 from fdi_torch.simulate.implicit import DIAGONAL, ERROR, NEWTON_ROUNDING, NEWTON_ROUNDS, NEWTON_SHARE, STAGES
 from fdi_torch.simulate.program import Program
@@ -79,7 +80,7 @@ def primitives(real: str) -> str:
     bits, suffix = (32, "##f") if real == "float" else (64, "")
     head = ["#include <cmath>", _VECTORS, f"typedef {real} real;"]
     head += [f"#define REAL_BITS {bits}", f"#define LIBRARY(name) name{suffix}"]
-    return "\n".join([*head, _PRIMITIVES.read_text(encoding="utf-8")])
+    return "\n".join([*head, *(header.read_text(encoding="utf-8") for header in (REGISTER, _PRIMITIVES))])
 
 
 def _law_tables(program: Program) -> list[str]:

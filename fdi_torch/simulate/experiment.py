@@ -161,15 +161,7 @@ def _blocks(count: int) -> Iterator[slice]:
 
 
 def _select(recording: Recording, channels: tuple[str, ...]) -> Tensor:
-    columns = []
-    for channel in channels:
-        if channel not in recording.input_names:
-            known = ", ".join(recording.input_names) or "none"
-            raise ValueError(f"{recording.source}: expected an input '{channel}', got {known}; map the column to it")
-        columns.append(recording.inputs[:, recording.input_names.index(channel)])
-    if not columns:
-        return recording.time.new_zeros(len(recording), 0)
-    inputs = torch.stack(columns, dim=1)
+    inputs = recording.inputs[:, recording.input_columns(channels)]
     if not bool(torch.isfinite(inputs).all()):
         row = int((~torch.isfinite(inputs)).any(dim=1).nonzero()[0])
         raise ValueError(

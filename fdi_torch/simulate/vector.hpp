@@ -6,20 +6,13 @@
 #include <cstdint>
 #include <cstring>
 #include <type_traits>
-#if defined(__AVX512F__)
-#define REGISTER 64
-#elif defined(__AVX__)
-#define REGISTER 32
-#else
-#define REGISTER 16
-#endif
 #define INLINE static inline __attribute__((always_inline))
 
-typedef real Vec __attribute__((vector_size(REGISTER)));
-typedef real Kept __attribute__((vector_size(REGISTER), aligned(sizeof(real)), may_alias));
+typedef real Vec __attribute__((vector_size(REGISTER_BYTES)));
+typedef real Kept __attribute__((vector_size(REGISTER_BYTES), aligned(sizeof(real)), may_alias));
 typedef std::conditional<REAL_BITS == 64, int64_t, int32_t>::type Bits;
-enum { VECTOR = REGISTER / sizeof(real) };
-typedef Bits BitsVec __attribute__((vector_size(REGISTER)));
+enum { VECTOR = REGISTER_BYTES / sizeof(real) };
+typedef Bits BitsVec __attribute__((vector_size(REGISTER_BYTES)));
 
 #define EACH_VECTOR for (int l = 0; l < LANES; l += VECTOR)
 #define AT(lane) (*reinterpret_cast<Kept *>((lane) + l))

@@ -106,4 +106,4 @@ def _fine_noise(segment: DataSet, fit: Fit) -> Noise:
     differences = (residual[2:] - 2.0 * residual[1:-1] + residual[:-2]) / math.sqrt(6.0)
     for c in valid.any(dim=0).nonzero().flatten().tolist():
         size[c] = differences[valid[:, c], c].square().mean().sqrt()
-    return Noise(torch.minimum(torch.maximum(size, FINEST * span), COARSEST * span), torch.zeros_like(span))
+    return Noise.white(torch.minimum(torch.maximum(size, FINEST * span), COARSEST * span))

@@ -19,7 +19,7 @@ from itertools import product
 import torch
 from torch import Tensor
 
-from fdi_torch.effects import effect, without_startup_effects
+from fdi_torch.effects import effects_of, without_startup_effects
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet, data_set_of
@@ -83,7 +83,7 @@ def predict(
     if start_samples < 1:
         raise ValueError(f"expected at least 1 sample for the start levels, got {start_samples}")
     plant = without_startup_effects(with_varying(plant, vary), recording.ran)
-    nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    nominal_effects = effects_of(plant)
     duration = float(recording.time[-1] - recording.time[0])
     step = step or max(0.5 * float(torch.median(torch.diff(recording.time))), duration / MOST_STEPS)
     defect = math.inf
@@ -124,8 +124,7 @@ def _run(data: DataSet, start_samples: int, skipped: int) -> Prediction:
     if not bool(early.any()):
         source = data.recording.source
         raise ValueError(f"{source}: expected readings among the first {start_samples} samples, got none")
-    std = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
-    fitter = Fitter(replace(data, mask=early), Noise(1e-2 * std, torch.zeros_like(std)))
+    fitter = Fitter(replace(data, mask=early), Noise.rough(data.readings))
     engine, theta = _start_from_segment(fitter, skipped) if skipped else _start_from_samples(fitter)
     run = engine.converge(theta)
     readings = run.readings[0]

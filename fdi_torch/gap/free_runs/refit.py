@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from fdi_torch.effects import build_network, effect
+from fdi_torch.effects import build_network, effect, effects_of
 from fdi_torch.gap.answer import with_constants
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.channel_noise import Noise, estimate_noise
-from fdi_torch.gap.dataset import DataSet, RecordingPart
+from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.free_runs.between_runs import DETERMINED, RunConstant
 from fdi_torch.gap.free_runs.prediction import rmse_by_sensor, with_varying
 from fdi_torch.gap.preprocess.sensor_limits import limits_of
@@ -30,12 +30,10 @@ from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.names import matching
 from fdi_torch.parameters import ParameterName, by_prefix, common_name, name_in_recording
 from fdi_torch.plant.description import PlacedEffect, PlantDescription, with_tolerances
-from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of_all
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.plant_limits import expect_no_denied_rim
 from fdi_torch.recordings.plant_units import expect_right_units
-from fdi_torch.simulate.experiment import Experiment
 
 TURNS = 3  # alternations between noise and fit
 WIDE = 0.5  # share of a range; a larger standard error means undetermined
@@ -95,7 +93,7 @@ def refit(
     plant = replace(plant, effects=tuple(e for e in plant.effects if e.prefix not in omitted))
     plant = with_tolerances(plant, lambda name: name.prefix not in omitted)
     held_plant = with_tolerances(with_varying(plant, vary), lambda name: str(name) not in held_names)
-    placements = [Placement(effect(e.effect), e.location, e.parameters) for e in plant.effects]
+    placements = effects_of(plant)
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     for recording in recordings:
         expect_right_units(held_plant, recording)
@@ -105,9 +103,10 @@ def refit(
     fixed = {*plant.tolerances, *held_names}
     start = {n: v for n, v in _initial_values(plant, recordings).items() if n not in fixed}
     free = [p for p in placements if p.prefix in by_prefix(start)]
-    std = data.readings.nan_to_num().std(dim=0).clamp(min=1e-9)
-    size = 1e-2 * std if white is None else white * std.new_tensor([abs(s.gain) for s in plant.sensors])
-    fitter = Fitter(data, Noise(size, torch.zeros_like(std)))
+    noise = Noise.rough(data.readings)
+    if white is not None:
+        noise = Noise.white(white * data.readings.new_tensor([abs(s.gain) for s in plant.sensors]))
+    fitter = Fitter(data, noise)
     null = _with_a_trajectory(fit_by_continuation(fitter, Candidate()), recordings)
     fit, base = null, null if white is None else None
     for _ in range(TURNS if white is None else 1):
@@ -233,8 +232,4 @@ def trajectory_found(fit: Fit) -> bool:
 
 
 def _smoothed(data: DataSet, widening: float) -> DataSet:
-    def wider(experiment: Experiment) -> Experiment:
-        return replace(experiment, resolution=widening * experiment.resolution)
-
-    further: list[RecordingPart] = [replace(part, experiment=wider(part.experiment)) for part in data.further]
-    return replace(data, experiment=wider(data.experiment), further=tuple(further))
+    return replace(data, experiments=tuple(replace(e, resolution=widening * e.resolution) for e in data.experiments))

@@ -7,8 +7,9 @@ these.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import torch
 from torch import Tensor
@@ -37,84 +38,129 @@ from fdi_torch.gap.localization.regressors import (
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
 from fdi_torch.plant.effect import place_kind
 from fdi_torch.plant.flow_component import FlowComponent
-from fdi_torch.plant.scales import time_scale
 
 Signals = dict[str, Tensor]
+FineRegressor = Breakpoints | Relays | Curves | Pulses
+FineRegressors = list[FineRegressor]
 RELAYS = 6  # thresholds of relays
 FINER = 8  # factor by which kinks, jumps, bands and travel times may lie more closely than in the first grid
 FINER_RELAYS = 4  # the same for thresholds of relays, of which there are as many as pairs of these
 SLOW = (100.0, 300.0)  # time constants (s) of a side chamber of a tank
 
 
-class SignalRanges:
-    """Least and greatest value of each signal over all recordings, and regressors between them."""
+@dataclass(frozen=True)
+class Terms:
+    """Regressors (K,) on a coarse grid, or several with coefficients of one variance (N, K); and families of the same
+    ones on finer grids."""
 
-    def __init__(self, recordings: Sequence[Signals]) -> None:
-        self.recordings = recordings
+    grid: Sequence[Tensor]
+    fine: Sequence[FineRegressor] = ()
 
-    def __call__(self, name: str) -> tuple[float, float]:
-        low, high = (
-            min(float(s[name].min()) for s in self.recordings),
-            max(float(s[name].max()) for s in self.recordings),
-        )
+
+class LocalSignals:
+    """Local signals (K,) along one recording, and the terms that depend on them.
+
+    step (K,): lengths of the steps, s. scale: time scale of the plant. recordings: the signals of all recordings,
+    between whose least and greatest values the grids lie. In all terms, factor is the name of a signal that multiplies
+    the regressors, if given.
+    """
+
+    def __init__(self, signals: Signals, step: Tensor, scale: float, recordings: Sequence[Signals]) -> None:
+        self.signals, self.step, self.scale, self.recordings = signals, step, scale, recordings
+
+    def ends(self, signal: str) -> tuple[float, float]:
+        """Least and greatest value of a signal over all recordings."""
+        low = min(float(s[signal].min()) for s in self.recordings)
+        high = max(float(s[signal].max()) for s in self.recordings)
         return low, max(high, low + 1e-9 * (max(abs(low), abs(high)) or 1.0))
 
-    def smooth_function(self, s: Signals, name: str, count: int) -> list[Tensor]:
-        return smooth_function(s[name], self(name), 2 * count)
+    def smooth(self, signal: str, count: int, factor: str = "") -> Terms:
+        """A piecewise linear function with 2 `count` nodes; kinks FINER times as close."""
+        grid = smooth_function(self.signals[signal], self.ends(signal), 2 * count)
+        return self._terms(factor, grid, self._breakpoints(signal, 2 * FINER * count, factor, jump=False))
 
-    def steps_in_value(self, s: Signals, name: str, count: int) -> list[Tensor]:
-        return steps_in_value(s[name], self(name), 3 * count)
+    def jumps(self, signal: str, count: int, factor: str = "") -> Terms:
+        """Steps at 3 `count` values; jumps FINER times as close."""
+        grid = steps_in_value(self.signals[signal], self.ends(signal), 3 * count)
+        return self._terms(factor, grid, self._breakpoints(signal, 3 * FINER * count + 2, factor, jump=True))
 
-    def kinks(self, s: Signals, name: str, count: int, factor: Tensor | None = None) -> Breakpoints:
-        """Kinks on a grid that is FINER times as fine as that of `smooth_function` with this `count`."""
-        return self._breakpoints(s, name, 2 * FINER * count, factor, jump=False)
+    def relays(self, signal: str, factor: str) -> Terms:
+        """Relays of a signal."""
+        return self._terms(factor, (on for _, on in self._switched(signal)), self._fine_relays(signal, factor))
 
-    def jumps(self, s: Signals, name: str, count: int, factor: Tensor | None = None) -> Breakpoints:
-        return self._breakpoints(s, name, 3 * FINER * count + 2, factor, jump=True)
+    def switched_draws(self, level: str, root: str) -> Terms:
+        """A constant draw, an orifice at the floor, and one at the lower threshold of a relay that switches it."""
+        x, y = self.signals[level], self.signals[root]
+        each = ((on, on * y, on * _root((x - low).clamp(min=0.0))) for low, on in self._switched(level))
+        return Terms(list(chain(*each)), [self._fine_relays(level, ""), self._fine_relays(level, root)])
 
-    def _breakpoints(self, s: Signals, name: str, count: int, factor: Tensor | None, jump: bool) -> Breakpoints:
-        at = torch.linspace(*self(name), count, dtype=s[name].dtype)[1:-1]
-        return Breakpoints(s[name], torch.ones_like(s[name]) if factor is None else factor, at, jump)
+    def lags(self, signal: str) -> Terms:
+        return Terms(lags_and_decays(self.signals[signal], self.step, self.scale))
 
-    def relays(self, s: Signals, name: str) -> list[tuple[float, Tensor]]:
+    def slow_lags(self, signal: str) -> Terms:
+        x = self.signals[signal]
+        return Terms([lagged(x, self.step, self.scale * tau) - x for tau in SLOW])
+
+    def play(self, signal: str, factor: str = "") -> Terms:
+        x, ends, bands = self.signals[signal], self.ends(signal), finer(BACKLASH_BANDS, FINER)
+        fine = self._times(factor, backlashes(x, ends, bands, BACKLASH_STARTS))
+        return self._terms(factor, backlashes(x, ends), Curves(torch.stack(fine)))
+
+    def actuator(self, signal: str, factor: str = "") -> list[Terms]:
+        """What an actuator adds to its flow or opening if it lags, sticks, or has a limited rate or play."""
+        x, ends, lags = self.signals[signal], self.ends(signal), self.lags(signal).grid
+        coarse = [*lags, *rate_limits(x, self.step, ends, self.scale), *stictions(x, ends)]
+        slow = rate_limits(x, self.step, ends, self.scale, finer(TRAVEL_TIMES, FINER))
+        curves = [torch.stack(self._times(factor, f)) for f in (slow, stictions(x, ends, FINE_STICTION_BANDS))]
+        return [self._terms(factor, coarse, *map(Curves, curves)), self.play(signal, factor)]
+
+    def fatigue(self, signal: str) -> Terms:
+        return Terms(fatigues(self.signals[signal], self.step, self.ends(signal), self.scale))
+
+    def clock_drift(self, signal: str) -> Terms:
+        """A gain that grows with time, and delays that grow from some time on."""
+        x, time, end = self.signals[signal], self.signals["time"], self.ends("time")[1]
+        lag = lagged(x, self.step, self.scale * LAGS[0]) - x
+        return Terms([x * time / end, *(lag * (time / end - j / RAMPS).clamp(min=0.0) for j in range(RAMPS))])
+
+    def _terms(self, factor: str, grid: Iterable[Tensor], *fine: FineRegressor) -> Terms:
+        return Terms(self._times(factor, grid), fine)
+
+    def _times(self, factor: str, functions: Iterable[Tensor]) -> list[Tensor]:
+        return [self.signals[factor] * f for f in functions] if factor else list(functions)
+
+    def _factor(self, factor: str, signal: str) -> Tensor:
+        return self.signals[factor] if factor else torch.ones_like(self.signals[signal])
+
+    def _breakpoints(self, signal: str, count: int, factor: str, jump: bool) -> Breakpoints:
+        x = self.signals[signal]
+        at = torch.linspace(*self.ends(signal), count, dtype=x.dtype)[1:-1]
+        return Breakpoints(x, self._factor(factor, signal), at, jump)
+
+    def _switched(self, signal: str) -> list[tuple[float, Tensor]]:
         """The lower threshold and the output of each relay."""
-        thresholds = relay_thresholds(self(name), RELAYS)
-        on = relay(s[name], thresholds).to(s[name].dtype)
-        return list(zip(thresholds[:, 0].tolist(), on, strict=True))
+        x, thresholds = self.signals[signal], relay_thresholds(self.ends(signal), RELAYS)
+        return list(zip(thresholds[:, 0].tolist(), relay(x, thresholds).to(x.dtype), strict=True))
 
-    def fine_relays(self, s: Signals, name: str, factor: Tensor | None = None) -> Relays:
-        """Relays with thresholds as closely spaced as those of `relays`, over FINER_RELAYS."""
-        one = torch.ones_like(s[name]) if factor is None else factor
-        return Relays(s[name], one, relay_thresholds(self(name), FINER_RELAYS * RELAYS))
-
-    def fine_backlashes(self, s: Signals, name: str) -> Curves:
-        bands = finer(BACKLASH_BANDS, FINER)
-        return Curves(torch.stack(backlashes(s[name], self(name), bands, BACKLASH_STARTS)))
-
-
-# Local signals (K,), step lengths (K,) s -> regressors (K,), or of several coefficients with one variance (N, K)
-RegressorFunction = Callable[[Signals, Tensor, SignalRanges], list[Tensor]]
-FineRegressor = Breakpoints | Relays | Curves | Pulses
-FineRegressors = list[FineRegressor]
-FineFunction = Callable[[Signals, Tensor, SignalRanges], FineRegressors]
+    def _fine_relays(self, signal: str, factor: str) -> Relays:
+        thresholds = relay_thresholds(self.ends(signal), FINER_RELAYS * RELAYS)
+        return Relays(self.signals[signal], self._factor(factor, signal), thresholds)
 
 
 @dataclass(frozen=True)
 class DiscrepancyModel:
-    """Regressors of one component's discrepancy.
+    """Discrepancy of one component: a flow from `source` to `target`.
 
-    signals: the local signals along a recording. flows: regressors in m^3/s, or to be scaled to it, of a flow from
-    `source` to `target`. fine: kinks, jumps and relays as among them on a finer grid. in_time: name of the signal that
-    functions of time multiply. areas: regressors of a relative change of the target's area, as level rates in m/s.
+    signals: the local signals along a recording. terms: in m^3/s, or to be scaled to it. in_time: name of the signal
+    that functions of time multiply. areas: of a relative change of the target's area, as level rates in m/s.
     """
 
     signals: Callable[[Forcing], Signals]
-    flows: RegressorFunction
-    fine: FineFunction
+    terms: Callable[[LocalSignals], list[Terms]]
     in_time: str
     source: str
     target: str
-    areas: RegressorFunction | None = None
+    areas: Callable[[LocalSignals], Terms] | None = None
 
 
 def discrepancy_model_at(place: str, plant: PlantDescription) -> DiscrepancyModel:
@@ -129,22 +175,13 @@ def discrepancy_model_at(place: str, plant: PlantDescription) -> DiscrepancyMode
     return _commanded(component, plant) if component.commanded else _by_head(component, plant)
 
 
-def reading_regressors(s: Signals, step: Tensor, ends: SignalRanges, scale: float) -> list[Tensor]:
-    """Regressors of a sensor's discrepancy. step: sampling intervals, s. scale: time scale of the plant."""
-    regressors = [*ends.smooth_function(s, "reading", 12), s["reading"] * s["time"] / ends("time")[1]]
-    lag = lagged(s["reading"], step, scale * LAGS[0]) - s["reading"]
-    regressors += [lag * (s["time"] / ends("time")[1] - j / RAMPS).clamp(min=0.0) for j in range(RAMPS)]  # clock drift
-    return [*regressors, *lags_and_decays(s["reading"], step, scale), *backlashes(s["reading"], ends("reading"))]
-
-
-def fine_reading_regressors(s: Signals, ends: SignalRanges) -> FineRegressors:
-    """The kinks and the backlashes among `reading_regressors` on finer grids."""
-    return [ends.kinks(s, "reading", 12), ends.fine_backlashes(s, "reading")]
+def reading_terms(at: LocalSignals) -> list[Terms]:
+    """The discrepancy of a sensor, in its unit; at: its samples."""
+    return [at.smooth("reading", 12), at.clock_drift("reading"), at.lags("reading"), at.play("reading")]
 
 
 def _commanded(component: FlowComponent, plant: PlantDescription) -> DiscrepancyModel:
-    name, tank, scale = component.name, _index(plant, component.near_tank), time_scale(plant)
-    actuator = _actuator(plant, name)
+    name, tank, actuator = component.name, _index(plant, component.near_tank), _actuator(plant, component.name)
 
     def signals(trajectory: Forcing) -> Signals:
         command = trajectory.commands[actuator]
@@ -155,66 +192,27 @@ def _commanded(component: FlowComponent, plant: PlantDescription) -> Discrepancy
             "level": trajectory.levels[tank],
         }
 
-    def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        regressors = [*ends.smooth_function(s, "command", 9), *_of_actuator(s["flow"], step, ends("flow"), scale)]
-        regressors += [s["flow"] * j for j in ends.steps_in_value(s, "below", 9)]
-        regressors += [s["flow"] * b for b in ends.smooth_function(s, "level", 6)]
-        return [*regressors, *fatigues(s["flow"], step, ends("flow"), scale)]
+    def terms(at: LocalSignals) -> list[Terms]:
+        below, level = at.jumps("below", 9, "flow"), at.smooth("level", 6, "flow")
+        return [at.smooth("command", 9), *at.actuator("flow"), below, level, at.fatigue("flow")]
 
-    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
-        kinks = [ends.kinks(s, "command", 9), ends.kinks(s, "level", 6, s["flow"])]
-        jumps = ends.jumps(s, "below", 9, s["flow"])
-        return [*kinks, jumps, *_fine_of_actuator(s, "flow", step, ends, scale)]
-
-    return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
-
-
-def _of_actuator(x: Tensor, step: Tensor, ends: tuple[float, float], scale: float) -> list[Tensor]:
-    """What an actuator adds to x, its flow or opening, if it lags, sticks, or has a limited rate or play."""
-    return [
-        *lags_and_decays(x, step, scale),
-        *rate_limits(x, step, ends, scale),
-        *stictions(x, ends),
-        *backlashes(x, ends),
-    ]
-
-
-def _fine_of_actuator(s: Signals, name: str, step: Tensor, ends: SignalRanges, scale: float) -> list[Curves]:
-    """The rate limits, stictions and plays among `_of_actuator` on finer grids. name: of the flow or the opening."""
-    slow = rate_limits(s[name], step, ends(name), scale, finer(TRAVEL_TIMES, FINER))
-    sticking = stictions(s[name], ends(name), FINE_STICTION_BANDS)
-    return [Curves(torch.stack(slow)), Curves(torch.stack(sticking)), ends.fine_backlashes(s, name)]
+    return DiscrepancyModel(signals, terms, "flow", component.source, component.target)
 
 
 def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyModel:
-    name, scale = component.name, time_scale(plant)
-    has_valve = component.input_channel is not None
+    name, has_valve = component.name, component.input_channel is not None
 
     def signals(trajectory: Forcing) -> Signals:
         head = trajectory.heads[name]
         here = {"head": head, "root": _root(head), "flow": trajectory.flows[name]}
         return here | ({"opening": trajectory.commands[_actuator(plant, name)]} if has_valve else {})
 
-    def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        regressors = [*ends.smooth_function(s, "root", 16), *ends.smooth_function(s, "head", 12)]
-        regressors += lags_and_decays(s["flow"], step, scale)
-        regressors += [s["flow"] * j for j in ends.steps_in_value(s, "root", 24)]
-        regressors += [s["flow"] * on for _, on in ends.relays(s, "root")]
-        if has_valve:
-            of_valve = _of_actuator(s["opening"], step, ends("opening"), scale)
-            regressors += [s["root"] * r for r in (*ends.smooth_function(s, "opening", 9), *of_valve)]
-        return [*regressors, *backlashes(s["flow"], ends("flow")), *fatigues(s["flow"], step, ends("flow"), scale)]
+    def terms(at: LocalSignals) -> list[Terms]:
+        law = [at.smooth("root", 16), at.smooth("head", 12), at.lags("flow"), at.jumps("root", 24, "flow")]
+        valve = [at.smooth("opening", 9, "root"), *at.actuator("opening", "root")] if has_valve else []
+        return [*law, at.relays("root", "flow"), *valve, at.play("flow"), at.fatigue("flow")]
 
-    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
-        of_valve: FineRegressors = []
-        if has_valve:
-            past = _fine_of_actuator(s, "opening", step, ends, scale)
-            of_valve = [ends.kinks(s, "opening", 9, s["root"]), *(Curves(s["root"] * c.values) for c in past)]
-        jumps, relays = ends.jumps(s, "root", 24, s["flow"]), ends.fine_relays(s, "root", s["flow"])
-        kinks = [ends.kinks(s, "root", 16), ends.kinks(s, "head", 12)]
-        return [*kinks, jumps, relays, ends.fine_backlashes(s, "flow"), *of_valve]
-
-    return DiscrepancyModel(signals, flows, fine, "flow", component.source, component.target)
+    return DiscrepancyModel(signals, terms, "flow", component.source, component.target)
 
 
 def _actuator(plant: PlantDescription, name: str) -> int:
@@ -229,38 +227,25 @@ def _pair(place: str, plant: PlantDescription) -> DiscrepancyModel:
         head = trajectory.levels[_index(plant, first)] - trajectory.levels[_index(plant, second)]
         return {"head": head, "root": _root(head)}
 
-    def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        return [*ends.smooth_function(s, "head", 10), *ends.smooth_function(s, "root", 10)]
+    def terms(at: LocalSignals) -> list[Terms]:
+        return [at.smooth("head", 10), at.smooth("root", 10)]
 
-    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
-        return [ends.kinks(s, "head", 10), ends.kinks(s, "root", 10)]
-
-    return DiscrepancyModel(signals, flows, fine, "root", first, second)
+    return DiscrepancyModel(signals, terms, "root", first, second)
 
 
 def _tank(place: str, plant: PlantDescription) -> DiscrepancyModel:
-    tank, scale = _index(plant, place), time_scale(plant)
+    tank = _index(plant, place)
 
     def signals(trajectory: Forcing) -> Signals:
-        level = trajectory.levels[tank]
-        return {"level": level, "rate": trajectory.still[tank], "one": torch.ones_like(level)}
+        level, rate = trajectory.levels[tank], trajectory.still[tank]
+        return {"level": level, "root": _root(level), "rate": rate, "one": torch.ones_like(level)}
 
-    def flows(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        regressors = [*ends.smooth_function(s, "level", 12), *ends.steps_in_value(s, "level", 24)]
-        for low, on in ends.relays(s, "level"):  # a constant draw, an orifice at the floor, and one at that height
-            regressors += [on, on * _root(s["level"]), on * _root((s["level"] - low).clamp(min=0.0))]
+    def terms(at: LocalSignals) -> list[Terms]:
+        law = [at.smooth("level", 12), at.jumps("level", 24), at.switched_draws("level", "root")]
         # No short lags: a short lag of the level is its rate, which the balance explains already.
-        regressors += [lagged(s["level"], step, scale * tau) - s["level"] for tau in SLOW]
-        return [*regressors, *backlashes(s["level"], ends("level"))]
+        return [*law, at.slow_lags("level"), at.play("level")]
 
-    def areas(s: Signals, step: Tensor, ends: SignalRanges) -> list[Tensor]:
-        return [s["rate"] * b for b in ends.smooth_function(s, "level", 12)]
-
-    def fine(s: Signals, step: Tensor, ends: SignalRanges) -> FineRegressors:
-        relays = [ends.fine_relays(s, "level"), ends.fine_relays(s, "level", _root(s["level"]))]
-        return [ends.kinks(s, "level", 12), ends.jumps(s, "level", 24), *relays, ends.fine_backlashes(s, "level")]
-
-    return DiscrepancyModel(signals, flows, fine, "one", OUTSIDE, place, areas)
+    return DiscrepancyModel(signals, terms, "one", OUTSIDE, place, lambda at: at.smooth("level", 12, "rate"))
 
 
 def _index(plant: PlantDescription, tank: str) -> int:

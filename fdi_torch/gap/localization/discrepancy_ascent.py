@@ -30,7 +30,6 @@ from fdi_torch.gap.localization.whitened_discrepancy import WhitenedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import LinearParameters, estimate_disturbances, with_disturbances
 from fdi_torch.gap.trajectory_problem import SHARE
 
-STEPS = 120  # step functions of time
 LESS_NOISE = (0.3, 0.1, 0.03, 0.01)  # random flows in successive regressions, as shares of the likeliest without one
 MOST_REGRESSORS = 100  # that a relevant law needs; a regression that so many steps would not save is given up
 MOST_TURNS = 12  # alternations between the disturbance noise, one more regressor, and the parameters of the fit
@@ -93,19 +92,19 @@ class EvaluatedDiscrepancy:
         explained, at, fit = self.explained, self.discrepancy, self.regression.fit
         size = unexplained_norm(fitter, fit.space, fit.theta, at.linearised.jacobian[0], explained)
         return LocalizedDiscrepancy(
-            self.location,
-            self.gain,
-            self.log_likelihood,
-            self.regressed.parameters,
-            explained,
-            at.linearised.readings[0] + explained,
-            size,
-            self.selection,
-            fit,
-            self.noise,
-            self.estimate,
-            self._quantities,
-            self.regression.level_filter,
+            location=self.location,
+            gain=self.gain,
+            log_likelihood=self.log_likelihood,
+            parameters=self.regressed.parameters,
+            explained=explained,
+            predicted=at.linearised.readings[0] + explained,
+            size=size,
+            selection=self.selection,
+            fit=fit,
+            noise=self.noise,
+            estimate=self.estimate,
+            level_filter=self.regression.level_filter,
+            quantities=self._quantities,
         )
 
     @property
@@ -172,7 +171,7 @@ class Ascent:
         data, right = self.fitter.data, Fitter(self.fitter.data, self.fitter.noise)
         if any(s.name == place for s in data.plant.sensors):
             right = Fitter(replace(data, readings=data.readings - explained), self.fitter.noise)
-        regression = DiscrepancyRegression(right, fit, selection.frequencies, STEPS, self.level_filter)
+        regression = DiscrepancyRegression(right, fit, selection.frequencies, self.level_filter)
         return self.evaluate(regression, regression.of(place, selection.positions), place, noise, selection.precision)
 
     def under_less_and_less_noise(

@@ -19,20 +19,20 @@ from fdi_torch.gap.localization.component_regressors import (
     DiscrepancyModel,
     FineRegressor,
     FineRegressors,
-    SignalRanges,
+    LocalSignals,
     Signals,
+    Terms,
     discrepancy_model_at,
-    fine_reading_regressors,
-    reading_regressors,
+    reading_terms,
 )
 from fdi_torch.gap.localization.discrepancy_columns import Columns, Discrepancy, Position
-from fdi_torch.gap.localization.predicted_levels import LevelFilter, predicted_levels
+from fdi_torch.gap.localization.predicted_levels import LevelFilter
 from fdi_torch.gap.localization.recording_linearisation import RecordingLinearisation
 from fdi_torch.gap.localization.regressor_families import Breakpoints, Pulses, Relays
 from fdi_torch.gap.localization.regressors import harmonics, step_functions, time_functions
 from fdi_torch.plant.description import OUTSIDE, Sensor
 from fdi_torch.plant.scales import time_scale
-from fdi_torch.simulate.joint_collocation import JointCollocation, with_blanks
+from fdi_torch.simulate.joint_collocation import with_blanks
 from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.resampling import interpolate
 
@@ -88,27 +88,20 @@ class Regressors:
 class DiscrepancyRegression:
     """Influence of the discrepancies of all components of a data set, about one fit.
 
-    frequencies: candidates for that of the sinusoids, Hz. steps: number of step functions of time, over all recordings.
-    level_filter: predicts the levels; by default that of the fitter, about the fit.
+    frequencies: candidates for that of the sinusoids, Hz. level_filter: predicts the levels.
     """
 
-    def __init__(
-        self,
-        fitter: Fitter,
-        fit: Fit,
-        frequencies: Sequence[float],
-        steps: int,
-        level_filter: LevelFilter | None = None,
-    ) -> None:
+    def __init__(self, fitter: Fitter, fit: Fit, frequencies: Sequence[float], level_filter: LevelFilter) -> None:
         self.fitter, self.fit, self.level_filter = fitter, fit, level_filter
         self.frequencies = torch.tensor(frequencies, dtype=fit.theta.dtype)
         self.engine = fitter.engine(fit.candidate, list(fit.effect_values))
         self.theta = fit.theta.unsqueeze(0)
-        self.levels = level_filter.levels(fitter, fit) if level_filter else predicted_levels(fitter, fit.linearised)
+        self.levels = level_filter.levels(fitter, fit)
         self.linearised = self.engine.linearise(self.theta, self.levels)
         self.pieces = self._pieces(replace(self.linearised, levels=self.levels))
         self._last: tuple[str, list[Regressors], Linearised] | None = None
-        self.steps = step_functions(steps, len(fitter.data.readings), len(self.pieces))
+        self.scale = time_scale(fitter.data.plant)
+        self.steps = step_functions(len(fitter.data.readings), len(self.pieces))
 
     def of(self, place: str, positions: Sequence[Position] = ()) -> Discrepancy:
         """The discrepancy of all regressors of the grid, and of those at some positions between them."""
@@ -131,13 +124,13 @@ class DiscrepancyRegression:
         choices[sinusoids] *= 2 * len(grid)
         discrepancy = Discrepancy(columns, linearised, regressor, choices, frequency, sinusoids)
         for position in positions:
-            discrepancy = discrepancy.with_column(self.column(place, position), position)
+            discrepancy = discrepancy.with_column(self.columns(place, [position])[..., 0], position)
         return discrepancy
 
-    def column(self, place: str, position: Position) -> Tensor:
-        """Influence (S, C) of the regressor at a position."""
-        functions = [r.at(position, k).unsqueeze(0) for k, r in enumerate(self.at(place)[0])]
-        return with_blanks([self.influence(place, k, f) for k, f in enumerate(functions)], dim=0)[..., 0]
+    def columns(self, place: str, positions: Sequence[Position]) -> Tensor:
+        """Influence (S, C, M) of the regressors at positions."""
+        functions = [torch.stack([r.at(p, k) for p in positions]) for k, r in enumerate(self.at(place)[0])]
+        return with_blanks([self.influence(place, k, f) for k, f in enumerate(functions)], dim=0)
 
     def sinusoids(self, place: str, frequency: Tensor) -> Tensor:
         """Influence (S, C, F, W) of harmonics of each frequency (F,), with separate amplitudes in each recording."""
@@ -171,8 +164,7 @@ class DiscrepancyRegression:
         """Influence (S, C, M) of local functions (M, K) along one recording on its readings, not whitened."""
         piece, channel = self.pieces[recording], self.sensor(place)
         if channel is None:
-            component = discrepancy_model_at(place, self.fitter.data.plant)
-            rates = (self._rate_changes(piece, component, some) for some in functions.split(BATCH))
+            rates = (self._rate_changes(piece, place, some) for some in functions.split(BATCH))
             return side_by_side([piece.to_readings(some) for some in rates])
         columns = functions.new_zeros(functions.shape[1], self.fitter.data.readings.shape[1], len(functions))
         columns[:, channel] = functions.T
@@ -184,13 +176,7 @@ class DiscrepancyRegression:
         return self.pieces[recording].to_readings(rates)
 
     def _pieces(self, linearised: Linearised) -> list[RecordingLinearisation]:
-        whole = self.engine
-        parts = (
-            whole.apart(self.theta, linearised)
-            if isinstance(whole, JointCollocation)
-            else [(whole, self.theta, linearised)]
-        )
-        pieces = []
+        parts, pieces = self.engine.apart(self.theta, linearised), []
         for rows, (engine, theta, linearised_part) in zip(self.fitter.data.rows, parts, strict=True):
             values = engine.network.bind(engine.space, theta.unsqueeze(-2))
             present = [p.prefix for p in engine.network.placements]
@@ -204,16 +190,11 @@ class DiscrepancyRegression:
             {n: x.reshape(-1).expand(len(p.middle)) for n, x in component.signals(p.forcing).items()}
             for p in self.pieces
         ]
-        ends, regressors = SignalRanges(signals), []
+        regressors = []
         for piece, s in zip(self.pieces, signals, strict=True):
-            step, factor = piece.engine.experiment.steps, s[component.in_time]
-            functions, widths = _stacked(component.flows(s, step, ends))
-            areas, of_areas = _stacked(component.areas(s, step, ends)) if component.areas else (None, ())
-            fine, in_time = component.fine(s, step, ends), factor * self._functions_of_time(piece, piece.middle)
-            widths = of_areas + widths
-            regressors.append(
-                Regressors(functions, widths, fine, in_time, piece.middle, factor, self.frequencies, areas)
-            )
+            at = LocalSignals(s, piece.engine.experiment.steps, self.scale, signals)
+            areas = component.areas(at) if component.areas else None
+            regressors.append(self._regressors(piece, component.terms(at), piece.middle, s[component.in_time], areas))
         return regressors
 
     def _of_sensor(self, sensor: Sensor) -> tuple[list[Regressors], Linearised]:
@@ -228,26 +209,38 @@ class DiscrepancyRegression:
                 {"reading": sensor.gain * interpolate(times, nodes, tank_levels) + sensor.offset, "time": times}
             )
             first += len(nodes)
-        ends, scale, regressors = SignalRanges(signals), time_scale(self.fitter.data.plant), []
+        regressors = []
         for piece, s in zip(self.pieces, signals, strict=True):
-            functions, widths = _stacked(reading_regressors(s, piece.engine.experiment.sample_intervals, ends, scale))
-            fine, in_time = fine_reading_regressors(s, ends), self._functions_of_time(piece, s["time"])
-            one = torch.ones_like(s["time"])
-            regressors.append(Regressors(functions, widths, fine, in_time, s["time"], one, self.frequencies))
+            at = LocalSignals(s, piece.engine.experiment.sample_intervals, self.scale, signals)
+            regressors.append(self._regressors(piece, reading_terms(at), s["time"], torch.ones_like(s["time"])))
         return regressors, self.engine.linearise(self.theta, levels)
 
-    def _rate_changes(self, piece: RecordingLinearisation, component: DiscrepancyModel, flows: Tensor) -> Tensor:
-        """Map flows (M, K) from source to target to changes of the rates (n, M, K)."""
+    def _regressors(
+        self,
+        piece: RecordingLinearisation,
+        terms: Sequence[Terms],
+        time: Tensor,
+        factor: Tensor,
+        areas: Terms | None = None,
+    ) -> Regressors:
+        functions, widths = _stacked([f for term in terms for f in term.grid])
+        of_areas, widths_of_areas = _stacked(areas.grid) if areas else (None, ())
+        in_time = factor * torch.stack(time_functions(time, float(piece.engine.experiment.nodes[-1]), self.steps))
+        fine = [family for term in terms for family in term.fine]
+        return Regressors(functions, widths_of_areas + widths, fine, in_time, time, factor, self.frequencies, of_areas)
+
+    def _rate_changes(self, piece: RecordingLinearisation, place: str, flows: Tensor) -> Tensor:
+        """Map flows (M, K) at a place to changes of the rates (n, M, K)."""
         inflows: list[Tensor | None] = [None] * len(self.fitter.data.plant.tanks)
-        for end, sign in ((component.source, -1.0), (component.target, 1.0)):
-            if end != OUTSIDE:
-                inflows[self.tank(end)] = sign * flows
+        for tank, sign in self.ends(place):
+            inflows[tank] = sign * flows
         return piece.forcing.by_inflows(inflows, len(flows))
 
-    def _functions_of_time(self, piece: RecordingLinearisation, time: Tensor) -> Tensor:
-        """Steps and ramps, (M, K)."""
-        duration = float(piece.engine.experiment.nodes[-1])
-        return torch.stack(time_functions(time, duration, self.steps))
+    def ends(self, place: str) -> list[tuple[int, float]]:
+        """The tanks whose balances the discrepancy flow at a place changes, each with the sign."""
+        component = discrepancy_model_at(place, self.fitter.data.plant)
+        ends = (component.source, -1.0), (component.target, 1.0)
+        return [(self.tank(tank), sign) for tank, sign in ends if tank != OUTSIDE]
 
     def tank(self, name: str) -> int:
         return [t.name for t in self.fitter.data.plant.tanks].index(name)

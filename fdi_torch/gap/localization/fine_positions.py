@@ -31,16 +31,15 @@ from fdi_torch.gap.localization.single_regressor_gain import (
     adjoints_of,
     choices_of,
     gains_of,
-    inflow_weights,
     largest_influence,
     parameter_basis,
     position_products,
     random_signs,
     strengths_of,
+    weights_of,
     whitened_residual,
 )
 from fdi_torch.gap.localization.sparse_regression import COLLINEAR, VISIBLE, regressor_costs
-from fdi_torch.simulate.joint_collocation import with_blanks
 
 TRIED = 8  # positions, or frequencies, with the largest estimated gains, whose gains are computed exactly
 HALVINGS = 4  # of the spacing between a relay's thresholds; then it is 1/16 of that of the fine grid
@@ -106,7 +105,7 @@ class Positions:
         if not tried or tried[0][0] < 0.0:
             return None
         positions = [Position(family, index, self._choices[family]) for _, family, index in tried]
-        columns = torch.stack([self.regression.column(self.place, p) for p in positions], dim=-1)
+        columns = self.regression.columns(self.place, positions)
         costs = torch.tensor([self._costs[p.family] for p in positions], dtype=columns.dtype)
         best = int((self._exact_gains(columns, basis) - costs).argmax())
         family = self.regression.families(self.place)[positions[best].family]
@@ -118,14 +117,12 @@ class Positions:
         self, discrepancy: Discrepancy, basis: Tensor, position: Position, family: Relays | Pulses
     ) -> Discrepancy:
         """The discrepancy with a relay or pulse whose parameters are moved to where it explains most."""
-        each = list(enumerate(self.regression.at(self.place)[0]))
 
         def at(parameters: Tensor) -> list[Position]:
             return [replace(position, parameters=tuple(p)) for p in parameters.tolist()]
 
         def columns(parameters: Tensor) -> Tensor:
-            functions = [torch.stack([r.at(p, k) for p in at(parameters)]) for k, r in each]
-            return with_blanks([self.regression.influence(self.place, k, f) for k, f in enumerate(functions)], dim=0)
+            return self.regression.columns(self.place, at(parameters))
 
         start = family.parameters(position.index)
         best = best_parameters(
@@ -147,10 +144,7 @@ class Positions:
     def _weights(self, white: Tensor, basis: Tensor) -> list[Tensor]:
         """Whitened columns (S C + P, W), less what the basis explains of these, as weights (W, K) of a regressor along
         each recording."""
-        adjoints = adjoints_of(self.regression, self.under, white, basis)
-        if (channel := self.regression.sensor(self.place)) is None:
-            return inflow_weights(self.regression, self.place, adjoints)
-        return [adjoints.readings[piece.rows, channel].T for piece in self.regression.pieces]
+        return weights_of(self.regression, self.place, adjoints_of(self.regression, self.under, white, basis))
 
     def with_best_frequency(self, discrepancy: Discrepancy, precision: Tensor) -> Discrepancy:
         """The discrepancy with the frequency at which its sinusoids explain most beside the other regressors that it

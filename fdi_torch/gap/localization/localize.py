@@ -19,7 +19,7 @@ from fdi_torch.estimate.evidence import RARE, TOLERANCE
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.localization.discrepancy_ascent import STEPS, Ascent, gain_of
+from fdi_torch.gap.localization.discrepancy_ascent import Ascent, gain_of
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.localized_discrepancy import (
     LocalizedDiscrepancy,
@@ -75,18 +75,17 @@ def localize(
     itself = max(evidence - base, 0.0)
     if hopeless or not places:
         return Localization((), itself)
-    assert regression.level_filter is not None
     ascent = Ascent(fitter, regression.level_filter, base)
     noises = likely, nearly_without_disturbances(likely)
-    first_order = _first_order_gains(regression, noises, fit, places, base)
+    first_order = _first_order_gains(regression, noises, places, base)
     evaluated: dict[str, LocalizedDiscrepancy] = {}
     growth, examined = -math.inf, 0  # growth: largest ratio so far of what a first-order gain lacks to that gain
-    for place, first in sorted(first_order.items(), key=lambda item: -item[1].expected):
-        if examined >= CALIBRATION_PLACES and first.expected + growth * first.gain < needed:
+    for place, (expected, alone) in sorted(first_order.items(), key=lambda item: -item[1][0]):
+        if examined >= CALIBRATION_PLACES and expected + growth * alone < needed:
             continue
         best = ascent.climbed(ascent.under_less_and_less_noise(regression, place, likely), needed)
         examined += 1
-        growth = max(growth, (best.gain - first.expected) / max(first.gain, 1.0))
+        growth = max(growth, (best.gain - expected) / max(alone, 1.0))
         selected = bool(best.regressed.used.any())
         itself = max(itself, best.without if best.regression is regression or not selected else -math.inf)
         needed = max(needed, itself - log_odds + math.log(RARE))
@@ -110,7 +109,7 @@ def _about_predicted(
     about_each = []
     for measured in (False, True):
         level_filter = measured_filter(fitter, fit) if measured else LevelFilter(noise)
-        regression = DiscrepancyRegression(fitter, fit, frequencies, STEPS, level_filter)
+        regression = DiscrepancyRegression(fitter, fit, frequencies, level_filter)
         linearised, likely = regression.linearised, level_filter.noise
         evidence = log_evidence(fitter, fit, likely, linearised)
         is_linear = abs(evidence - base) < TOLERANCE
@@ -140,8 +139,8 @@ def localize_beside(
     explains of them. needed: gain in log evidence below which it is irrelevant.
     """
     base = log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
-    if at.selection is None or at.level_filter is None:
-        regression = DiscrepancyRegression(fitter, fit, (), STEPS)
+    if at.selection is None:
+        regression = DiscrepancyRegression(fitter, fit, (), LevelFilter(noise))
         likely = estimate_disturbances(fitter, fit, regression.linearised, start=noise, climb=False).noise
         processes = [*drifting_sensors(regression, likely, [at.location], base, needed)]
         processes += random_flows(regression, likely, [at.location], base, needed)
@@ -151,33 +150,20 @@ def localize_beside(
     return ascent.climbed(ascent.with_finer_positions(first), needed).localized(fitter)
 
 
-@dataclass(frozen=True)
-class _FirstOrder:
-    """expected: gain in log evidence of the best single regressor of a place, with that of the noise. gain: of the
-    regressor alone, without the cost of its selection."""
-
-    expected: float
-    gain: float
-
-
 def _first_order_gains(
-    regression: DiscrepancyRegression,
-    noises: Sequence[StateNoise],
-    fit: Fit,
-    places: Sequence[str],
-    base: float,
-) -> dict[str, _FirstOrder]:
-    """First-order gains of each place, under the best of the noises."""
-    under_each = []
+    regression: DiscrepancyRegression, noises: Sequence[StateNoise], places: Sequence[str], base: float
+) -> dict[str, tuple[float, float]]:
+    """First-order gain in log evidence of the best single regressor of each place under the best of the noises, with
+    that of the noise; and the gain of the regressor alone, without the cost of its selection."""
+    fit, linearised, under_each = regression.fit, regression.linearised, []
     for noise in noises:
-        under = with_disturbances(regression.fitter, fit, noise, regression.linearised)
-        without = log_likelihood(under, fit, regression.linearised) + noise.log_prior() - base
-        gains = SingleRegressorGains(regression, under, fit, torch.Generator().manual_seed(0))
-        under_each.append((without, gains))
+        under = with_disturbances(regression.fitter, fit, noise, linearised)
+        without = log_likelihood(under, fit, linearised) + noise.log_prior() - base
+        under_each.append((without, SingleRegressorGains(regression, under, torch.Generator().manual_seed(0))))
     first_order = {}
     for place in places:  # the regression keeps the regressors of one place only
         each = [(without, gains.at(place)) for without, gains in under_each]
-        first_order[place] = max((_FirstOrder(w + g.net, g.gain) for w, g in each), key=lambda f: f.expected)
+        first_order[place] = max(((w + g.net, g.gain) for w, g in each), key=itemgetter(0))
     return first_order
 
 
@@ -190,7 +176,7 @@ def _evidence_bound(fitter: Fitter, fit: Fit, noise: StateNoise) -> float:
     """
     undisturbed = with_disturbances(fitter, fit, replace(noise, intensity=torch.zeros_like(noise.intensity)))
     count, residual = int(fitter.data.mask.sum()), undisturbed.residual(fit.linearised.readings)
-    steps = step_functions(STEPS, len(fitter.data.readings), len(fitter.data.parts))
+    steps = step_functions(len(fitter.data.readings), len(fitter.data.parts))
     cost = 0.5 * (1.0 + math.log(max(float(residual.square().sum()) - count, 1.0))) + math.log(steps)
     # The parameters are determined no better than with the disturbances.
     return (

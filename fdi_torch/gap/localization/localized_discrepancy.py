@@ -72,8 +72,8 @@ class LocalizedDiscrepancy:
     predicted (S, C): the readings with it; None of a random process. size: norm of the part of it that no parameter of
     the fit explains, in units of the sensor noise. selection: its regressors; None of a random process. fit, noise: the
     fit refitted, and the most likely disturbance noise, with the discrepancy. estimate: of the fit's parameters beside
-    it. quantities: what it changes, of 'area' (of a tank) and 'flow' (or the reading of a sensor).
-    level_filter: predicts the levels about which its plant is linearised; None of a random process.
+    it. level_filter: predicts the levels about which its plant is linearised. quantities: what it changes, of 'area'
+    (of a tank) and 'flow' (or the reading of a sensor).
     """
 
     location: str
@@ -87,8 +87,8 @@ class LocalizedDiscrepancy:
     fit: Fit
     noise: StateNoise
     estimate: Estimate
+    level_filter: LevelFilter
     quantities: frozenset[str] = frozenset({"flow"})
-    level_filter: LevelFilter | None = None
 
     @property
     def pulses(self) -> tuple[tuple[float, float], ...]:

@@ -37,7 +37,18 @@ class LevelFilter:
     def levels(self, fitter: Fitter, fit: Fit) -> Tensor:
         """States (1, K+1, n) of all recordings at the parameters of a fit."""
         linearised = fit.linearised if self.along is None else _linearised(fitter, fit, self.along)
-        return predicted_levels(with_disturbances(fitter, fit, self.noise, linearised), linearised)
+        data, levels = fitter.data, linearised.levels.clone()
+        whitening = with_disturbances(fitter, fit, self.noise, linearised).whitening
+        assert whitening is not None
+        correction = whitening.predicted(data.readings - linearised.readings[0])
+        first = 0
+        for part, rows in zip(data.parts, data.rows, strict=True):
+            nodes = part.experiment.nodes
+            at_nodes = [interpolate(nodes, part.experiment.sample_times, x) for x in correction[rows].unbind(1)]
+            levels[0, first : first + len(nodes)] += torch.stack(at_nodes, dim=1)
+            first += len(nodes)
+        levels[..., : len(data.plant.tanks)].clamp_(min=0.0)
+        return levels
 
 
 def measured_filter(fitter: Fitter, fit: Fit) -> LevelFilter:
@@ -50,24 +61,6 @@ def _linearised(fitter: Fitter, fit: Fit, levels: Tensor) -> Linearised:
     """The plant at the parameters of a fit, linearised about levels."""
     engine = fitter.engine(fit.candidate, list(fit.effect_values))
     return engine.linearise(fit.theta.unsqueeze(0), levels)
-
-
-def predicted_levels(fitter: Fitter, linearised: Linearised) -> Tensor:
-    """States (1, K+1, n) of all recordings, predicted by the filter of a fitter, which is linearised about a
-    trajectory; those of the trajectory without a filter."""
-    data, whitening = fitter.data, fitter.whitening
-    if whitening is None:
-        return linearised.levels.clone()
-    levels = linearised.levels.clone()
-    correction = whitening.predicted(data.readings - linearised.readings[0])
-    first = 0
-    for part, rows in zip(data.parts, data.rows, strict=True):
-        nodes = part.experiment.nodes
-        at_nodes = [interpolate(nodes, part.experiment.sample_times, x) for x in correction[rows].unbind(1)]
-        levels[0, first : first + len(nodes)] += torch.stack(at_nodes, dim=1)
-        first += len(nodes)
-    tanks = len(data.plant.tanks)
-    return torch.cat([levels[..., :tanks].clamp(min=0.0), levels[..., tanks:]], dim=-1)
 
 
 def measured_levels(fitter: Fitter, fit: Fit) -> Tensor:

@@ -126,8 +126,9 @@ def _random_process(
     nothing = torch.zeros_like(fitter.data.readings)
     under = with_disturbances(fitter, fit, noise, linearised)
     estimate = Estimate.beside(under, fit, linearised, nothing.unsqueeze(-1)[..., :0], nothing.new_zeros(0))
+    level_filter = regression.level_filter
     return LocalizedDiscrepancy(
-        place, gain, log_likelihood, parameters, nothing, None, size, None, fit, noise, estimate
+        place, gain, log_likelihood, parameters, nothing, None, size, None, fit, noise, estimate, level_filter
     )
 
 

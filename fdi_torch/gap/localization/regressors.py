@@ -34,6 +34,7 @@ FATIGUE_TIMES = (150.0, 500.0)  # s, of the mean of a flow's recent past that ch
 RAMPS = 12  # ramps in time, at equal distances
 CYCLES = 8  # fewest periods in a recording of a line that its spectrum shows
 SLOW_CYCLES = tuple(1.0 + 0.25 * j for j in range(4 * (CYCLES - 1)))  # periods of slower sinusoids
+STEPS = 120  # most step functions of time, over all recordings
 SAMPLES_A_STEP = 9  # fewest samples per step function of time
 HARMONICS = 3  # of a dominant frequency of the residual
 
@@ -107,9 +108,9 @@ def fatigues(x: Tensor, step: Tensor, ends: tuple[float, float], scale: float) -
     return [x * lagged(x, step, scale * tau) / largest for tau in FATIGUE_TIMES]
 
 
-def step_functions(most: int, samples: int, recordings: int) -> int:
-    """Number of step functions of time in each recording. most, samples: of all recordings together."""
-    return max(min(most, samples // SAMPLES_A_STEP) // recordings, 2)
+def step_functions(samples: int, recordings: int) -> int:
+    """Number of step functions of time in each recording. samples: of all recordings together."""
+    return max(min(STEPS, samples // SAMPLES_A_STEP) // recordings, 2)
 
 
 def time_functions(time: Tensor, duration: float, steps: int) -> list[Tensor]:

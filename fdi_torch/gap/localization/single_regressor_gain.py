@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -22,11 +22,9 @@ from torch import Tensor
 from fdi_torch.estimate.linear_parameters import decomposed, without
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.localization.component_regressors import discrepancy_model_at
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.regressor_families import Pulses
 from fdi_torch.gap.localization.sparse_regression import regressor_costs
-from fdi_torch.plant.description import OUTSIDE
 from fdi_torch.simulate.linearised import Linearised
 
 SIGNS = 64  # random sign vectors; the diagonal of C'C is then accurate to about 20 %
@@ -59,32 +57,28 @@ class SingleRegressorGains:
     under: fitter with the disturbance noise.
     """
 
-    def __init__(self, regression: DiscrepancyRegression, under: Fitter, fit: Fit, generator: torch.Generator) -> None:
-        self.regression, self.under, self.fit = regression, under, fit
-        self._largest = largest_influence(under)
-        self._basis = parameter_basis(under, fit, regression.linearised)
-        residual = whitened_residual(under, fit, regression.linearised)
+    def __init__(self, regression: DiscrepancyRegression, under: Fitter, generator: torch.Generator) -> None:
+        self.regression, self.under, self._largest = regression, under, largest_influence(under)
+        basis = parameter_basis(under, regression.fit, regression.linearised)
+        residual = whitened_residual(under, regression.fit, regression.linearised)
         columns = torch.cat([residual, random_signs(residual, generator)], dim=1)
-        self._adjoints = adjoints_of(regression, under, columns, self._basis)
+        self._adjoints = adjoints_of(regression, under, columns, basis)
 
     def at(self, place: str) -> SingleRegressorGain:
-        channel = self.regression.sensor(place)
-        weights = self._inflow_weights(place) if channel is None else self._reading_weights(place, channel)
+        weights = weights_of(self.regression, place, self._adjoints_at(place))
         grid, families = self._products(place, weights), position_products(self.regression, place, weights)
         groups = [(grid, len(grid)), *zip(families, choices_of(self.regression, place), strict=True)]
         gains = (_largest_gain(group, choices, self._largest) for group, choices in groups if len(group))
         return max(gains, key=lambda g: g.net)
 
-    def _inflow_weights(self, place: str) -> list[Tensor]:
-        return inflow_weights(self.regression, place, self._adjoints)
-
-    def _reading_weights(self, place: str, channel: int) -> list[Tensor]:
-        """Per recording, the weights (1 + SIGNS, K) of a sensor's readings, about the model's level of its tank."""
-        linearised = self.regression.at(place)[1]
-        basis = parameter_basis(self.under, self.fit, linearised)
-        residual = _whitened_adjoint(self.under, whitened_residual(self.under, self.fit, linearised), basis)
-        weights = torch.cat([residual[:, channel], self._adjoints.readings[:, channel, 1:]], dim=1)
-        return [weights[piece.rows].T for piece in self.regression.pieces]
+    def _adjoints_at(self, place: str) -> Adjoints:
+        """The adjoints; of a sensor with the residual about the model's level of its tank."""
+        if self.regression.sensor(place) is None:
+            return self._adjoints
+        fit, linearised = self.regression.fit, self.regression.at(place)[1]
+        basis = parameter_basis(self.under, fit, linearised)
+        residual = _whitened_adjoint(self.under, whitened_residual(self.under, fit, linearised), basis)
+        return replace(self._adjoints, readings=torch.cat([residual, self._adjoints.readings[..., 1:]], dim=-1))
 
     def _products(self, place: str, weights: Sequence[Tensor]) -> Tensor:
         """Products (M, 1 + SIGNS) of the regressors of the grids with weights."""
@@ -195,13 +189,9 @@ def _whitened_adjoint(under: Fitter, columns: Tensor, basis: Tensor) -> Tensor:
     return whitening.transposed(remaining[: shape.numel()].reshape(*shape, -1))
 
 
-def inflow_weights(regression: DiscrepancyRegression, place: str, adjoints: Adjoints) -> list[Tensor]:
-    """Per recording, the weights (., K) of a flow at a place."""
-    component, weights = discrepancy_model_at(place, regression.fitter.data.plant), []
-    for inflows in adjoints.inflows:
-        net = torch.zeros_like(inflows[0])
-        for end, sign in ((component.source, -1.0), (component.target, 1.0)):
-            if end != OUTSIDE:
-                net += sign * inflows[regression.tank(end)]
-        weights.append(net)
-    return weights
+def weights_of(regression: DiscrepancyRegression, place: str, adjoints: Adjoints) -> list[Tensor]:
+    """Per recording, the weights (., K) of a flow at a place, or of a sensor's readings."""
+    if (channel := regression.sensor(place)) is not None:
+        return [adjoints.readings[piece.rows, channel].T for piece in regression.pieces]
+    ends = regression.ends(place)
+    return [torch.stack([sign * inflows[tank] for tank, sign in ends]).sum(dim=0) for inflows in adjoints.inflows]

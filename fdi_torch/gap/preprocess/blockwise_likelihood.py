@@ -20,7 +20,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from fdi_torch.effects import effect
+from fdi_torch.effects import effects_of
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
@@ -29,7 +29,6 @@ from fdi_torch.gap.trajectory_problem import BEHIND, CAP, SHARE
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Placement
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.repeated_readings import scatter
 
@@ -118,7 +117,7 @@ def slowest(plant: PlantDescription) -> float:
 def blocked_recording(plant: PlantDescription, recording: Recording, noise: Tensor) -> BlockedRecording:
     """Thin a recording to at most about SAMPLES samples, and divide it into blocks. noise (C,): as of `noise_of`."""
     thinned = recording.every(max(1, len(recording) // SAMPLES))
-    nominal_effects = [Placement(effect(p.effect), p.location, p.parameters) for p in plant.effects]
+    nominal_effects = effects_of(plant)
     data = data_set_of(plant, nominal_effects, thinned, float(torch.median(torch.diff(thinned.time))))
     blocks = max(float(thinned.time[-1] - thinned.time[0]) / (2.0 * slowest(plant)), 1.0)
     spans = torch.tensor([reading_span(plant, s) for s in plant.sensors], dtype=torch.float64)
@@ -166,7 +165,7 @@ def blockwise_fit(
 def _fitter(data: DataSet, variance: Tensor, means: Tensor) -> Fitter:
     """A fitter that gives each channel the weight of its v_c."""
     std = torch.sqrt(variance * data.mask.sum(dim=0).clamp(min=1) / means.clamp(min=1.0))
-    return Fitter(data, Noise(std, torch.zeros_like(std)))
+    return Fitter(data, Noise.white(std))
 
 
 def prior_chi_square(fit: Fit, theta: Tensor) -> float:

@@ -63,12 +63,12 @@ class SensorOutliers:
         return many and bool(far) and median(far) > CLEAR * FAR
 
 
-def outliers_of(recording: Recording, lay_out: Callable[[Recording], DataSet]) -> tuple[SensorOutliers, ...]:
-    """Outliers of each sensor that has some. lay_out: the data set of a recording, which may average readings."""
+def outliers_of(recording: Recording, lay_out: Callable[[Sequence[Recording]], DataSet]) -> tuple[SensorOutliers, ...]:
+    """Outliers of each sensor that has some. lay_out: the data set of recordings, which may average readings."""
     outliers: dict[str, list[Outlier]] = {}
     masked = recording
     for _ in range(PASSES):
-        data, mask = lay_out(masked), masked.mask
+        data, mask = lay_out([masked]), masked.mask
         model = at_recorded_times(data, _fitted_readings(data))
         for i, sensor in enumerate(data.plant.sensors):
             c = recording.output_names.index(sensor.column)
@@ -93,11 +93,11 @@ def sensor_with_outliers(sensors: Sequence[SensorOutliers]) -> str | None:
     return max(clear, key=lambda s: s.samples).sensor if clear else None
 
 
-def without(mask: Tensor, strays: Sequence[Outlier], channel: int) -> Tensor:
+def without(mask: Tensor, outliers: Sequence[Outlier], channel: int) -> Tensor:
     """The mask (S, C) without these readings of a channel."""
     reduced = mask.clone()
-    for stray in strays:
-        reduced[stray.rows, channel] = False
+    for outlier in outliers:
+        reduced[outlier.rows, channel] = False
     return reduced
 
 
@@ -105,7 +105,7 @@ def _fitted_readings(data: DataSet) -> Tensor:
     """Readings (S, C) of the plant with its constants fitted."""
     readings = torch.where(data.mask, data.readings, torch.nan)
     size = (readings - readings.nanmedian(dim=0).values).abs().nanmedian(dim=0).values.clamp(min=1e-9)
-    return Fitter(data, Noise(1e-2 * size, torch.zeros_like(size))).fit(Candidate()).linearised.readings[0]
+    return Fitter(data, Noise.white(1e-2 * size)).fit(Candidate()).linearised.readings[0]
 
 
 def _channel_outliers(recording: Recording, model: Tensor, channel: int) -> list[Outlier]:

@@ -99,7 +99,7 @@ def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str], target: float
     for _ in range(MOST_EFFECTS):
         fit, fitter = parent.fit, parent.fitter
         reach = with_simulated_levels(ranges, plant, fit.linearised.levels[0])
-        further = [p for p in library if p.prefix not in known and (p.effect.name, p.location) not in fit.key]
+        further = [p for p in library if p.prefix not in known and p.cause not in fit.key]
         screening = screen(fitter, fit, options_of(further, fitter, reach))
         best: dict[tuple[str, str], Option] = {}
         for k in torch.argsort(screening.gain, descending=True).tolist():

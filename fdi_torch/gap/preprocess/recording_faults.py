@@ -3,7 +3,7 @@
     wrong unit        y = 10^k y'               k = -3 ... 3, of one sensor or one input
     swapped channels  y_a = y'_b, y_b = y'_a    two sensors of one calibration, or two inputs of one unit
     clock offset      `clock_offset.py`
-    silent sensor     `silent_sensors.py`
+    silent sensor     y = mean + scatter, whatever the level
 
 Another, commands that move faster than their samples, shows in the readings alone (`recordings/input_sampling.py`).
 
@@ -25,8 +25,8 @@ from torch import Tensor
 
 from fdi_torch.gap.preprocess.clock_offset import clock_offsets
 from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Correction
-from fdi_torch.gap.preprocess.recording_fault_texts import swapped, wrong_unit
-from fdi_torch.gap.preprocess.silent_sensors import silent_sensors
+from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, stuck, swapped, unrelated, wrong_unit
+from fdi_torch.recording import Recording
 
 DECADES = (-3, -2, -1, 1, 2, 3)
 """Powers of ten by which a unit can be wrong; millimetres instead of metres at most."""
@@ -38,7 +38,7 @@ def suspected(fits: CorrectedFits, constant: Collection[str], thorough: bool) ->
     constant: columns of sensors that never move. thorough: the likeliest is worth a fit even without a gain, because
     the plant may have an effect as well.
     """
-    alternatives = chain(_units(fits), _swaps(fits), clock_offsets(fits), silent_sensors(fits, constant))
+    alternatives = chain(_units(fits), _swaps(fits), clock_offsets(fits), _silent_sensors(fits, constant))
     likeliest = [max(((fits.first_order_gain(c), c) for c in each), key=itemgetter(0)) for each in alternatives if each]
     ranked = sorted(likeliest, key=itemgetter(0), reverse=True)
     return [item for item in ranked if item[0] > 0.0] or (ranked[:1] if thorough else [])
@@ -86,3 +86,52 @@ def _alike(channels: Mapping[str, Hashable]) -> list[tuple[str, str]]:
 def _exchanged(names: Sequence[str], pair: tuple[str, str]) -> tuple[str, ...]:
     a, b = pair
     return tuple({a: b, b: a}.get(name, name) for name in names)
+
+
+def _silent_sensors(fits: CorrectedFits, constant: Collection[str]) -> Iterator[list[Correction]]:
+    """Sensors whose noise exceeds the movement of their level, and sets of sensors that never move.
+
+    Those that never move are often stuck together, because one logger or one supply fails. Which of them are stuck is
+    decided among nested sets: the first, the first two, ... of them. Their order follows from one fit without any of
+    them, which no stuck sensor can bias: the one that lies furthest from that fit comes first. n such sensors need
+    n + 1 fits.
+
+    constant: columns of those that never move.
+    """
+    data, model = fits.as_is.blocked.data, fits.as_is.readings
+    moves = model.std(dim=0)
+    sensors = {i: s for i, s in enumerate(fits.plant.sensors) if bool(data.mask[:, i].any())}
+    still = [i for i, s in sensors.items() if s.column in constant]
+    for i, sensor in sensors.items():
+        if i not in still and float(fits.noise[i]) > float(moves[i]):
+            yield [_silence(fits, unrelated(sensor), [i])]
+    if not still:
+        return
+    model = fits.fit(_without_sensors(fits, still)).readings
+
+    def gain(i: int) -> float:
+        return _about_mean(fits, i) - fits.channel_log_likelihood(i, data.readings[:, i] - model[:, i])
+
+    ordered = sorted(still, key=gain, reverse=True)
+    for count in range(1, len(ordered) + 1):
+        some = ordered[:count]
+        yield [_silence(fits, stuck([sensors[i].column for i in some]), some)]
+
+
+def _silence(fits: CorrectedFits, fault: RecordingFault, silent: list[int]) -> Correction:
+    """The hypothesis that these sensors are silent, each for a reason of its own."""
+    explained = (len(silent) - 1) * fits.prior + sum(_about_mean(fits, i) for i in silent)
+    return Correction(fault, _without_sensors(fits, silent), -explained)
+
+
+def _without_sensors(fits: CorrectedFits, sensors: list[int]) -> Recording:
+    mask = fits.thinned.mask.clone()
+    mask[:, [fits.column(i) for i in sensors]] = False
+    return replace(fits.thinned, mask=mask)
+
+
+def _about_mean(fits: CorrectedFits, sensor: int) -> float:
+    """Log-likelihood of a sensor's readings about their own mean."""
+    data = fits.as_is.blocked.data
+    readings = data.readings[:, sensor]
+    return fits.channel_log_likelihood(sensor, readings - readings[data.mask[:, sensor]].mean())

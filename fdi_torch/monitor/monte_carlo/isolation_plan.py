@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from statistics import NormalDist
 from typing import Any
 
 import torch
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from fdi_torch.estimate.proportion import wilson
 from fdi_torch.monitor.detection import Chart, make_detector
+from fdi_torch.monitor.diagnosability import REACH
 from fdi_torch.monitor.hypothesis import SHAPE, Fault
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
@@ -147,8 +147,6 @@ class IsolationPlan:
         return ResultTable(title, header, tuple(rows) if results else (), summary)
 
 
-# Error rates that define an isolable size: false alarms and missed faults.
-FALSE_ALARM, MISS = 0.001, 0.05
 TRIAL_SIZE = 0.01  # fault size for signatures, as a share of the parameter's range
 RIVAL_ONSETS = 13  # onsets about the fault's own at which another fault may have the same signature
 
@@ -176,9 +174,8 @@ def smallest_isolable(
     """Smallest deviation of each fault, in its parameter's unit, that is distinguished from every other single fault.
 
     It follows from the angle between its signature and the nearest other one, over all sizes, onsets and manners of
-    growth: |signature| sin(angle) = reach. Infinite if another fault has the same signature.
+    growth: |signature| sin(angle) = REACH. Infinite if another fault has the same signature.
     """
-    reach = NormalDist().inv_cdf(1.0 - 0.5 * FALSE_ALARM) + NormalDist().inv_cdf(1.0 - MISS)
     base = observer.white_innovations(window, believed, no_change(believed)).flatten(1)
     end = float(window.samples.time[-1])
     offsets = torch.linspace(-0.2, 0.4, RIVAL_ONSETS, dtype=believed.dtype) * (end - onset)
@@ -207,7 +204,7 @@ def smallest_isolable(
     nearest = torch.where(same_fault, 0.0, cosine.abs()).amax(1).clamp(max=1.0)
     distance = length * torch.sqrt(1.0 - nearest**2)
     return [
-        reach * abs(t) / float(d) if float(d) > 1e-9 else float("inf") for t, d in zip(trials, distance, strict=True)
+        REACH * abs(t) / float(d) if float(d) > 1e-9 else float("inf") for t, d in zip(trials, distance, strict=True)
     ]
 
 
