@@ -27,7 +27,7 @@ class Recording(Shown):
     since 1970, if known. zone: of the file's clock, s ahead of UTC. notes: corrections by the reader, as sentences.
     ran: inputs that were, or may have been, on before the first sample, according to the recording from which this one
     was cut. trusted: whether checks for wrong units, swapped channels and clock errors are skipped. written: the unit
-    of each channel in its file.
+    of each channel, and of the time `t`, in its file.
     """
 
     time: torch.Tensor

@@ -231,11 +231,15 @@ def test_planned_inputs_step_and_ramp_where_they_should() -> None:
         ({"duration": "1.5 s"}, "simulate.duration: expected a multiple of sample_time \\(1 s\\), got 1.5 s"),
         (
             {"inputs": {"Q1": {"steps": [["1 s", "5 cm^3/s"]]}, "Q2": "5 cm^3/s"}},
-            "times that start at 0 s and increase",
+            "times that start at 0 s and increase, got 1 s first$",
+        ),
+        (
+            {"inputs": {"Q1": {"steps": [[f"{t} s", "5 cm^3/s"] for t in (0, 2, 2, 3)]}, "Q2": "5 cm^3/s"}},
+            "times that start at 0 s and increase, got 2 s after 2 s$",
         ),
         (
             {"inputs": {"Q1": {"steps": [["0 s", "5 cm^3/s"], ["1.5 s", "5 cm^3/s"]]}, "Q2": "5 cm^3/s"}},
-            "expected times at samples \\(every 1 s\\), got others",
+            "expected times at samples \\(every 1 s\\), got 1.5 s$",
         ),
     ],
 )

@@ -421,6 +421,15 @@ def test_a_recording_comes_back_from_its_csv_file(tmp_path: Path) -> None:
     assert torch.equal(again.mask, missing.mask)
 
 
+def test_a_recording_is_read_for_a_plant_of_any_name(tmp_path: Path) -> None:
+    """The functions of the commands take the name of a plant file, so those that read recordings do too."""
+    file = str(fdi_torch.write_csv(simulated(), str(tmp_path / "run.csv")))
+    (tmp_path / "rig.yaml").write_text(fdi_torch.dump_plant(RIG))
+    for plant in (tmp_path / "rig.yaml", str(tmp_path / "rig.yaml")):
+        found, expected = (fdi_torch.read_recording(file, each) for each in (plant, RIG))
+        assert torch.equal(found.outputs, expected.outputs)
+
+
 def test_a_data_frame_follows_the_rules_of_files() -> None:
     pandas = pytest.importorskip("pandas")
     stamps = pandas.date_range("2026-03-29 08:30", periods=4, freq="2s", tz="UTC")

@@ -193,7 +193,7 @@ def test_the_fault_free_part_of_a_new_monitor_fits_the_recording(
         first, last = load_monitor(f"m{interval}_{start}.yaml").config.fault_free
         capsys.readouterr()
         fdi("monitor", "--config", f"m{interval}_{start}.yaml")
-        (learnt, needed), *_ = re.findall(r"learnt from (\S+) s of (\S+) s needed", capsys.readouterr().out)
+        (learnt, needed), *_ = re.findall(r"learnt from (\S+) s \((\S+) s needed\)", capsys.readouterr().out)
         assert first == start and float(learnt) == pytest.approx(last - first, abs=10 * interval)
         assert (last - first) / min(float(needed), 0.5 * lasts) == pytest.approx(1.0, abs=0.15)
 

@@ -1,4 +1,4 @@
-"""Units that are wrong for all areas, flows or levels: every command names them before it computes."""
+"""Units that are wrong for all areas, flows, levels or times: every command names them before it computes."""
 
 from __future__ import annotations
 
@@ -96,6 +96,7 @@ def in_file(old: str, new: str) -> Callable[[str], str]:
             in_file("l/min", "cm^3/s"),
             "the flows of Q are 16.7 times too small (write l/min in place of cm^3/s)",
         ),
+        ("run.csv", in_file("t_s", "t_min"), "the times are 60 times too large (write s in place of min)"),
         ("run.csv", in_file("mm", "cm"), "the levels hA, hB are 10 times too large (write mm in place of cm)"),
     ],
 )

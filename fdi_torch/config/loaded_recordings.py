@@ -20,6 +20,7 @@ from fdi_torch.config.channels import (
     unrecorded_valves,
     without_column,
 )
+from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.recording_config import (
     ColumnConfig,
@@ -143,7 +144,7 @@ def separate_recordings(recordings: Sequence[Any]) -> tuple[list[Any], dict[str,
 
 def read_recording(
     config: RecordingConfig | Mapping[str, Any] | str | Path,
-    plant: PlantDescription,
+    plant: PlantDescription | str | Path,
     base: Path | None = None,
     given: Mapping[str, Recording] | None = None,
 ) -> Recording:
@@ -151,12 +152,14 @@ def read_recording(
 
     From now on its channels are displayed in the units that its file has for them.
     config: the name of the file, or the recording's entry in a run file: {"file": "run.xlsx", "columns": {"h1":
-    {"column": "LT-101", "unit": "mm"}}}. base: folder of relative paths. given:
+    {"column": "LT-101", "unit": "mm"}}}. plant: or the name of its file. base: folder of relative paths. given:
     recordings in memory, by the name that `file` gives them; the result is on the CPU. Raises ConfigError naming file,
     row and column.
     """
     if not isinstance(config, RecordingConfig):
         config = config_of(config)
+    if isinstance(plant, str | Path):
+        plant = chosen_plant(plant)
     channels, columns = plant.channels(), plant.outputs()
     in_memory = (given or {}).get(config.file)
     folder = base or Path.cwd()
@@ -180,7 +183,7 @@ def read_recording(
         raise ConfigError([str(error)]) from error
 
 
-def read_frame(frame: Any, plant: PlantDescription, **keys: Any) -> Recording:
+def read_frame(frame: Any, plant: PlantDescription | str | Path, **keys: Any) -> Recording:
     """The plant's inputs and outputs in a pandas.DataFrame, by the rules of CSV files.
 
     Columns have headers as in a CSV file (`h1_cm`, `h1 [cm]`), or the names of the plant's channels with their units in

@@ -5,6 +5,7 @@ sensors or for each of them.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import torch
@@ -148,12 +149,16 @@ def _series(name: str, config: InputConfig, unit: str, time: Tensor, run: Simula
         return torch.full_like(time, quantity_at(place, config.value, unit))
     times = torch.tensor([t for t, _ in config.steps], dtype=torch.float64)
     values = torch.tensor([quantity_at(f"{place}.steps", v, unit) for _, v in config.steps], dtype=torch.float64)
-    if float(times[0]) != 0.0 or not bool((torch.diff(times) > 0).all()):
-        raise ConfigError([f"{place}.steps: expected times that start at 0 s and increase, got {times.tolist()}"])
+    wrong = [f"{b:g} s after {a:g} s" for a, b in pairwise(times.tolist()) if not b > a]
+    if wrong or float(times[0]) != 0.0:
+        got = wrong[0] if wrong else f"{float(times[0]):g} s first"
+        raise ConfigError([f"{place}.steps: expected times that start at 0 s and increase, got {got}"])
     if run.hold == "linear":
         return interpolate(time, times, values)
-    if bool(((times / run.sample_time - (times / run.sample_time).round()).abs() > 1e-9).any()):
-        raise ConfigError([f"{place}.steps: expected times at samples (every {run.sample_time:g} s), got others"])
+    between = times[(times / run.sample_time - (times / run.sample_time).round()).abs() > 1e-9].tolist()
+    if between:
+        every = f"(every {run.sample_time:g} s)"
+        raise ConfigError([f"{place}.steps: expected times at samples {every}, got {between[0]:g} s"])
     return values[torch.searchsorted(times, time + 1e-9 * run.sample_time, right=True) - 1]
 
 

@@ -1,7 +1,7 @@
 """A Foxglove and Lichtblick layout that shows what a log has: a plot per sensor, inputs, search, events.
 
-Every message path names a field of the schema of its topic. Fields whose names a path would have to quote, such as
-`T1.leak.size`, are left out.
+Every message path names a field of the schema of its topic. It quotes names with other characters than letters of
+ASCII, digits and underscores, such as `"T1.leak.size"`, as the grammar of these viewers requires.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def foxglove_layout(run: Run) -> dict[str, Any]:
 
 
 def numeric_fields(run: Run) -> dict[str, dict[str, str]]:
-    """For each topic, its numeric fields that a message path can name without quoting, with their units."""
+    """For each topic, its numeric fields with their units."""
     fields: dict[str, dict[str, str]] = {}
     seen = set()
     for message in run.messages():
@@ -79,7 +79,7 @@ def numeric_fields(run: Run) -> dict[str, dict[str, str]]:
         units = channel.units
         known = fields.setdefault(channel.topic, {})
         for name, part in _properties(channel.schema_data).items():
-            if part.get("type") in ("number", "integer") and _PLAIN.fullmatch(name):
+            if part.get("type") in ("number", "integer"):
                 known[name] = units.get(name, "")
     return fields
 
@@ -93,6 +93,13 @@ def _properties(schema: bytes) -> dict[str, Any]:
         return {}
 
 
+def _path(topic: str, name: str) -> str:
+    """The message path of a field."""
+    if not _PLAIN.fullmatch(name):
+        name = '"' + re.sub(r'(["\\])', r"\\\1", name) + '"'
+    return f"{topic}.{name}"
+
+
 def _sensor_plots(fields: Fields) -> list[Panel]:
     """One plot per sensor of each recording: measured, and estimated where the log has it."""
     plots = []
@@ -101,8 +108,8 @@ def _sensor_plots(fields: Fields) -> list[Panel]:
             continue
         model = topic.replace("/plant/", "/estimate/", 1)
         for name, unit in _signals(fields[topic]):
-            lines = [(f"{topic}.{name}", "measured")]
-            lines += [(f"{model}.{name}", "estimated")] if name in fields.get(model, {}) else []
+            lines = [(_path(topic, name), "measured")]
+            lines += [(_path(model, name), "estimated")] if name in fields.get(model, {}) else []
             plots.append(_plot(_title(name, topic, unit), lines))
     return plots
 
@@ -115,7 +122,7 @@ def _residual_plots(fields: Fields) -> list[Panel]:
             continue
         present = fields[topic]
         for name, unit in _signals(present):
-            lines = [(f"{topic}.{name}", "residual"), *_companions(present, topic, name, _BAND)]
+            lines = [(_path(topic, name), "residual"), *_companions(present, topic, name, _BAND)]
             plots.append(_plot(_title(f"{name}: residual", topic, unit), lines))
         for name in _tests(present):
             plots.append(_plot(_title(f"{name}: test statistic", topic, ""), _companions(present, topic, name, _TEST)))
@@ -129,7 +136,7 @@ def _tests(present: Mapping[str, str]) -> list[str]:
 
 def _companions(present: Mapping[str, str], topic: str, name: str, ends: Sequence[str]) -> list[tuple[str, str]]:
     """Path and label of the fields that are called like another one with these ends."""
-    return [(f"{topic}.{name}{end}", end[1:]) for end in ends if name + end in present]
+    return [(_path(topic, name + end), end[1:]) for end in ends if name + end in present]
 
 
 def _input_plots(fields: Fields) -> list[Panel]:
@@ -139,14 +146,14 @@ def _input_plots(fields: Fields) -> list[Panel]:
         if topic.startswith("/plant/") and topic.endswith("/input"):
             units = dict.fromkeys(unit for _, unit in _signals(fields[topic]))
             for unit in units:
-                lines = [(f"{topic}.{name}", name) for name, its in _signals(fields[topic]) if its == unit]
+                lines = [(_path(topic, name), name) for name, its in _signals(fields[topic]) if its == unit]
                 plots.append(_plot(_title("Inputs", topic, unit), lines))
     return plots
 
 
 def _cost_plots(fields: Fields) -> list[Panel]:
     return [
-        _plot(f"{title}: cost over {step}", [(f"{topic}.{name}", name) for name in costs], f"{topic}.{step}")
+        _plot(f"{title}: cost over {step}", [(_path(topic, name), name) for name in costs], f"{topic}.{step}")
         for topic, (title, step, costs) in _COST.items()
         if {step, *costs} <= fields.get(topic, {}).keys()
     ]

@@ -96,7 +96,7 @@ def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -
     needed = seconds * design.learning_factor(RATE_FACTOR)
     fewest, most = (design.count_quantile(every, p) for p in (0.025, 0.975))
     text = (
-        f"the noise is learnt from {quantity_text(seconds, 's')} of {quantity_text(needed, 's')} needed; expect one "
+        f"the noise is learnt from {quantity_text(seconds, 's')} ({quantity_text(needed, 's')} needed); expect one "
         f"false alarm in {quantity_text(every, 's', 5)} ({fewest} to {most} with a probability of 95 %)"
     )
     if noise.whitening.flows is None:

@@ -136,7 +136,7 @@ def _read_rows(file: FileSource, names: Sequence[str]) -> Read:
     sheet = Sheet(str(path), order.seconds, tuple(b.name for b in in_file), order.values)
     notes = [f"{path.name}: {note}" for note in (*unit_notes(bounds), *notes, *order.notes)]
     zone = _zone(clock_source, columns.read_stamp, order.seconds)
-    return Read([sheet], *_units_and_constants(bounds), clock.stamps, zone, notes)
+    return Read([sheet], *_units_and_constants(clock, bounds), clock.stamps, zone, notes)
 
 
 def _read_tagged(file: FileSource, names: Sequence[str]) -> Read:
@@ -154,7 +154,7 @@ def _read_tagged(file: FileSource, names: Sequence[str]) -> Read:
         notes += [f"{path.name}: {bound.header}: {note}" for note in order.notes]
     bounds = [bound for bound, *_ in tagged] + [bind(path, (), name, file.columns[name]) for name in constant]
     zone = _zone(clock_source, StampReader(), sheets[0].seconds) if sheets else 0.0
-    return Read(sheets, *_units_and_constants(bounds), clock.stamps, zone, notes)
+    return Read(sheets, *_units_and_constants(clock, bounds), clock.stamps, zone, notes)
 
 
 def _zone(source: ClockSource, read: StampReader, seconds: np.ndarray) -> float:
@@ -162,9 +162,11 @@ def _zone(source: ClockSource, read: StampReader, seconds: np.ndarray) -> float:
     return offset_of_zone(float(seconds[0]), source.zone) if source.zone else read.offset
 
 
-def _units_and_constants(bounds: Sequence[Bound]) -> tuple[dict[str, str], dict[str, str], dict[str, float]]:
-    """SI units of the channels, their units in the file, and the values of constant ones."""
-    written = {b.name: spelled(b.unit) for b in bounds if b.unit}
+def _units_and_constants(
+    clock: Bound, bounds: Sequence[Bound]
+) -> tuple[dict[str, str], dict[str, str], dict[str, float]]:
+    """SI units of the channels, their units and that of time in the file, and the values of constant channels."""
+    written = {b.name: spelled(b.unit) for b in (clock, *bounds) if b.unit}
     return {b.name: b.si_unit for b in bounds}, written, {b.name: b.constant for b in bounds if b.position is None}
 
 

@@ -1,4 +1,4 @@
-"""Units that are wrong for a whole kind of number: all areas, all flows, all levels, or the area of a tank.
+"""Units that are wrong for a whole kind of number: all areas, flows, levels or times, or the area of a tank.
 
 A correction divides these numbers by the ratio of the unit in which they were written to another usual unit. By Bayes'
 theorem, the likelihoods of the unchanged plant file and of each correction, which follow from the volume balance of the
@@ -28,6 +28,7 @@ UNITS = {
     "m": ("mm", "cm", "dm", "m"),
     "m^2": ("mm^2", "cm^2", "dm^2", "m^2"),
     "m^3/s": ("ml/min", "cm^3/s", "l/h", "l/min", "l/s", "m^3/h", "m^3/s"),
+    "s": ("ms", "s", "min", "h"),
 }
 """The usual units of each kind of number."""
 PRIOR = 0.01
@@ -108,6 +109,9 @@ def _corrections(plant: PlantDescription, recording: Recording, as_is: Balance) 
         if _fits_into_tanks(corrected, recording):
             lower = balance_along(corrected, recording, unit=1.0 / ratio)
             yield Correction(f"the levels {', '.join(columns)} are", written, right, ratio, lower)
+    written = recording.written.get("t", "")  # none: the clock has dates, or is that of a simulation
+    for right, ratio in _other_units("s", written) if written else ():
+        yield Correction("the times are", written, right, ratio, as_is.scaled(all_tanks / ratio, all_tanks / ratio))
 
 
 def _fits_into_tanks(plant: PlantDescription, recording: Recording) -> bool:

@@ -82,7 +82,7 @@ class Chart:
     log: use a logarithmic axis if the values span more than a decade; with zeros among them it is linear below the
     median of the positive values (asinh). level: a horizontal reference line; at 0, the lines are residuals.
     events: times of vertical lines. clock: charts of one clock show the same crosshair and zoom together. from_zero:
-    the vertical axis begins at 0. height: of the picture, inches.
+    a linear vertical axis begins at 0. height: of the picture, inches.
     zero: date of time 0, s since 1970; None if the axis is not time or the recording has no dates. after: words behind
     the label of the axis, as in ' after 2026-11-01 08:00:00'.
 
@@ -155,11 +155,11 @@ def draw(chart: Chart) -> Figure:
         )
     for moment in list(chart.events)[:MOST_EVENTS]:
         axes.axvline(moment, color=MARK, lw=0.9, alpha=0.8)
-    if chart.from_zero:
-        axes.set_ylim(bottom=0.0)
     kind, width = chart.scale
     if kind != "linear":
         logarithmic(axes, width)
+    elif chart.from_zero:
+        axes.set_ylim(bottom=0.0)
     if len(chart.lines) > 1:
         label_lines(axes)
         if len(chart.title) + sum(len(line.name) + 4 for line in chart.lines) > ONE_ROW:

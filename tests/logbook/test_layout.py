@@ -58,8 +58,10 @@ def expect_sound(layout: dict[str, Any], log: Path) -> list[str]:
     """The paths of a layout, all of which exist in the log; every panel is placed once."""
     known, shown = schemas(log), list(paths(layout["configById"]))
     for path in shown:
-        assert re.fullmatch(r"(/[\w-]+)+(\.\w+)?", path), path
+        # The grammar of paths in Lichtblick (packages/message-path/src/grammar.ne): a name or a quoted string.
+        assert re.fullmatch(r'(/[A-Za-z0-9_-]+)+(\.([A-Za-z0-9_-]+|"([^"\\]|\\["\\])*"))?', path), path
         topic, _, name = path.partition(".")
+        name = re.sub(r'\\(["\\])', r"\1", name[1:-1]) if name.startswith('"') else name
         assert topic in known and (not name or known[topic][name] in ("number", "integer")), path
     assert {"configById", "layout", "globalVariables", "userNodes", "playbackConfig"} == set(layout)
     for panel, config in layout["configById"].items():
@@ -101,15 +103,15 @@ def test_the_statistic_of_a_monitor_is_beside_its_threshold() -> None:
     assert sum("cusum" in title for title in plots) == 1
 
 
-def test_recordings_in_groups_have_plots_of_their_own_and_odd_names_none(tmp_path: Path) -> None:
-    time, two = np.arange(3.0), np.zeros((3, 2))
+def test_recordings_in_groups_have_plots_of_their_own_and_odd_names_are_quoted(tmp_path: Path) -> None:
+    time, two, outputs = np.arange(3.0), np.zeros((3, 2)), ("h1", 'Füllstand "T.h" \\')
     with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
         for group in ("1", "2"):
-            log.recording(time, two, two, ("Q1", "Q 2"), ("h1", "T.h"), ("m^3/s",) * 2, ("m",) * 2, group=group)
-            log.predictions(time, two, two, ("h1", "T.h"), ("m",) * 2, group=group)
+            log.recording(time, two, two, ("Q1", "Q 2"), outputs, ("m^3/s",) * 2, ("m",) * 2, group=group)
+            log.predictions(time, two, two, outputs, ("m",) * 2, group=group)
     shown = expect_sound(foxglove_layout(read_run(tmp_path / "a.mcap")), tmp_path / "a.mcap")
     assert "/plant/2/output.h1" in shown and "/estimate/2/output.h1" in shown and "/plant/1/input.Q1" in shown
-    assert not any("T.h" in path or "Q 2" in path for path in shown)
+    assert '/plant/1/input."Q 2"' in shown and '/estimate/2/residual."Füllstand \\"T.h\\" \\\\"' in shown
 
 
 def test_a_log_without_content_has_no_layout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

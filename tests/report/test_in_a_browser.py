@@ -99,6 +99,12 @@ FAULTS = """() => {
       if (across > 3 && down > 3) wrong.push(`on top of each other: ${one.text} | ${other.text}`);
     }
   });
+  for (const cell of document.querySelectorAll("td.l")) {
+    const line = parseFloat(getComputedStyle(cell).lineHeight), text = document.createRange();
+    text.selectNodeContents(cell);
+    const broken = /^[a-z]{1,12}$/i.test(cell.textContent) && text.getBoundingClientRect().height > 1.5 * line;
+    if (broken) wrong.push(`a word of two lines: ${cell.textContent}`);
+  }
   for (const figure of document.querySelectorAll("figure")) {
     const shown = [...figure.querySelectorAll("svg, canvas")].filter(picture => picture.checkVisibility());
     if (shown.length !== 1) wrong.push(`${shown.length} pictures in one figure`);

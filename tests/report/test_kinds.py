@@ -26,6 +26,7 @@ from fdi_torch.blind.case_kinds import KINDS
 from fdi_torch.blind.kind_meanings import KIND_MEANINGS
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.logbook import RunLog, read_run
+from fdi_torch.report.chart import draw
 from fdi_torch.report.diagnosed_effects import diagnosed_effects
 from fdi_torch.report.material import gather
 from fdi_torch.report.page import RunReport, page, report_of, unbroken
@@ -262,6 +263,22 @@ def test_a_variable_that_stands_still_has_no_panel() -> None:
     after = profile_section(material)
     assert before is not None and after is not None
     assert [len(section.pictures) for section in (before, after)] == [8, 7]
+
+
+@pytest.mark.parametrize(("ratio", "kind"), [(3.0, "linear"), (100.0, "log")])
+def test_a_residual_of_a_hundred_times_the_noise_leaves_the_noise_visible(ratio: float, kind: str) -> None:
+    material = material_of(DATA / "log_format_1_gap.mcap", load_plant("three_tank"))
+    recording = material.recordings[0]
+    noise = np.where(np.arange(len(recording.time)) % 2, 1e-3, -1e-3)[:, None]
+    for model, wrong in (("nominal", ratio), ("recalibrated", ratio), ("augmented", 1.0)):
+        material.arrays[model] = recording.outputs - wrong * noise
+    material.answer["noise"] = {name: {"std": 1e-3} for name in recording.output_names}
+    section = profile_section(material)
+    assert section is not None
+    charts = [picture.chart for picture in section.pictures if picture.chart is not None]
+    assert charts and {chart.scale[0] for chart in charts} == {kind}
+    axes = draw(charts[0]).axes[0]
+    assert axes.get_yscale() == kind and (axes.get_ylim()[0] == 0.0) == (kind == "linear")
 
 
 def test_the_result_stands_beside_the_rig_and_the_index_lists_every_section(gap_page: str) -> None:

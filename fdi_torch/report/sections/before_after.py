@@ -67,7 +67,7 @@ def profile_section(material: Material) -> Section | None:
     varied = (v for v in _variables(material, recording) if np.nanmin(v[2]) < np.nanmax(v[2]))
     for k, (title, label, variable) in enumerate(varied):
         lines = [Line(MODELS[m][0], *_binned(variable, size), MODELS[m][1]) for m, size in excess.items()]
-        chart = Chart(title, label, "residual, × noise", lines, level=1.0, from_zero=True)
+        chart = Chart(title, label, "residual, × noise", lines, log=True, level=1.0, from_zero=True)
         pictures.append(signals(f"gap_by_{k + 1}", chart))
     words = "Root mean square residual of all sensors, each divided by its noise; 1 means noise only."
     return Section("What the gap depends on", [words, pictures])
