@@ -62,7 +62,7 @@ def with_spikes(recording: Recording, channel: int, every: int) -> Recording:
 
 def test_outliers_are_masked_in_their_channel_only() -> None:
     recording = with_spikes(recorded({"T1.leak.size": 0.1}, 51), 1, 90)
-    (found,) = outliers_of(recording, lambda r: checked_data_set(nominal_plant(), (), [r], None))
+    (found,) = outliers_of(recording, lambda r: checked_data_set(nominal_plant(), (), r, None))
     assert found.sensor == nominal_plant().sensors[1].name and found.clear
     assert [s.rows.start for s in found.each] == list(range(37, 1000, 90))
     assert [s.times[0] for s in found.each] == [float(recording.time[s.rows.start]) for s in found.each]
