@@ -388,7 +388,7 @@ def test_the_beginning_of_one_of_several_recordings_has_its_own_start_level() ->
 
 def test_a_recording_at_hand_is_asked_for_the_plant_s_channels() -> None:
     blank = simulated()
-    with pytest.raises(fdi_torch.ConfigError, match=r"expected an output .*got 'h'"):
+    with pytest.raises(fdi_torch.ConfigError, match=r"expected a sensor 'h', got x"):
         fdi_torch.predict(RIG, Recording(blank.time, blank.inputs, blank.outputs, ("Q",), ("x",), ("m^3/s",), ("m",)))
 
 
