@@ -82,12 +82,13 @@ def leak_rig() -> tuple[Answer, Answer]:
 
 
 @pytest.mark.slow
-def test_offsets_of_tanks_that_start_empty_are_adopted(tmp_path: Path) -> None:
+def test_offsets_of_tanks_that_start_empty_are_adopted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The fit ends 0.11 standard errors before its minimum: of a start level at zero, steps are refused."""
+    monkeypatch.setenv("FDI_TORCH_DATA", str(DATA))
     step = tmp_path / "step1.yaml"
     words = ["gap", "--plant", str(REAL / "three_tank_leak_nominal.yaml"), "--library", "sensor_bias"]
     words += ["--recording", str(REAL / "three_tank_leak_calm.yaml"), "--adopt", str(step), "--with-constants"]
-    assert cli.main([*words, "--quiet"]) == cli.DONE
+    assert cli.main([*words, "--quiet", "--out", str(tmp_path)]) == cli.DONE
     adopted_biases = [p.location for p in load_plant(step).effects if p.effect == "sensor_bias"]
     assert adopted_biases == ["p1", "p2", "p3"]
 
