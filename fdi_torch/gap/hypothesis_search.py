@@ -36,7 +36,7 @@ from fdi_torch.gap.structure_search import Report, SearchResult
 class HypothesisSearch:
     """The hypotheses about a pool of explanations, which grows.
 
-    options: effects that may be added. places: where something unknown may be.
+    options: effects that may be added. places: where something unknown may be. report: called after each step.
     """
 
     def __init__(

@@ -54,7 +54,7 @@ def posterior_of(
     """Posterior over the explanations of a search, with and without an unknown discrepancy at each place.
 
     pool: pool of the evaluated explanations, which may grow. options: effects that are fitted before something at their
-    place is called unknown. named_only: without unknown discrepancies.
+    place is called unknown. named_only: without unknown discrepancies. report: called with the likeliest causes so far.
     """
     search = HypothesisSearch(pool, options, places, report)
     best = max(e.log_weight for e in result.explanations)

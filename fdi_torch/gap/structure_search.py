@@ -47,7 +47,7 @@ class SearchResult:
 def search(
     pool: ExplanationPool, options: Sequence[Option], most: int = DEEPEST, report: Report = lambda causes: None
 ) -> SearchResult:
-    """Search from the recalibrated plant. most: effects in one explanation."""
+    """Search from the recalibrated plant. most: effects in one explanation. report: called after each extension."""
     base = pool.evaluate(pool.null)
     alarm, of_sensors = screen_under_each([base.fitter, pool.fitter], base.fit, options)
     pool.extend(base, alarm, of_sensors)
