@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import doctest
 import re
+import traceback
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -324,6 +326,57 @@ def test_arguments_of_another_kind_are_named() -> None:
         fdi_torch.ConfigError, match=r"fault_free: expected a value, .* \(interval .* as in \[0 s, 300 s\]"
     ):
         fdi_torch.monitor({"plant": RIG, "recording": simulated()})
+
+
+def refused_calls() -> dict[str, Callable[[], Any]]:
+    """Mistakes that are noticed far inside: by YAML, by pydantic, by the readers of units, files and logs."""
+    unfinished, without_q, no_reading = Path("unfinished.yaml"), Path("without_q.csv"), Path("no_reading.csv")
+    unfinished.write_text("plant: three_tank\nsimulate: {inputs: [")
+    without_q.write_text("t_s,h_m,pB_mbar\n0,0.1,2\n1,0.1,2\n")
+    no_reading.write_text("t_s,Q_V,h_m,pB_mbar\n0,1,0.1,x\n1,1,0.1,2\n")
+    train, estimate = fdi_torch.train, {"parameters": ["A.leak"]}
+    return {
+        "YAML": lambda: fdi_torch.load_run("unfinished.yaml"),
+        "a plant": lambda: fdi_torch.load_plant("three_tnk"),
+        "no file": lambda: train({"plant": RIG, "recordings": ["none.csv"], "estimate": estimate}),
+        "a column": lambda: train({"plant": RIG, "recordings": ["without_q.csv"], "estimate": estimate}),
+        "a cell": lambda: fdi_torch.gap(RIG, "no_reading.csv"),
+        "a parameter": lambda: train(
+            {"plant": RIG, "simulate": {"duration": "3 s"}, "estimate": {"parameters": ["A.lek"]}}
+        ),
+        "a unit": lambda: fdi_torch.simulate(RIG, inputs={"Q": "3 bananas"}, duration="10 s"),
+        "a dimension": lambda: fdi_torch.simulate(RIG, inputs={"Q": "3 cm"}, duration="10 s"),
+        "a key": lambda: fdi_torch.monitor({"plant": RIG, "recordng": simulated()}),
+        "a plant's quantity": lambda: Tank("A", area="3 cm", height="1 m"),
+        "a log": lambda: fdi_torch.read_run("none.mcap"),
+    }
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        "YAML",
+        "a plant",
+        "no file",
+        "a column",
+        "a cell",
+        "a parameter",
+        "a unit",
+        "a dimension",
+        "a key",
+        "a plant's quantity",
+        "a log",
+    ],
+)
+def test_the_traceback_of_a_mistake_shows_its_message_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    """Not the errors of YAML, pydantic and pint from which the message was made."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((ValueError, OSError)) as refused:
+        refused_calls()[what]()
+    shown = "".join(traceback.format_exception(refused.value))
+    assert shown.count("Traceback (most recent call last)") == 1, shown
 
 
 def test_one_recording_and_one_effect_need_no_list(tmp_path: Path) -> None:

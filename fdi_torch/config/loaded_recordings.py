@@ -180,7 +180,7 @@ def read_recording(
         display_also_in(recording.written)
         return replace(selected, trusted=config.trusted or selected.trusted)
     except (ValueError, LogError) as error:
-        raise ConfigError([str(error)]) from error
+        raise ConfigError([str(error)]) from None
 
 
 def read_frame(frame: Any, plant: PlantDescription | str | Path, **keys: Any) -> Recording:

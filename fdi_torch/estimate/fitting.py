@@ -153,7 +153,7 @@ def _step_control(step: float, recording: Recording, plant: PlantDescription) ->
         return StepControl.for_fixed_step(step, plant)
     except ValueError as error:
         span = float(recording.time[-1] - recording.time[0])
-        raise ValueError(f"{span / step:.3g} integration steps of {step:g} s through {span:g} s: {error}") from error
+        raise ValueError(f"{span / step:.3g} integration steps of {step:g} s through {span:g} s: {error}") from None
 
 
 def set_up(

@@ -98,7 +98,7 @@ def serve_metrics(host: str = "127.0.0.1", port: int = PORT) -> Iterator[Metrics
     except OSError as error:
         raise ValueError(
             f"--metrics: expected a free address, got {host}:{port} ({error}); name another port"
-        ) from error
+        ) from None
     metrics.port = server.server_port
     try:
         yield metrics
