@@ -428,6 +428,32 @@ def test_the_catalogue_takes_the_name_of_a_plant() -> None:
     assert len(fdi_torch.effects()) > len(fdi_torch.effects("three_tank"))
 
 
+def test_every_function_takes_a_plant_or_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("rig.yaml").write_text(fdi_torch.dump_plant(RIG))
+    fdi_torch.write_csv(simulated(), Path("run.csv"))
+    named = fdi_torch.set_up("rig.yaml", "run.csv", ["A.leak"])
+    itself = fdi_torch.set_up(RIG, simulated(), ["A.leak"])
+    theta = itself.space.nominal()[None]
+    assert named.space.names == itself.space.names
+    assert torch.equal(named.engines(1.0)[0].readings(theta), itself.engines(1.0)[0].readings(theta))
+    constants = fdi_torch.build_network("three_tank").constants.names
+    assert constants == fdi_torch.build_network(fdi_torch.load_plant("three_tank")).constants.names
+    assert fdi_torch.dump_plant("three_tank") == fdi_torch.dump_plant(fdi_torch.load_plant("three_tank"))
+    wrong: Any = 3
+    for call in (
+        lambda: fdi_torch.set_up(wrong, simulated(), []),
+        lambda: fdi_torch.build_network(wrong),
+        lambda: fdi_torch.dump_plant(wrong),
+        lambda: fdi_torch.read_recording("run.csv", wrong),
+        lambda: fdi_torch.export_fmu(wrong, "rig.fmu"),
+        lambda: fdi_torch.gap(wrong, simulated()),
+        lambda: fdi_torch.effects(wrong),
+    ):
+        with pytest.raises(TypeError, match="plant: expected a Plant or the name of a plant file, got a int"):
+            call()
+
+
 def test_the_beginning_of_one_of_several_recordings_has_its_own_start_level() -> None:
     long, short = simulated(), simulated().stretch(0, 120)
     both = fdi_torch.set_up(RIG, [long, short], ["A.leak", "Q.gain"], "free")

@@ -20,7 +20,7 @@ from fdi_torch.config.channels import (
     unrecorded_valves,
     without_column,
 )
-from fdi_torch.config.plant_file import chosen_plant
+from fdi_torch.config.plant_file import AnyPlant, chosen_plant, given_plant
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.recording_config import (
     ColumnConfig,
@@ -144,7 +144,7 @@ def separate_recordings(recordings: Sequence[Any]) -> tuple[list[Any], dict[str,
 
 def read_recording(
     config: RecordingConfig | Mapping[str, Any] | str | Path,
-    plant: PlantDescription | str | Path,
+    plant: AnyPlant,
     base: Path | None = None,
     given: Mapping[str, Recording] | None = None,
 ) -> Recording:
@@ -158,8 +158,7 @@ def read_recording(
     """
     if not isinstance(config, RecordingConfig):
         config = config_of(config)
-    if isinstance(plant, str | Path):
-        plant = chosen_plant(plant)
+    plant = chosen_plant(plant) if isinstance(plant, str | Path) else given_plant(plant)
     channels, columns = plant.channels(), plant.outputs()
     in_memory = (given or {}).get(config.file)
     folder = base or Path.cwd()
@@ -183,7 +182,7 @@ def read_recording(
         raise ConfigError([str(error)]) from None
 
 
-def read_frame(frame: Any, plant: PlantDescription | str | Path, **keys: Any) -> Recording:
+def read_frame(frame: Any, plant: AnyPlant, **keys: Any) -> Recording:
     """The plant's inputs and outputs in a pandas.DataFrame, by the rules of CSV files.
 
     Columns have headers as in a CSV file (`h1_cm`, `h1 [cm]`), or the names of the plant's channels with their units in

@@ -13,7 +13,7 @@ from typing import Any
 
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings, read_recording
 from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monitor
-from fdi_torch.config.plant_file import chosen_plant
+from fdi_torch.config.plant_file import AnyPlant, given_plant
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.study_file import Study, build_study, load_study
 from fdi_torch.effects import units_for_display
@@ -39,7 +39,6 @@ from fdi_torch.quantities import display_in
 from fdi_torch.recording import Recording
 
 Tell = Callable[[float, str], None]
-AnyPlant = PlantDescription | str | Path
 AnyRecording = Recording | Mapping[str, Any] | str | Path
 AnyRun = Run | Mapping[str, Any] | str | Path
 
@@ -245,12 +244,9 @@ def effects(plant: AnyPlant | None = None) -> Catalogue:
 
 def plant_of(plant: AnyPlant) -> PlantDescription:
     """The plant itself, or the plant of a file or of a shipped name; its units are those for display."""
-    if isinstance(plant, str | Path):
-        return chosen_plant(plant)
-    if not isinstance(plant, PlantDescription):
-        raise TypeError(f"plant: expected a Plant or the name of a plant file, got a {type(plant).__name__}")
-    display_in(units_for_display(plant))
-    return plant
+    given = given_plant(plant)
+    display_in(units_for_display(given))
+    return given
 
 
 def recordings_of(wanted: AnyRecording | Sequence[AnyRecording], plant: PlantDescription) -> list[Recording]:
