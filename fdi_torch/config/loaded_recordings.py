@@ -82,7 +82,10 @@ def _unknown(whole: Recording) -> str:
     unknown_shares = {name: share for name, share in zip(whole.input_names, shares, strict=True) if share > 0.0}
     listing = ", ".join(f"{name} at {share:.3g} of the samples" for name, share in unknown_shares.items())
     partly_known = next((name for name, share in unknown_shares.items() if share < 1.0), "")
-    fix = f"if an input keeps its value over empty cells, give the time: columns: {{{partly_known}: {{held: 10 s}}}}"
+    fix = (
+        f"if an input keeps its value over empty cells, give the time: columns: {{{partly_known}: {{held: 10 s}}}}, or "
+        "held: always for one that is recorded on change"
+    )
     return f"unknown are {listing}; " + (f"{fix}, or {GIVE_A_CONSTANT}" if partly_known else GIVE_A_CONSTANT)
 
 
