@@ -148,7 +148,7 @@ class FreeRun(Shown):
     def picture(self) -> str:
         """Measured and predicted readings, as SVG."""
         predictions = {self.plant.name: self.prediction.readings}
-        figure = fit_figure(self.recording, predictions, self.title, self.plant.outputs())
+        figure = fit_figure(self.recording, predictions, self.title, self.plant, self.plant.outputs())
         return notebook_svg(figure, "free-run", self.title)
 
     def to_xarray(self) -> Any:
