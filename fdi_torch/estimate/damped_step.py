@@ -104,9 +104,9 @@ def damping_of_shorter_step(
 ) -> Float[Tensor, " L"]:
     """The damping (L,), at least `damping` (L,), whose step has a share (L,) of the length of `step` (L, P).
 
-    Lengths are those of scaled parameters. The damping is the root of a nearly linear function, which Newton's method
-    finds from below (Moré, 1978, "The Levenberg-Marquardt algorithm", section 5). Bounds that are not active at theta are
-    ignored.
+    Lengths are those of scaled parameters; bounds that are not active at theta are ignored. The damping is the root of
+    a nearly linear function, which Newton's method finds from below (Moré, 1978, "The Levenberg-Marquardt algorithm",
+    section 5).
     """
     free = ~model.held()
     gradient = torch.where(free, model.gradient * model.unit, 0.0)

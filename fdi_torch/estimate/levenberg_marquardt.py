@@ -291,7 +291,8 @@ def _advance(
     share = torch.where(accepted, _SHORTER, _SHORTER_IF_REFUSED)
     shorter = damping_of_shorter_step(lanes.quadratic, lanes.damping, change, share)
     damping = torch.where(accepted & well_predicted, _DAMPING_REDUCTION * lanes.damping, shorter)
-    below_tolerance = (change.abs() <= settings.step_tolerance * typical_size(lanes.theta, lanes.low, lanes.high)).all(-1)
+    width = typical_size(lanes.theta, lanes.low, lanes.high)
+    below_tolerance = (change.abs() <= settings.step_tolerance * width).all(-1)
     advanced = replace(
         lanes,
         theta=torch.where(accepted[:, None], step.trial, lanes.theta),

@@ -82,9 +82,9 @@ class ExplanationPool:
         """Estimate noise and fit alternately until the evidence converges; keep the better explanation.
 
         Effects that were evaluated before are evaluated again only if this fit is likelier under the noise found then.
-        The evaluation stops early if the explanation cannot compete with the likeliest. At its end, improbable onsets and
-        the like are dropped. Its fits are given up if they cannot compete with those of as many effects that will be
-        extended, or with one that has only some of its effects.
+        The evaluation stops early if the explanation cannot compete with the likeliest. At its end, improbable onsets
+        and the like are dropped. Its fits are given up if they cannot compete with those of as many effects that will
+        be extended, or with one that has only some of its effects.
         """
         before, candidate = self.explanations.get(fit.key), fit.candidate
         if before and evidence_under(before.fitter, fit, self.choices) < before.log_evidence + TOLERANCE:
@@ -170,8 +170,10 @@ class ExplanationPool:
             self.evaluate(fit, parent.noise)
 
     def _prospect(self, parent: RankedExplanation, fit: Fit) -> float:
-        """Log evidence of a fit under the noise of the sensors alone or that of `parent`, whichever suits it better. The
-        likeliest is evaluated first, because others then stop early."""
+        """Log evidence of a fit under the noise of the sensors alone or that of `parent`, whichever suits it better.
+
+        The likeliest fit is evaluated first, because the others then stop early.
+        """
         return max(evidence_under(fitter, fit, self.choices) for fitter in (self.fitter, parent.fitter))
 
     def fits_beside(self, fitter: Fitter, base: Fit, options: Sequence[Option]) -> list[Fit]:
