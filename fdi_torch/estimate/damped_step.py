@@ -31,6 +31,9 @@ class Quadratic:
     low: Tensor
     high: Tensor
 
+    def __getitem__(self, keep: Tensor) -> Quadratic:
+        return Quadratic(*(value[keep] for value in vars(self).values()))
+
     @property
     def unit(self) -> Float[Tensor, "L P"]:
         """Scale of each parameter, 1 / sqrt(H_ii); one where the cost has no curvature."""
@@ -102,7 +105,9 @@ def damped_step(model: Quadratic, damping: Float[Tensor, " L"]) -> Step:
 def damping_of_shorter_step(
     model: Quadratic, damping: Float[Tensor, " L"], step: Float[Tensor, "L P"], share: Float[Tensor, " L"]
 ) -> Float[Tensor, " L"]:
-    """The damping (L,), at least `damping` (L,), whose step has a share (L,) of the length of `step` (L, P).
+    """The damping (L,), at least twice `damping` (L,), whose step has a share (L,) of the length of `step` (L, P).
+
+    share: at most a half.
 
     Lengths are those of scaled parameters; bounds that are not active at theta are ignored. The damping is the root of
     a nearly linear function, which Newton's method finds from below (Moré, 1978, "The Levenberg-Marquardt algorithm",
@@ -115,12 +120,12 @@ def damping_of_shorter_step(
     along = apply(vectors.mT, gradient).square()
     longest = (share * dot(step / model.unit, step / model.unit).sqrt()).unsqueeze(-1)
     # Without this shift, a curvature that is not positive definite would have no minimum within any length.
-    total = torch.maximum(damping, _RIDGE - values[:, 0]).unsqueeze(-1)
+    total = torch.maximum(2.0 * damping, _RIDGE - values[:, 0]).unsqueeze(-1)
     for _ in range(_ROOT_ITERATIONS):
         shifted = values + total
         length = row_sum(along / shifted**2).unsqueeze(-1).sqrt()
         slope = row_sum(along / shifted**3).unsqueeze(-1)
-        excess = (length / longest - 1.0).clamp(min=0.0, max=_LARGEST_EXCESS)
+        excess = (length / longest - 1.0).nan_to_num(nan=0.0).clamp(min=0.0, max=_LARGEST_EXCESS)
         total = total + torch.where(slope > 0.0, excess * length**2 / slope, 0.0)
     return total.squeeze(-1)
 

@@ -288,9 +288,12 @@ def _advance(
     decrease = torch.where(accepted, decrease, 0.0)
     well_predicted = decrease > _GOOD_GAIN_RATIO * step.predicted
     change = step.trial - lanes.theta
-    share = torch.where(accepted, _SHORTER, _SHORTER_IF_REFUSED)
-    shorter = damping_of_shorter_step(lanes.quadratic, lanes.damping, change, share)
-    damping = torch.where(accepted & well_predicted, _DAMPING_REDUCTION * lanes.damping, shorter)
+    damping = _DAMPING_REDUCTION * lanes.damping
+    poor = (~(accepted & well_predicted)).nonzero().flatten()
+    if len(poor):
+        share = torch.where(accepted[poor], _SHORTER, _SHORTER_IF_REFUSED)
+        shorter = damping_of_shorter_step(lanes.quadratic[poor], lanes.damping[poor], change[poor], share)
+        damping = damping.index_copy(0, poor, shorter)
     width = typical_size(lanes.theta, lanes.low, lanes.high)
     below_tolerance = (change.abs() <= settings.step_tolerance * width).all(-1)
     advanced = replace(
