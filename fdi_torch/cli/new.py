@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 
 def _text(arguments: argparse.Namespace, name: str) -> str:
-    """The text of the new file. torch, which takes long to import, is imported only if a plant or a recording is read."""
+    """The text of the new file. torch, slow to import, is imported only if a plant or a recording is read."""
     if arguments.kind != "plant":
         from fdi_torch.config.file_templates import template
         from fdi_torch.config.plant_file import chosen_plant

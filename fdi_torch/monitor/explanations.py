@@ -49,8 +49,8 @@ class Explainer:
     ) -> list[HypothesisFit]:
         """Fits of all hypotheses since `start` s, likeliest first.
 
-        While the most likely onset under a plausible hypothesis is the beginning of the window, the fault may have begun
-        earlier. The window is then doubled, back to `earliest` s at most.
+        While the most likely onset under a plausible hypothesis is the beginning of the window, the fault may have
+        begun earlier. The window is then doubled, back to `earliest` s at most.
         """
         s = self.settings
         while True:
