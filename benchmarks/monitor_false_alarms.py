@@ -2,8 +2,9 @@
 
 Each calibration learns from its own recording and is tested on the rest of it. Its number of alarms is compared with
 the 95 % interval that it predicts for itself. With `--tolerance 1` the rig's constants differ from the plant's by their
-tolerances; with `--rests` the inputs rest while it learns; with `--piece 500` the observer starts anew each 500 samples
-of the test. With `--cases FOLDER`, each fault-free case of a folder of practice data
+tolerances; with `--rests` the inputs rest while it learns; with `--flows 0.3` the random flows are smaller; with
+`--calibrate` the constants that have a tolerance are calibrated on the fault-free part; with `--piece 500` the observer
+starts anew each 500 samples of the test. With `--cases FOLDER`, each fault-free case of a folder of practice data
 (CASE/plant.yaml, CASE/recording.csv.gz, CASE/holdout.csv.gz, key.json) is learnt from its recording and tested on its
 hold-out.
 """
@@ -14,21 +15,22 @@ import argparse
 import json
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.stats import poisson
+from torch import Tensor
 
 from benchmarks.monitor_rigs import KINDS, Case, recordings
 from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.monitor.fault_free_checks import QUESTION
-from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
-from fdi_torch.monitor.observer import Observer
-from fdi_torch.monitor.samples import samples_of_recording
+from fdi_torch.monitor.monitor_setup import PreparedMonitor, fault_free_part, prepare_monitor
+from fdi_torch.monitor.samples import Samples, samples_of_recording
+from fdi_torch.monitor.state_update import advance_observer
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
@@ -54,21 +56,25 @@ class Calibration:
 
 
 def tested(
-    plant: PlantDescription, learnt: Recording, test: Recording, skip: int, every: float, piece: int = 0
+    plant: PlantDescription,
+    learnt: Recording,
+    test: Recording,
+    skip: int,
+    every: float,
+    piece: int = 0,
+    calibrate: bool = False,
 ) -> Calibration:
     """Learn from one recording and count the alarms of another, whose first `skip` samples do not count.
 
     piece: after so many samples the observer starts anew; 0 if it never does.
     """
-    prepared = prepare_monitor(plant, learnt, time_between_false_alarms=every)
+    constants = sorted(plant.tolerances) if calibrate else ()
+    prepared = prepare_monitor(plant, learnt, calibrate=constants, time_between_false_alarms=every)
     monitor, samples = prepared.monitor, samples_of_recording(test, plant)
-    observer = Observer(
-        monitor.network, monitor.noise.gain, monitor.space, prepared.believed, monitor.observer.stepper.longest
-    )
     whole = len(samples)
     starts = range(skip, whole, piece) if piece else [0]
-    runs = [observer.run(samples.segment(first, min(first + (piece or whole), whole))) for first in starts]
-    white = torch.cat([monitor.noise.whitening(run.steady_residual) for run in runs])[0 if piece else skip :]
+    runs = [samples.segment(first, min(first + (piece or whole), whole)) for first in starts]
+    white = torch.cat([_to_test(prepared, run, 0 if piece else skip) for run in runs])
     detector, seconds = monitor.detector, len(white) * monitor.detector.design.interval
     alarms, expected = int(detector.alarms(white).sum()), detector.design.rates * seconds
     low, high = (detector.design.count_quantile(seconds, p) for p in (0.025, 0.975))
@@ -76,7 +82,16 @@ def tested(
     return Calibration(alarms, low, high, share, detector.threshold, any(QUESTION in w for w in prepared.warnings))
 
 
-def test_cases(folder: Path, every: float) -> None:
+def _to_test(prepared: PreparedMonitor, samples: Samples, skip: int) -> Tensor:
+    """The residuals that the detector tests in one run, without those of the first `skip` samples."""
+    observer, state = prepared.monitor.observer, prepared.monitor.start(samples, prepared.believed)
+    if skip:
+        state = advance_observer(observer, state, samples.segment(1, skip))
+        state = replace(state, errors=state.errors.as_calibrated())
+    return advance_observer(observer, state, samples.segment(max(skip, 1), len(samples))).tested[skip:]
+
+
+def test_cases(folder: Path, every: float, calibrate: bool) -> None:
     """Test each fault-free case on its hold-out."""
     for case, answer in json.loads((folder / "key.json").read_text()).items():
         if answer["causes"]:
@@ -86,7 +101,7 @@ def test_cases(folder: Path, every: float) -> None:
             read_recording(RecordingConfig(file=str(folder / case / f"{name}.csv.gz")), plant, folder)
             for name in ("recording", "holdout")
         )
-        row, lasts = tested(plant, learnt, test, 0, every), float(test.time[-1] - test.time[0])
+        row, lasts = tested(plant, learnt, test, 0, every, calibrate=calibrate), float(test.time[-1] - test.time[0])
         print(f"{case} {answer['kind']:6} {len(plant.tanks):2} tanks: {row.alarms} ", end="")
         print(f"({row.low} to {row.high}) of {lasts / every:.1f}", flush=True)
 
@@ -100,11 +115,13 @@ def main() -> None:
     parser.add_argument("--correlation", type=float, default=0.0, help="of neighbouring values of the sensors' noise")
     parser.add_argument("--tolerance", type=float, default=0.0, help="errors of the constants, in their tolerances")
     parser.add_argument("--rests", action="store_true", help="inputs rest during the learning part")
+    parser.add_argument("--flows", type=float, default=1.0, help="random flows, as a share of the usual ones")
+    parser.add_argument("--calibrate", action="store_true", help="the constants that have a tolerance")
     parser.add_argument("--piece", type=int, default=0, help="the observer starts anew each that many samples")
     parser.add_argument("--cases", type=Path, help="folder of practice data")
     a = parser.parse_args()
     if a.cases is not None:
-        test_cases(a.cases, a.every)
+        test_cases(a.cases, a.every, a.calibrate)
         return
     plant = load_plant("three_tank")
     cells = [(k, closed, learn) for k in KINDS for closed in (True, False) for learn in LEARN]
@@ -121,6 +138,7 @@ def main() -> None:
             correlation=a.correlation,
             tolerance=a.tolerance,
             rests=a.rests,
+            flows=a.flows,
         )
         for i, (k, closed, learn) in enumerate(cells)
         for j in range(a.calibrations)
@@ -129,7 +147,10 @@ def main() -> None:
     for first in range(0, len(cases), a.calibrations):
         case = cases[first]
         whole = [recording for recording, _ in runs[first : first + a.calibrations]]
-        rows = [tested(plant, fault_free_part(r, 0.0, case.learn), r, int(case.learn), a.every, a.piece) for r in whole]
+        rows = [
+            tested(plant, fault_free_part(r, 0.0, case.learn), r, int(case.learn), a.every, a.piece, a.calibrate)
+            for r in whole
+        ]
         results += rows
         loop, thresholds = "closed" if case.closed else "open", [round(row.threshold, 1) for row in rows]
         texts = ", ".join(f"{row.alarms} ({row.low} to {row.high})" for row in rows)

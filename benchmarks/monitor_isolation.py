@@ -5,7 +5,8 @@ onset, course (sudden or growing) and the number of faults are known, and over t
 known too. What remains is what the readings do not decide. With `--from-prior N`, N faults and their sizes are
 drawn from the prior of the monitor, so that its probabilities must be the frequencies with which it is right; with
 `--growing` beside it the times of their growth, and with `--growing S` they reach these sizes within S seconds. With
-`--listed K` beside it, each monitor has K suspects only, and each second fault is none of them.
+`--listed K` beside it, each monitor has K suspects only, and each second fault is none of them. `--tolerance`,
+`--rests`, `--flows` and `--calibrate` are those of `monitor_false_alarms`.
 """
 
 from __future__ import annotations
@@ -47,14 +48,17 @@ def prepared_for(
     every: float = 20000.0,
     ranges: Mapping[str, tuple[float, float]] | None = None,
     listed: Sequence[str] = (),
+    calibrate: bool = False,
 ) -> tuple[PreparedMonitor, Samples]:
     """A monitor that has learnt for `learn` s, and all samples.
 
     ranges: of faults, the usual ones by default. listed: the monitor's suspects, by default those with ranges.
+    calibrate: the constants that have a tolerance.
     """
     plant, suspects = load_plant("three_tank"), list(listed or ranges or {})
     known = fault_free_part(recording, 0.0, learn)
-    prepared = prepare_monitor(plant, known, suspects, time_between_false_alarms=every, ranges=ranges)
+    constants = sorted(plant.tolerances) if calibrate else ()
+    prepared = prepare_monitor(plant, known, suspects, constants, time_between_false_alarms=every, ranges=ranges)
     return prepared, samples_of_recording(recording, plant)
 
 
@@ -244,6 +248,10 @@ def main() -> None:
     parser.add_argument("--from-prior", type=int, default=0, help="draw that many cases from the monitor's prior")
     parser.add_argument("--growing", type=float, nargs="?", default=0.0, help="these grow, to their size in so many s")
     parser.add_argument("--listed", type=int, default=0, help="number of suspects, beside --from-prior")
+    parser.add_argument("--tolerance", type=float, default=0.0, help="errors of the constants, in their tolerances")
+    parser.add_argument("--rests", action="store_true", help="inputs rest during the learning part")
+    parser.add_argument("--flows", type=float, default=1.0, help="random flows, as a share of the usual ones")
+    parser.add_argument("--calibrate", action="store_true", help="the constants that have a tolerance")
     parser.add_argument("--oracle", action="store_true", help="compare with posteriors for known onsets and sizes")
     parser.add_argument("--show", action="store_true", help="print the events")
     a = parser.parse_args()
@@ -251,11 +259,12 @@ def main() -> None:
         chosen, ranges = cases_from_prior(a.seed, a.learn, a.from_prior, a.growing)
     else:
         chosen, ranges = cases(a.seed, a.learn, a.faults, a.kinds)[a.first :: a.every], {}
+    chosen = [replace(case, tolerance=a.tolerance, rests=a.rests, flows=a.flows) for case in chosen]
     total: dict[str, float] = defaultdict(float)
     started = time.process_time()
     for k, (case, (recording, _)) in enumerate(zip(chosen, recordings(chosen), strict=True)):
         listed = suspects_of(case, list(ranges), a.listed, k % 2 == 1) if a.listed else []
-        prepared, samples = prepared_for(recording, case.learn, ranges=ranges, listed=listed)
+        prepared, samples = prepared_for(recording, case.learn, ranges=ranges, listed=listed, calibrate=a.calibrate)
         events = followed(prepared, samples, case.learn)
         count = scored_list(case, events, k % 2 == 1) if a.listed else scored(case, events)
         if a.oracle:

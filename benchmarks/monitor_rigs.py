@@ -47,7 +47,7 @@ class Case:
     share: of the usual size. pumps: flows asked for after the learning part, m^3/s, instead of the usual commands.
     correlation: of neighbouring values of the sensors' noise. tolerance: standard deviation of the rig's discharge
     coefficients about the plant's, in its tolerances. rests: whether the commands and set points rest at the usual mean
-    during the learning part, from the plant's steady levels on.
+    during the learning part, from the plant's steady levels on. flows: share of the usual random flows.
     """
 
     fault: str
@@ -63,6 +63,7 @@ class Case:
     correlation: float = 0.0
     tolerance: float = 0.0
     rests: bool = False
+    flows: float = 1.0
 
     @property
     def name(self) -> str:
@@ -156,7 +157,7 @@ def _drive(case: Case, rng: np.random.Generator, samples: int, factor: Array, er
         asked[: int(case.learn)], points[: int(case.learn)] = 5e-5, REST[0]
     # The variance of the flow integrated over a minute is that of flows held for 15 s.
     scale = {"white": 15.0**0.5, "held": 1.0, "slow": 0.55}[case.kind]
-    random = Disturbance(case.kind, KINDS[case.kind], FLOW * scale * rng.uniform(0.5, 1.5, size=3), 1.0)
+    random = Disturbance(case.kind, KINDS[case.kind], case.flows * FLOW * scale * rng.uniform(0.5, 1.5, size=3), 1.0)
     limits = "proportional_integral", 0, 0, points, 0.0, 9e-5, 0.01, 1e-3, 1e-8
     control = _ScaledControl(*limits, factor[:, 0]) if case.closed else None
     return Drive(asked, start, random.values(rng, samples), control, error[:, 0])

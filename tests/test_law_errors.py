@@ -6,14 +6,19 @@ from dataclasses import replace
 
 import pytest
 import torch
+from rigs import blank_recording
 from torch import Tensor
 
 from fdi_torch.effects import build_network, place
 from fdi_torch.estimate.evidence import ODDS
+from fdi_torch.monitor import law_errors
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.law_errors import SIZE_ERROR, UNKNOWN, LawErrors
 from fdi_torch.monitor.monitor import Monitor
+from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
+from fdi_torch.monitor.noise_model import learn_noise
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.simulate.build import BuildError
 from tests.test_monitor import (
     INPUTS,
     NETWORK,
@@ -35,12 +40,19 @@ def start(faults: int, correlation_time: float) -> LawErrors:
     return LawErrors.at_start(range(faults), correlation_time, nothing, nothing, torch.zeros(0, 3, dtype=DTYPE))
 
 
+def missing() -> None:
+    raise BuildError("no compiler")
+
+
+@pytest.mark.parametrize("compiler", [True, False])
 @pytest.mark.parametrize("deviation", [0.0, UNKNOWN])
 def test_innovations_beside_known_faults_are_those_of_the_normal_distribution_of_all_residuals(
-    deviation: float,
+    deviation: float, compiler: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its covariance is I + D (SIZE_ERROR^2 + law_error^2 exp(-|t - t'| / T)) D', for the readings that are there, and
     UNKNOWN^2 between those of one sensor beside a steady deviation."""
+    if not compiler:
+        monkeypatch.setattr(law_errors, "_library", missing)
     generator = torch.Generator().manual_seed(3)
     count, sensors, faults, time = 40, 3, 2, 25.0
     white, effects = (torch.randn(*n, count, sensors, generator=generator, dtype=DTYPE) for n in ((), (faults,)))
@@ -149,3 +161,67 @@ def test_a_fault_is_detected_as_soon_beside_a_steady_deviation_as_alone() -> Non
         events = beside_steady_deviation(step_to("T1.leak.size", 0.1, 700.0), 2, size, 760)
         first.append(next(event.time for event in events if event.kind == "alarm" and event.time > 600.0))
     assert 700.0 < first[1] <= first[0] + 2.0
+
+
+CONSTANTS = [f"{pipe.name}.discharge_coefficient" for pipe in PLANT.pipes]
+OF_CONSTANTS = ParameterSpace([NETWORK.constants[name] for name in [*CONSTANTS, "T1.leak.size"]])
+
+
+def calibrated_at_rest(seed: int, learn: int, leak: float) -> tuple[list[Event], float]:
+    """The events after `learn` s at rest, on which the constants of a rig are calibrated, and 800 s of moving
+    pumps, with a leak from 600 s on. And the squared errors of the constants by their covariance.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    nominal, std = OF_CONSTANTS.nominal(), OF_CONSTANTS.std()
+    drawn = std[:-1] * torch.randn(len(CONSTANTS), generator=generator, dtype=DTYPE)
+    sound = nominal + torch.cat([drawn, drawn.new_zeros(1)])
+    leaking = sound + torch.tensor([*(0.0 for _ in CONSTANTS), leak], dtype=DTYPE)
+    steps = 3e-5 + 4e-5 * torch.rand(4, 2, generator=generator, dtype=DTYPE)
+    inputs = torch.cat([INPUTS.repeat(learn, 1), steps.repeat_interleave(200, 0)])
+
+    def truth(time: float) -> Tensor:
+        return leaking if time >= 600.0 else sound
+
+    samples = recorded(truth, len(inputs), NETWORK, OF_CONSTANTS, seed=seed, inputs=inputs)
+    whole = replace(blank_recording(PLANT, inputs, samples.time), outputs=samples.readings, mask=None)
+    prepared = prepare_monitor(PLANT, fault_free_part(whole, 0.0, learn), ["T1.leak.size"], calibrate=CONSTANTS)
+    state = prepared.monitor.start(samples, prepared.believed, learning_until=learn)
+    _, events = prepared.monitor.advance(state, samples.segment(1, len(samples)))
+    columns = [prepared.monitor.space.index(name) for name in CONSTANTS]
+    error = (prepared.believed[columns] - sound[:-1]) / std[:-1]
+    covariance = prepared.monitor.noise.constants.covariance
+    return events, float(error @ torch.linalg.solve(covariance, error))
+
+
+@pytest.mark.parametrize(("seed", "learn"), [(20261555, 300), (20261566, 100)])
+def test_errors_of_constants_that_were_calibrated_at_rest_raise_no_alarm(seed: int, learn: int) -> None:
+    """A sound rig with drawn constants; calibrated constants that count as exact raise an alarm."""
+    events, square = calibrated_at_rest(seed, learn, 0.0)
+    assert not [event for event in events if event.kind == "alarm"]
+    assert square <= 16.3  # 99.9 % of chi-square with three degrees of freedom
+
+
+def test_errors_of_constants_hide_no_fault_beyond_their_tolerance() -> None:
+    """A leak of 0.1 draws as much as an outlet whose coefficient is 10 % larger; the tolerance is 3 %."""
+    events, _ = calibrated_at_rest(20261566, 100, 0.1)
+    assert 600.0 < next(event.time for event in events if event.kind == "alarm") <= 620.0
+
+
+def test_the_covariance_of_least_squares_is_that_of_estimates_from_drawn_flows_and_noise() -> None:
+    """Weighted sums of 4000 simulated free runs."""
+    flows = learn_noise(NETWORK, recorded(lambda t: SPACE.nominal(), 120))[0].whitening.flows
+    assert flows is not None
+    flows = replace(flows, noise=replace(flows.noise, intensity=torch.full((3,), 3e-4), correlation_time=20.0))
+    generator = torch.Generator().manual_seed(20261565)
+    runs, samples = 4000, 60
+    rows = torch.randn(2, samples, 3, generator=generator, dtype=DTYPE)
+    state = flows.flow_std * torch.randn(runs, 3, generator=generator, dtype=DTYPE)
+    state, sums = torch.cat([torch.zeros_like(state), state], 1), torch.zeros(runs, 2, dtype=DTYPE)
+    for k in range(samples):
+        noise = flows.white_std * torch.randn(runs, 3, generator=generator, dtype=DTYPE)
+        sums += (state @ flows.joint.output.mT + noise) @ rows[:, k].mT
+        shocks = flows.process_std * torch.randn(runs, 6, generator=generator, dtype=DTYPE)
+        state = state @ flows.transition.mT + shocks
+    expected, got = flows.covariance_of_sums(rows), torch.cov(sums.mT)
+    scale = expected.diagonal().sqrt()
+    assert float(((got - expected) / scale / scale[:, None]).abs().max()) < 0.1  # four standard errors

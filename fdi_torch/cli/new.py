@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 
 def _text(arguments: argparse.Namespace, name: str) -> str:
-    """The text of the new file. Only a file that depends on a plant or a recording waits for torch."""
+    """The text of the new file. torch, slow to import, is imported only if a plant or a recording is read."""
     if arguments.kind != "plant":
         from fdi_torch.config.file_templates import template
         from fdi_torch.config.plant_file import chosen_plant

@@ -1,9 +1,9 @@
 """Division of the integration steps in which levels move too fast for the midpoint rule.
 
 An error of s / sqrt(S) in each of S readings with noise s adds one to chi-square: the rule may err by no more in a
-step. The plant file shows where it does: a tank that exchanges its water fast, levels that meet. So do the readings,
-whatever moves them: a tank that starts far above an overflow that the file does not know. Roots and rims are smoothed
-for the length of a step, so that their error falls with it.
+step. Where it does follows from the plant file (a tank that exchanges its water fast, levels that meet) and from the
+readings (a level that falls fast because its tank starts far above an overflow that the file lacks). Square roots and
+rims are smoothed over the length of a step, so that their error becomes smaller with the step.
 """
 
 from __future__ import annotations

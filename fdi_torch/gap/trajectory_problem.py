@@ -26,8 +26,8 @@ BEHIND, SHARE = 30.0, 0.25
 def first_lowest(cost: Tensor) -> int:
     """Index of the first of the costs (L,) that exceed the lowest by less than a converged descent may.
 
-    Rounding decides between descents that end at the same cost, as where an effect shows nowhere; their evidence may
-    differ.
+    Several starts may end at the same cost but at other parameters, for example if an effect shows nowhere in the
+    recording. The lowest cost of all would then be a matter of rounding errors.
     """
     cost = cost.nan_to_num(nan=torch.inf)
     return int((cost <= cost.min() + DECREMENT).nonzero()[0])

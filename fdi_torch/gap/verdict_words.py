@@ -1,6 +1,7 @@
 """The verdict in one sentence, and explanations in words, for terminal and report pages.
 
-The answer is its JSON in format 1 or 2, possibly from a log that anyone may have written.
+Functions take the answer as JSON in format 1 or 2, as it is in logs. A log may come from anybody, so its texts are not
+trusted.
 """
 
 from __future__ import annotations

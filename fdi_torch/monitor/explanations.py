@@ -49,8 +49,8 @@ class Explainer:
     ) -> list[HypothesisFit]:
         """Fits of all hypotheses since `start` s, likeliest first.
 
-        The window is doubled, up to `earliest` s, while the onset of a plausible one lies at its beginning: the change
-        may have occurred before it, and a fault that had grown before would not be an explanation.
+        While the most likely onset under a plausible hypothesis is the beginning of the window, the fault may have
+        begun earlier. The window is then doubled, back to `earliest` s at most.
         """
         s = self.settings
         while True:

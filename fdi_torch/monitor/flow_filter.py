@@ -175,6 +175,21 @@ class FlowFilter:
         slope = ((of_sums - 1.0).reshape(-1, 1, 1) * power).mean(0)
         return 0.5 * (slope @ self.covariance_of_parameters * slope).sum(-1).sqrt()
 
+    def covariance_of_sums(self, rows: Tensor) -> Tensor:
+        """Covariance (P, P) of P weighted sums of what random flows and measurement noise add to the readings of a free
+        run, by the adjoint of the model. rows (P, S, sensors): the weights.
+        """
+        n = len(self.linear.transition)
+        start = torch.cat([self.flow_std.new_zeros(n), self.flow_std, self.reading_std[: self._noises]])
+        by_states, noise = rows.new_zeros(len(rows), len(self.transition)), (rows * self.white_std).flatten(1)
+        total = noise @ noise.mT
+        for k in range(rows.shape[1] - 1, -1, -1):
+            shocks = by_states * self.process_std
+            total = total + shocks @ shocks.mT
+            by_states = by_states @ self.transition + rows[:, k] @ self.joint.output
+        first = by_states * start
+        return total + first @ first.mT
+
     def over(self, samples: int) -> tuple[Tensor, Tensor]:
         """Transition (2 n, 2 n) of states and flows over some samples, and covariance of their shocks, by doubling."""
         levels = slice(2 * len(self.linear.transition))

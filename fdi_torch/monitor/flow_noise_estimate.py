@@ -39,7 +39,7 @@ def estimate_flow_filter(
     BuildError without a compiler.
     """
     first = StateNoise(_usual_flow(linear, reading_std, start_std), FIRST_TIME * interval, torch.ones_like(reading_std))
-    free = _free_residual(linear, observer, residual)
+    free = free_residual(linear, observer, residual)
     start = FlowFilter(linear, first, reading_std, observer, start_std, interval, free, correlation=correlation)
     flows, likely = _likeliest(start, [free], CORRELATION_TIMES)
     return flows, likely.log_likelihood
@@ -79,7 +79,7 @@ def _likeliest(
     first = 0
     for k, segment in enumerate(segments):
         last, fresh[first] = first + len(segment), True
-        moved = _by_initial_levels(linear, len(segment))[..., :tanks] * start.start_std
+        moved = by_initial_levels(linear, len(segment))[..., :tanks] * start.start_std
         by_levels[first:last, :, k * tanks : (k + 1) * tanks] = moved
         first = last
     a, b, c = (x.expand(count, *x.shape) for x in (linear.transition, forcing(linear.transition), linear.output))
@@ -147,27 +147,28 @@ def learning_from(flows: FlowFilter, residual: Tensor, number: int) -> tuple[Flo
     residual (S, sensors): scaled to the steady variance, of the observer's samples from `number` on, where the
     filter starts anew: the state of one with other noise would not be known to the precision that its gain assumes.
     """
-    further = _free_residual(flows.linear, flows.observer, residual, number)
+    further = free_residual(flows.linear, flows.observer, residual, number)
     likeliest, at = _likeliest(replace(flows, begins=number), [flows.learnt, further])
     return likeliest, at.log_likelihood - at.start_log_likelihood
 
 
-def _free_residual(linear: Linear, observer: Gain, residual: Tensor, number: int = 0) -> Tensor:
-    """What the residual (S, sensors) would be without the observer's corrections: r_k + C xi_k, with
+def free_residual(linear: Linear, observer: Gain, residual: Tensor, number: int = 0) -> Tensor:
+    """What the residual (*batch, S, sensors) would be without the observer's corrections: r_k + C xi_k, with
     xi_{k+1} = A (xi_k + L_k r_k). NaN where a reading is missing, which makes no correction.
 
     number: samples of the run before the first.
     """
-    raw = residual * observer.spread(number, len(residual))
-    steps = (observer.table(number, len(raw)) @ raw.nan_to_num().unsqueeze(-1)).squeeze(-1)
-    shift, path = torch.zeros_like(steps[0]), []
-    for step in steps:
+    count = residual.shape[-2]
+    raw = residual * observer.spread(number, count)
+    steps = observer.table(number, count) @ raw.nan_to_num().unsqueeze(-1)
+    shift, path = torch.zeros_like(steps[..., 0, :, :]), []
+    for step in steps.unbind(-3):
         path.append(shift)
         shift = linear.transition @ (shift + step)
-    return raw + torch.stack(path) @ linear.output.mT
+    return raw + (linear.output @ torch.stack(path, -3)).squeeze(-1)
 
 
-def _by_initial_levels(linear: Linear, count: int) -> Tensor:
+def by_initial_levels(linear: Linear, count: int) -> Tensor:
     """Derivatives of the readings by the initial states, C A^k, (S, sensors, n)."""
     power, path = torch.eye(len(linear.transition), dtype=linear.transition.dtype), []
     for _ in range(count):

@@ -69,7 +69,7 @@ class Monitor:
         self.settings = settings or usual_settings(network.description)
         self.watched = len(space) - unlisted if watched is None else watched
         self.faults = faults_of(space.names[: self.watched])
-        self.observer = ObserverBank(network, space, noise.gain, noise.whitening, longest_step)
+        self.observer = ObserverBank(network, space, noise.gain, noise.whitening, longest_step, noise.constants)
         self.writer = EventWriter(self.observer, self.settings, self.watched)
         outside = [f for f in faults_of(space.names) if f.size >= len(space) - unlisted]
         explainer = Explainer(self.observer, self.faults, self.settings, outside)
@@ -174,7 +174,11 @@ class Monitor:
         if learning:
             if moved.now >= state.learning_until:  # no window reaches into the part that is declared fault-free
                 moved = replace(
-                    moved, learning_until=LONG_AGO, detector_memory=None, earliest_start=state.learning_until
+                    moved,
+                    learning_until=LONG_AGO,
+                    detector_memory=None,
+                    earliest_start=state.learning_until,
+                    errors=moved.errors.as_calibrated(),  # it includes what the errors have seen so far
                 )
             return moved, count, []
         state, events = self.alarms.on_threshold(moved) if raised else (moved, [])

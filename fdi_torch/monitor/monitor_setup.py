@@ -12,6 +12,7 @@ from torch import Tensor
 from fdi_torch.effects import build_network, placements_for, without_startup_effects
 from fdi_torch.estimate.fitting import StartLevels, set_up
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
+from fdi_torch.monitor.calibration_errors import calibration_errors
 from fdi_torch.monitor.detection import Chart, make_detector
 from fdi_torch.monitor.fault_free_checks import false_alarm_rate_text, fault_warnings, residual_warnings
 from fdi_torch.monitor.hypothesis import SHAPE, faults_of
@@ -88,6 +89,9 @@ def prepare_monitor(
     believed = space.vector(values)
     samples = samples_of_recording(fault_free, plant)
     noise, seen = learn_noise(learning, samples, space, believed, longest_step=step)
+    noise = replace(
+        noise, constants=calibration_errors(learning, samples, space, believed, calibrate, noise, seen, step)
+    )
     sampling = float(torch.diff(samples.time).median())
     generator = torch.Generator().manual_seed(seed)
     every = time_between_false_alarms

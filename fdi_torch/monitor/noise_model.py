@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from fdi_torch.monitor.flow_filter import FlowFilter
 from fdi_torch.monitor.flow_noise_estimate import estimate_flow_filter, likeliest_correlation
+from fdi_torch.monitor.law_errors import ConstantErrors
 from fdi_torch.monitor.observer import Observation, Observer, bind_parameters, initial_levels
 from fdi_torch.monitor.observer_gain import (
     Gain,
@@ -41,7 +42,7 @@ class NoiseModel:
 
     reading_std (sensors,): measurement noise in the readings' units. ratio: process over measurement noise, both as
     levels. whitening: of the observer's residual. gain: of the observer. interval: usual time between
-    samples, s.
+    samples, s. constants: what is not known about the calibrated ones.
     """
 
     reading_std: Tensor
@@ -49,6 +50,7 @@ class NoiseModel:
     whitening: Whitening
     gain: Gain
     interval: float = 1.0
+    constants: ConstantErrors = field(default_factory=ConstantErrors)
 
 
 def learn_noise(

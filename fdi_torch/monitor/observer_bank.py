@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.uncertainty import end_reached
+from fdi_torch.monitor.law_errors import ConstantErrors
 from fdi_torch.monitor.observer import ObserverRun, initial_levels, run_observers
 from fdi_torch.monitor.observer_gain import Gain
 from fdi_torch.monitor.samples import Samples
@@ -86,9 +87,9 @@ class ObserverBank:
     (prediction-error method; Ljung 1999, ch. 7). In all methods believed (P,) are the values of `space` before the
     change.
 
-    effects: groups of columns of `space` that belong to one effect, such as amplitude, period and phase of an
-    oscillation. An effect with a memory and an onset parameter (a stuck sensor keeps its reading at the onset) gets the
-    onset of the change.
+    constants: what is not known about the calibrated ones. effects: groups of columns of `space` that belong to one
+    effect, such as amplitude, period and phase of an oscillation. An effect with a memory and an onset parameter (a
+    stuck sensor keeps its reading at the onset) gets the onset of the change.
     """
 
     def __init__(
@@ -98,7 +99,9 @@ class ObserverBank:
         gain: Gain,
         whitening: Whitening,
         longest_step: float | None = None,
+        constants: ConstantErrors | None = None,
     ) -> None:
+        self.constants = constants or ConstantErrors()
         self.stepper = Stepper(network, longest_step)
         self.network, self.space, self.gain, self.whitening = network, space, gain, whitening
         self.changing = SwitchedNetwork(network, space.names)

@@ -14,7 +14,7 @@ from torch import Tensor
 from fdi_torch.estimate.evidence import ODDS
 from fdi_torch.monitor.detection import Detector
 from fdi_torch.monitor.hypothesis import HypothesisFit, faults_of
-from fdi_torch.monitor.law_errors import SIZE_ERROR, STEP, LawErrors, normalized
+from fdi_torch.monitor.law_errors import SIZE_ERROR, STEP, LawErrors, normalized, prior_std
 from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
 from fdi_torch.monitor.observer_bank import LONG_AGO, ChangeHypotheses, ObserverBank, ObserverWindow
 from fdi_torch.monitor.samples import ClockState, Samples, concatenated
@@ -45,7 +45,14 @@ def initial_state(
         white=white,
         tested=white,
         memory=memory,
-        errors=LawErrors.at_start(known, correlation_time, state, memory[0], innovations[: observer.whitening.order]),
+        errors=LawErrors.at_start(
+            known,
+            correlation_time,
+            state,
+            memory[0],
+            innovations[: observer.whitening.order],
+            constants=observer.constants,
+        ),
         number=1,
         believed=believed,
         healthy=healthy,
@@ -94,7 +101,8 @@ def _adopt(
     first, known = len(state.samples) - len(window), _known_columns(observer, believed, state.healthy)
     past, time = _innovations_before(observer, state, first), state.errors.correlation_time
     sizes = _size_errors(state, believed, known, fit)
-    errors = LawErrors.at_start(known, time, window.state, state.memory[first - 1], past, sizes)
+    known_state = window.state, state.memory[first - 1], past
+    errors = LawErrors.at_start(known, time, *known_state, sizes, state.errors.constants)
     state = replace(state, believed=believed, errors=errors, detector_memory=None)
     return _run(observer, state, window, before, fit.onset, fit.hypothesis.incipient)
 
@@ -148,9 +156,10 @@ def _run(
     its memory and the errors of the known faults are those at its beginning.
     """
     first, errors, order = len(state.samples) - len(window), state.errors, observer.whitening.order
-    theta = state.believed.repeat(1 + len(errors.columns), 1)
-    for lane, column in enumerate(errors.columns, start=1):
-        theta[lane, column] += STEP * (state.believed - state.healthy)[column]
+    raised = torch.where(state.off_nominal, state.believed - state.healthy, prior_std(observer.space))
+    columns = [*errors.columns, *errors.constants.columns]
+    theta = state.believed.repeat(1 + len(columns), 1)
+    theta[1:] += STEP * torch.diag(raised)[columns]
     change = ChangeHypotheses(theta, theta.new_full((len(theta),), onset), torch.full((len(theta),), incipient))
     path, residual = observer.run(window, before, change)
     innovations, memory = observer.whitening.innovations(residual, window.number, window.memory)

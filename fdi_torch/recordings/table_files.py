@@ -125,7 +125,7 @@ def _lines(rows: Iterable[Row]) -> list[str]:
 
 
 def tab_separated(rows: Iterator[Row]) -> Iterator[list[str]]:
-    """Blocks of lines of rows of plain values, the first of which is the header."""
+    """Rows of plain values as lines of tab-separated text, in blocks; the first row is the header."""
     while block := list(islice(rows, _AT_ONCE)):
         yield _lines(block)
 
