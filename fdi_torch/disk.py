@@ -46,7 +46,7 @@ def named_errors(place: Path | str) -> Iterator[None]:
     except OSError as error:
         if error.errno is None:  # one of this program's errors, which is a sentence already
             raise
-        raise DiskError(sentence(place, error)) from error
+        raise DiskError(sentence(place, error)) from None
 
 
 @contextmanager

@@ -22,8 +22,8 @@ def parse_quantity(text: str, unit: str) -> float:
     """
     try:
         return in_unit(*number_and_unit(text), unit)
-    except UnitError as error:
-        raise ValueError(f"expected a quantity in {unit} such as '1 {unit}', got '{shortened(text)}'") from error
+    except UnitError:
+        raise ValueError(f"expected a quantity in {unit} such as '1 {unit}', got '{shortened(text)}'") from None
 
 
 def parse_level_deviation(text: str, name: str) -> float:
@@ -34,7 +34,7 @@ def parse_level_deviation(text: str, name: str) -> float:
     try:
         value = parse_quantity(text, "m")
     except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
+        raise ValueError(f"{name}: {error}") from None
     if not value > 0.0:
         raise ValueError(f"{name}: expected a positive standard deviation such as '1 mm', got '{text}'")
     return value
@@ -45,8 +45,8 @@ def unit_factor(unit: str, si_unit: str) -> float:
     """The value of one `unit` in `si_unit`: unit_factor('cm', 'm') = 0.01."""
     try:
         return factor(unit, si_unit)
-    except UnitError as error:
-        raise ValueError(f"expected a unit that converts to {si_unit}, got '{shortened(unit)}'") from error
+    except UnitError:
+        raise ValueError(f"expected a unit that converts to {si_unit}, got '{shortened(unit)}'") from None
 
 
 def si_unit_of(unit: str) -> str:

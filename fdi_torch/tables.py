@@ -150,7 +150,7 @@ def needed(library: str, extra: str = "") -> Any:
         sentence = (
             f"expected the library {library.partition('.')[0]}, got none; pip install 'fdi_torch[{extra or library}]'"
         )
-        raise MissingExtraError(sentence) from error
+        raise MissingExtraError(sentence) from None
 
 
 def _shown(column: str, value: Any, std: float | None) -> str:

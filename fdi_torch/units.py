@@ -87,7 +87,7 @@ def in_unit(number: float, unit: str, target: str) -> float:
     try:
         converted = float(_registry.Quantity(number, _parsed(unit)).to(_parsed(target)).magnitude)
     except (pint.PintError, OverflowError, ZeroDivisionError) as error:
-        raise UnitError(str(error)) from error
+        raise UnitError(str(error)) from None
     if math.isfinite(number) and not math.isfinite(converted):
         raise UnitError(f"beyond all numbers: {number:g} {unit}")
     return converted
@@ -155,5 +155,5 @@ def _known(name: str) -> Any:
     name = _SIGNS.get(name, name)
     try:
         return _registry.Unit(_registry.UnitsContainer({_registry.get_name(name): 1}))
-    except (pint.PintError, KeyError, ValueError) as error:
-        raise UnitError(f"no unit: {name}") from error
+    except (pint.PintError, KeyError, ValueError):
+        raise UnitError(f"no unit: {name}") from None

@@ -25,6 +25,7 @@ from fdi_torch.gap.identifiability import planned_identifiability
 from fdi_torch.gap.library import STANDARD, equivalence_class, library_of
 from fdi_torch.gap.screening import Pairs
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.constants import leak_pipe
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
@@ -185,6 +186,18 @@ def test_a_known_cause_is_named_with_its_size_and_closes_the_gap() -> None:
     assert abs(amount.value - 12.0) < 5 * amount.std < 3.0
     assert answer.closure["closed"] == pytest.approx(1.0, abs=0.03)
     assert answer.closure["augmented"] == pytest.approx(0.1, rel=0.1)  # cm: the noise
+
+
+def test_a_leak_is_told_with_its_flow_at_the_mean_level() -> None:
+    """By Torricelli's law; a cause without a flow of its own, such as a pump gain, has none."""
+    plant, recording = nominal_plant(), recorded({"T1.leak.size": 0.2}, 61)
+    (cause,) = diagnose(plant, recording, settings=Settings(("leak", "pump_gain"))).causes
+    hole = leak_pipe(plant, "T1")
+    speed = math.sqrt(2.0 * plant.gravity * float(recording.outputs[:, 0].mean()))
+    assert cause.flow == pytest.approx(0.2 * hole.discharge_coefficient * hole.area * speed, rel=0.05)
+    gain = recorded({"Q2.pump_gain.factor": 1.12}, 62)
+    (cause,) = diagnose(plant, gain, settings=Settings(("leak", "pump_gain"))).causes
+    assert cause.effect == "pump_gain" and cause.flow is None
 
 
 def test_two_causes_are_named_together() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -10,8 +12,10 @@ from fdi_torch.cli.gap_text import next_steps, show
 from fdi_torch.cli.screen import Screen
 from fdi_torch.gap.answer import Amount, Answer, Cause, ProbableExplanation, adopted
 from fdi_torch.gap.verdict_words import causes_of, probability_words, verdict_sentence
+from fdi_torch.jobs.python_results import GapResult
 from fdi_torch.quantities import displayed_in
 from fdi_torch.report.reference_models import flows_that_matter
+from fdi_torch.report.sections.gap import _cause_rows
 from tests.test_gap import nominal_plant
 
 LEAK = Cause("leak", "T1", {"size": Amount(0.2, 0.01, "1")})
@@ -200,3 +204,16 @@ def test_rounded_readings_are_no_fault_and_are_told_in_the_unit_of_the_sensor(
             "No gap: the plant file explains the recording within rounding, noise and tolerances, probability 99.0 %. "
             "Readings are rounded, which is no fault: h1 to 1 %."
         )
+
+
+def test_the_flow_of_a_leak_stands_beside_its_size(capsys: pytest.CaptureFixture[str]) -> None:
+    """On the terminal, in Python, in the JSON and on the page, in the user's units."""
+    answer = replace(BOTH, causes=[replace(LEAK, flow=25e-6)])
+    with displayed_in({"m^3/s": "l/min"}):
+        show(answer, nominal_plant(), [], Screen())
+        assert re.search(r"leak +T1 +flow at mean levels +1.5 +l/min", capsys.readouterr().out)
+        page_rows = _cause_rows(answer.to_dict()["causes"][0])
+    assert page_rows[-1] == ["leak", "T1", "flow at mean levels", "1.5", "l/min"]
+    rows = GapResult(answer, nominal_plant(), Path("gap.mcap")).table().columns
+    assert rows["parameter"] == ["size", "flow at mean levels"] and rows["value"][1] == pytest.approx(25.0)
+    assert answer.to_dict()["causes"][0]["flow"] == 25e-6 and "flow" not in BOTH.to_dict()["causes"][0]

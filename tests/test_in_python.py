@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import doctest
 import re
+import traceback
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -326,6 +328,57 @@ def test_arguments_of_another_kind_are_named() -> None:
         fdi_torch.monitor({"plant": RIG, "recording": simulated()})
 
 
+def refused_calls() -> dict[str, Callable[[], Any]]:
+    """Mistakes that are noticed far inside: by YAML, by pydantic, by the readers of units, files and logs."""
+    unfinished, without_q, no_reading = Path("unfinished.yaml"), Path("without_q.csv"), Path("no_reading.csv")
+    unfinished.write_text("plant: three_tank\nsimulate: {inputs: [")
+    without_q.write_text("t_s,h_m,pB_mbar\n0,0.1,2\n1,0.1,2\n")
+    no_reading.write_text("t_s,Q_V,h_m,pB_mbar\n0,1,0.1,x\n1,1,0.1,2\n")
+    train, estimate = fdi_torch.train, {"parameters": ["A.leak"]}
+    return {
+        "YAML": lambda: fdi_torch.load_run("unfinished.yaml"),
+        "a plant": lambda: fdi_torch.load_plant("three_tnk"),
+        "no file": lambda: train({"plant": RIG, "recordings": ["none.csv"], "estimate": estimate}),
+        "a column": lambda: train({"plant": RIG, "recordings": ["without_q.csv"], "estimate": estimate}),
+        "a cell": lambda: fdi_torch.gap(RIG, "no_reading.csv"),
+        "a parameter": lambda: train(
+            {"plant": RIG, "simulate": {"duration": "3 s"}, "estimate": {"parameters": ["A.lek"]}}
+        ),
+        "a unit": lambda: fdi_torch.simulate(RIG, inputs={"Q": "3 bananas"}, duration="10 s"),
+        "a dimension": lambda: fdi_torch.simulate(RIG, inputs={"Q": "3 cm"}, duration="10 s"),
+        "a key": lambda: fdi_torch.monitor({"plant": RIG, "recordng": simulated()}),
+        "a plant's quantity": lambda: Tank("A", area="3 cm", height="1 m"),
+        "a log": lambda: fdi_torch.read_run("none.mcap"),
+    }
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        "YAML",
+        "a plant",
+        "no file",
+        "a column",
+        "a cell",
+        "a parameter",
+        "a unit",
+        "a dimension",
+        "a key",
+        "a plant's quantity",
+        "a log",
+    ],
+)
+def test_the_traceback_of_a_mistake_shows_its_message_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    """Not the errors of YAML, pydantic and pint from which the message was made."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises((ValueError, OSError)) as refused:
+        refused_calls()[what]()
+    shown = "".join(traceback.format_exception(refused.value))
+    assert shown.count("Traceback (most recent call last)") == 1, shown
+
+
 def test_one_recording_and_one_effect_need_no_list(tmp_path: Path) -> None:
     blank, estimate = simulated(), {"parameters": ["A.leak"]}
     run = build_run({"plant": RIG, "recordings": blank, "estimate": estimate}, tmp_path, "train")
@@ -373,6 +426,32 @@ def test_an_initial_level_that_is_free_needs_no_mention() -> None:
 def test_the_catalogue_takes_the_name_of_a_plant() -> None:
     assert fdi_torch.effects("three_tank").headline == fdi_torch.effects(fdi_torch.load_plant("three_tank")).headline
     assert len(fdi_torch.effects()) > len(fdi_torch.effects("three_tank"))
+
+
+def test_every_function_takes_a_plant_or_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("rig.yaml").write_text(fdi_torch.dump_plant(RIG))
+    fdi_torch.write_csv(simulated(), Path("run.csv"))
+    named = fdi_torch.set_up("rig.yaml", "run.csv", ["A.leak"])
+    itself = fdi_torch.set_up(RIG, simulated(), ["A.leak"])
+    theta = itself.space.nominal()[None]
+    assert named.space.names == itself.space.names
+    assert torch.equal(named.engines(1.0)[0].readings(theta), itself.engines(1.0)[0].readings(theta))
+    constants = fdi_torch.build_network("three_tank").constants.names
+    assert constants == fdi_torch.build_network(fdi_torch.load_plant("three_tank")).constants.names
+    assert fdi_torch.dump_plant("three_tank") == fdi_torch.dump_plant(fdi_torch.load_plant("three_tank"))
+    wrong: Any = 3
+    for call in (
+        lambda: fdi_torch.set_up(wrong, simulated(), []),
+        lambda: fdi_torch.build_network(wrong),
+        lambda: fdi_torch.dump_plant(wrong),
+        lambda: fdi_torch.read_recording("run.csv", wrong),
+        lambda: fdi_torch.export_fmu(wrong, "rig.fmu"),
+        lambda: fdi_torch.gap(wrong, simulated()),
+        lambda: fdi_torch.effects(wrong),
+    ):
+        with pytest.raises(TypeError, match="plant: expected a Plant or the name of a plant file, got a int"):
+            call()
 
 
 def test_the_beginning_of_one_of_several_recordings_has_its_own_start_level() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 import urllib.request
 from pathlib import Path
@@ -14,6 +15,7 @@ from test_live_mqtt import Rig, source
 from test_monitor_follow import FAULT, SAMPLES, config, monitored, written
 
 from fdi_torch.cli import main
+from fdi_torch.live.metrics import Metrics
 
 
 def test_events_are_published_and_the_state_is_retained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -63,6 +65,14 @@ def test_metrics_follow_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert float(lines['fdi_input{channel="Q1"}']) == pytest.approx(50e-6)
     assert 'fdi_reading{channel="h3"}' in lines and 'fdi_residual{channel="h3"}' in lines
     assert float(lines['fdi_detector{quantity="threshold"}']) > 0.0
+
+
+def test_metrics_have_no_values_before_the_first_sample() -> None:
+    """Nor numbers that could be taken for one: no time, reading, statistic or fault, and counters at 0."""
+    library = pytest.importorskip("prometheus_client")
+    samples = {s.name: s.value for family in Metrics(library).registry.collect() for s in family.samples}
+    assert math.isnan(samples.pop("fdi_plant_time_seconds"))
+    assert {name: value for name, value in samples.items() if not name.endswith("_created")} == {"fdi_samples_total": 0}
 
 
 @pytest.mark.parametrize(

@@ -70,7 +70,10 @@ def test_an_input_is_not_held_over_rows_that_are_missing(plant: PlantDescription
     assert len(whole.known_segments()) == 1
     (warning,) = data_warnings(whole, plant)
     assert warning.startswith("Q: changes in the gap after 2 s, at an unknown time")
-    assert warning.endswith("unless the recording is cut there: columns: {Q: {held: 3 s}}")
+    assert warning.endswith(
+        "unless the recording is cut there: by columns: {Q: {held: 3 s}} if it is recorded "
+        "at every sample, by stop and start of two entries if it is recorded on change"
+    )
     (tmp_path / "flow.csv").write_text("t_s,Q_l_min\n0,60\n5,30\n11,30\n")
     levels = "\n".join(",".join(cell for k, cell in enumerate(row.split(",")) if k != 1) for row in text.split())
     assert not data_warnings(read(plant, tmp_path, levels, also=["flow.csv"]), plant)  # it says when
@@ -218,9 +221,24 @@ def test_empty_cells_of_inputs_without_held_are_told_once_with_the_fix(plant: Pl
     recording = read(plant, tmp_path, "t_s,Q_l_min,V_pct,h_mm\n" + rows)
     [found] = [f for f in check_recording(recording, plant).findings if f.kind == "unknown"]
     assert "unknown at 20 of 40 samples, in 20 stretches" in found.text
-    assert "columns: {Q: {held: 2 s}}" in found.text
-    with pytest.raises(ConfigError, match=r"unknown are Q at 0.5 of the samples; .* columns: \{Q: \{held: 10 s\}\}"):
+    assert "columns: {Q: {held: 6 s}}" in found.text
+    with pytest.raises(
+        ConfigError, match=r"unknown are Q at 0.5 of the samples; .* columns: \{Q: \{held: 10 s\}\}, or held: always"
+    ):
         load_recordings([RecordingConfig(file="run.csv")], plant, tmp_path)
+
+
+def test_a_command_recorded_on_change_is_proposed_to_hold_until_the_next(
+    plant: PlantDescription, tmp_path: Path
+) -> None:
+    """Not for a time, which would cut the recording wherever the command rests longer. The proposal cuts nothing."""
+    changes = {0: 60, 3: 30, 4: 60, 15: 50, 17: 20, 30: 40, 31: 60, 60: 30}
+    text = "t_s,Q_l_min,V_pct,h_mm\n" + "".join(f"{k},{changes.get(k, '')},50,{500 + k % 7}\n" for k in range(80))
+    [found] = [f for f in check_recording(read(plant, tmp_path, text), plant).findings if f.kind == "unknown"]
+    assert found.text.endswith(
+        "as of a command that is recorded on change; if it is, each holds until the next: columns: {Q: {held: always}}"
+    )
+    assert len(read(plant, tmp_path, text, columns={"Q": {"held": "always"}}).known_segments()) == 1
 
 
 def test_held_inputs_are_followed_as_rows_come(tmp_path: Path) -> None:

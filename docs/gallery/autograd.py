@@ -10,7 +10,7 @@ truth = {"T1.leak": 0.15, "P13.plugging": 0.3}
 steps = {"steps": [["0 s", "50 cm^3/s"], ["200 s", "70 cm^3/s"], ["400 s", "40 cm^3/s"]]}
 noise = {"std": {"h1": "1 mm", "h2": "1 mm", "h3": "1 mm"}}
 recording = fdi_torch.simulate(inputs={"Q1": steps, "Q2": "50 cm^3/s"}, duration="600 s", noise=noise, faults=truth)
-fitting = fdi_torch.set_up(fdi_torch.load_plant("three_tank"), [recording], names, start="equilibrium")
+fitting = fdi_torch.set_up("three_tank", [recording], names, start="equilibrium")
 engine = fitting.engines(step=1.0)[0]
 
 

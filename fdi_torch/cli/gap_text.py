@@ -11,6 +11,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.clock import clock_unit
 from fdi_torch.gap.answer import UNKNOWN, Answer
 from fdi_torch.gap.verdict_words import (
+    MEAN_FLOW,
     cause_words,
     causes_of,
     closed_sentence,
@@ -23,7 +24,7 @@ from fdi_torch.gap.verdict_words import (
 from fdi_torch.names import listed
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.quantities import display_unit
+from fdi_torch.quantities import display_unit, significant
 from fdi_torch.report.reference_models import flows_that_matter, has_causes, reference_models
 
 MOST_ROWS = 5
@@ -124,6 +125,9 @@ def _causes(answer: Answer, screen: Screen) -> None:
             numbers = [rounded(scale * value, scale * amount.std) for value in (amount.value, amount.std)]
             row = [cause.effect, cause.location, name, *numbers, clock_unit(unit, name, amount.value)]
             rows += [] if rounds(cause.effect) else [row]
+        if cause.flow is not None:
+            unit, scale = display_unit("m^3/s")
+            rows.append([cause.effect, cause.location, MEAN_FLOW, significant(scale * cause.flow, 3), "", unit])
     if rows:
         screen.table("causes", ("effect", "at", "parameter", "value", "std error", "unit"), rows, left=3)
 

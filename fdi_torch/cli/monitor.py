@@ -108,7 +108,7 @@ def _publisher(url: str) -> Iterator[Publish]:
     try:
         publisher = EventPublisher(address_of(url, ("mqtt", "mqtts")))
     except ValueError as error:
-        raise ValueError(f"--publish: {error}") from error
+        raise ValueError(f"--publish: {error}") from None
     with publisher:
         yield publisher.publish
 

@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         runs[own_name] = prediction.readings
         columns = [sensor.column for sensor in plant.sensors]
         title = misfits[-1].headline(f"free run along {Path(recording.source).name}")
-        screen.note(f"picture: {save(fit_figure(recording, runs, title, columns), Path(arguments.picture))}")
+        screen.note(f"picture: {save(fit_figure(recording, runs, title, plant, columns), Path(arguments.picture))}")
     results = [_result(plant, *run, misfit, arguments) for run, misfit in zip(predictions, misfits, strict=True)]
     several = {"format": "fdi_torch.predictions/1", "runs": results}
     screen.result((results[0] if len(results) == 1 else several) | {"doubts": doubts})

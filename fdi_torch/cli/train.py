@@ -84,7 +84,7 @@ def show(done: TrainResult, screen: Screen) -> None:
     for line in in_words(done):
         screen.say(line)
     show_uncertainty(done, screen)
-    sensors = done.fitting.recordings[0].output_names
+    sensors = [done.fitting.plant.channel_words(c) for c in done.fitting.recordings[0].output_names]
     rho = ", ".join(f"{n} {float(r):.6f}" for n, r in zip(sensors, done.result.correlation, strict=True))
     search, refinement = done.result.steps
     screen.say(f"correlation of readings and model: {rho}")

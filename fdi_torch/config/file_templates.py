@@ -209,11 +209,11 @@ def plant_from_recording(path: Path, name: str) -> str:
     """
     try:
         header = read_header(path)
-    except HeaderlessError as error:
+    except HeaderlessError:
         raise ValueError(
             f"{path}: expected a header with names and units, got numbers; describe the plant with fdi new plant, then "
             f"let fdi new run --plant FILE --recording {path} number the columns"
-        ) from error
+        ) from None
     clock = bind_clock(path, header, ClockSource()).header
     named = [column for column in header if column != clock]
     columns = _columns(path, [column for column in named if header_unit(column)])

@@ -61,7 +61,7 @@ def growing_rows(
         is_log = ".mcap" in path.suffixes
         rows = _mcap_rows(path, plant, mapping, idle) if is_log else _csv_rows(path, plant, mapping, idle, began)
     except (ValueError, LogError) as error:
-        raise ConfigError([str(error)]) from error
+        raise ConfigError([str(error)]) from None
     return _between(rows, start, stop)
 
 
@@ -72,7 +72,7 @@ def _between(rows: Iterator[Row | str], start: float, stop: float) -> Iterator[R
             if isinstance(row, str) or start <= row[0] <= stop:
                 yield row
     except (ValueError, LogError) as error:
-        raise ConfigError([str(error)]) from error
+        raise ConfigError([str(error)]) from None
 
 
 def _find(name: str, base: Path) -> Path:

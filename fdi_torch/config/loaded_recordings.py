@@ -20,7 +20,7 @@ from fdi_torch.config.channels import (
     unrecorded_valves,
     without_column,
 )
-from fdi_torch.config.plant_file import chosen_plant
+from fdi_torch.config.plant_file import AnyPlant, chosen_plant, given_plant
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.recording_config import (
     ColumnConfig,
@@ -82,7 +82,10 @@ def _unknown(whole: Recording) -> str:
     unknown_shares = {name: share for name, share in zip(whole.input_names, shares, strict=True) if share > 0.0}
     listing = ", ".join(f"{name} at {share:.3g} of the samples" for name, share in unknown_shares.items())
     partly_known = next((name for name, share in unknown_shares.items() if share < 1.0), "")
-    fix = f"if an input keeps its value over empty cells, give the time: columns: {{{partly_known}: {{held: 10 s}}}}"
+    fix = (
+        f"if an input keeps its value over empty cells, give the time: columns: {{{partly_known}: {{held: 10 s}}}}, or "
+        "held: always for one that is recorded on change"
+    )
     return f"unknown are {listing}; " + (f"{fix}, or {GIVE_A_CONSTANT}" if partly_known else GIVE_A_CONSTANT)
 
 
@@ -144,7 +147,7 @@ def separate_recordings(recordings: Sequence[Any]) -> tuple[list[Any], dict[str,
 
 def read_recording(
     config: RecordingConfig | Mapping[str, Any] | str | Path,
-    plant: PlantDescription | str | Path,
+    plant: AnyPlant,
     base: Path | None = None,
     given: Mapping[str, Recording] | None = None,
 ) -> Recording:
@@ -158,8 +161,7 @@ def read_recording(
     """
     if not isinstance(config, RecordingConfig):
         config = config_of(config)
-    if isinstance(plant, str | Path):
-        plant = chosen_plant(plant)
+    plant = chosen_plant(plant) if isinstance(plant, str | Path) else given_plant(plant)
     channels, columns = plant.channels(), plant.outputs()
     in_memory = (given or {}).get(config.file)
     folder = base or Path.cwd()
@@ -180,10 +182,10 @@ def read_recording(
         display_also_in(recording.written)
         return replace(selected, trusted=config.trusted or selected.trusted)
     except (ValueError, LogError) as error:
-        raise ConfigError([str(error)]) from error
+        raise ConfigError([str(error)]) from None
 
 
-def read_frame(frame: Any, plant: PlantDescription | str | Path, **keys: Any) -> Recording:
+def read_frame(frame: Any, plant: AnyPlant, **keys: Any) -> Recording:
     """The plant's inputs and outputs in a pandas.DataFrame, by the rules of CSV files.
 
     Columns have headers as in a CSV file (`h1_cm`, `h1 [cm]`), or the names of the plant's channels with their units in

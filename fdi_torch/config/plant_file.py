@@ -21,10 +21,21 @@ from fdi_torch.effects import units_for_display
 from fdi_torch.names import unknown
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.components import Component
-from fdi_torch.plant.description import FLOW_KINDS, READING_UNITS, FaultPriority, PlacedEffect, Sensor, Tank
+from fdi_torch.plant.description import (
+    FLOW_KINDS,
+    READING_UNITS,
+    FaultPriority,
+    PlacedEffect,
+    PlantDescription,
+    Sensor,
+    Tank,
+)
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.quantities import SI_UNITS, display_in, unit_factor
 from fdi_torch.untrusted_input import MOST_COMPONENTS
+
+AnyPlant = PlantDescription | str | Path
+"""A plant, or the name of its file, or of a shipped one."""
 
 
 def component_sections(base: type[Strict]) -> type[Strict]:
@@ -124,6 +135,15 @@ def load_plant(name: str | Path, base: Path | None = None) -> Plant:
     data = read_yaml(path)
     expect_kind(data, "plant", path)
     return build_plant({"name": path.stem, **data}, str(path))
+
+
+def given_plant(plant: AnyPlant) -> PlantDescription:
+    """The plant itself, or that of a file or of a shipped name. Raises ConfigError, and TypeError for another type."""
+    if isinstance(plant, str | Path):
+        return load_plant(plant)
+    if not isinstance(plant, PlantDescription):
+        raise TypeError(f"plant: expected a Plant or the name of a plant file, got a {type(plant).__name__}")
+    return plant
 
 
 def chosen_plant(name: str | Path) -> Plant:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fdi_torch.config.plant_file import written_fields
+from fdi_torch.config.plant_file import AnyPlant, given_plant, written_fields
 from fdi_torch.config.plant_in_code import absolute_units, effect_parameters
 from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import write_yaml
@@ -29,9 +29,9 @@ _UNITS = {
 """SI unit -> customary units, the usual one first."""
 
 
-def dump_plant(plant: PlantDescription) -> str:
-    """A plant file that reads back as the same description."""
-    return write_yaml(plant_mapping(plant))
+def dump_plant(plant: AnyPlant) -> str:
+    """The text of a plant file that reads back as the same plant, which is given itself or by its name."""
+    return write_yaml(plant_mapping(given_plant(plant)))
 
 
 def plant_mapping(plant: PlantDescription) -> dict[str, Any]:

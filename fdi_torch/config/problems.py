@@ -38,7 +38,7 @@ def naming(place: str) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise ConfigError([f"{place}: {error}"]) from error
+        raise ConfigError([f"{place}: {error}"]) from None
 
 
 @contextmanager
@@ -47,7 +47,7 @@ def naming_source(source: str) -> Iterator[None]:
     try:
         yield
     except ConfigError as error:
-        raise ConfigError([p if p.startswith(source) else f"{source}: {p}" for p in error.problems]) from error
+        raise ConfigError([p if p.startswith(source) else f"{source}: {p}" for p in error.problems]) from None
 
 
 def _path(location: tuple[int | str, ...]) -> str:

@@ -27,8 +27,8 @@ def _start_level(value: Any) -> StartLevel:
         return value
     try:
         return quantity(value, "m")
-    except ValueError as error:
-        raise ValueError(f"expected free, equilibrium or a level such as '50 cm', got {value!r}") from error
+    except ValueError:
+        raise ValueError(f"expected free, equilibrium or a level such as '50 cm', got {value!r}") from None
 
 
 def _start_levels(value: Any) -> Any:

@@ -101,7 +101,7 @@ def resolve(
     try:
         plant = plant_of(data.get("plant", model.model_fields["plant"].default), base, source)
     except ConfigError as error:  # errors within a plant file already name that file
-        raise ConfigError([f"{source}: {p}" if p.startswith("plant: ") else p for p in error.problems]) from error
+        raise ConfigError([f"{source}: {p}" if p.startswith("plant: ") else p for p in error.problems]) from None
     config = scaled_to_plant(config, time_scale(plant))
     display_in(units_for_display(plant))
     return config, plant, write_yaml({**data, "plant": plant_mapping(plant)})

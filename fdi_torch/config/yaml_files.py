@@ -59,7 +59,7 @@ def _values(text: bytes, source: str) -> Any:
         if getattr(error, "context", None) == "while scanning an alias" or "undefined alias" in problem:
             problem = 'text that begins with * needs quotes, as in "*.area": 3 %'
         sentence = problem if isinstance(error, _RejectedError) else f"not valid YAML: {problem}"
-        raise ConfigError([f"{source}: {line}{sentence}"]) from error
+        raise ConfigError([f"{source}: {line}{sentence}"]) from None
 
 
 def compose_yaml(text: str) -> yaml.Node:

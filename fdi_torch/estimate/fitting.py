@@ -153,7 +153,7 @@ def _step_control(step: float, recording: Recording, plant: PlantDescription) ->
         return StepControl.for_fixed_step(step, plant)
     except ValueError as error:
         span = float(recording.time[-1] - recording.time[0])
-        raise ValueError(f"{span / step:.3g} integration steps of {step:g} s through {span:g} s: {error}") from error
+        raise ValueError(f"{span / step:.3g} integration steps of {step:g} s through {span:g} s: {error}") from None
 
 
 def set_up(
@@ -171,8 +171,6 @@ def set_up(
     inputs), 'free' (estimated) or a level in m. The fit is computed on the device of the recordings.
     Raises ValueError for an unknown parameter or choice, and for a channel that is not recorded.
     """
-    if not isinstance(plant, PlantDescription):
-        raise TypeError(f"plant: expected a Plant, got {plant!r}; read a plant file by fdi_torch.load_plant")
     recordings = [recordings] if isinstance(recordings, Recording) else recordings
     requested = [full_name(p, plant) if isinstance(p, str) else p for p in parameters]
     names = [p if isinstance(p, str) else p.name for p in requested]

@@ -34,12 +34,15 @@ class Amount:
 
 @dataclass(frozen=True)
 class Cause:
-    """An effect at a place, with its parameters by short name, in SI. same_as: equivalent causes."""
+    """An effect at a place, with its parameters by short name, in SI. same_as: equivalent causes. flow: of an effect
+    that adds one, such as a leak, at the mean levels of the first recording, m^3/s.
+    """
 
     effect: str
     location: str
     parameters: Mapping[str, Amount] = field(default_factory=dict)
     same_as: tuple[CauseName, ...] = ()
+    flow: float | None = None
 
 
 @dataclass(frozen=True)
@@ -174,4 +177,5 @@ def names(causes: Iterable[CauseName]) -> list[dict[str, str]]:
 def _cause(cause: Cause) -> dict[str, Any]:
     parameters = {n: asdict(a) for n, a in cause.parameters.items()}
     named: dict[str, Any] = {"effect": cause.effect, "location": cause.location, "parameters": parameters}
+    named |= {} if cause.flow is None else {"flow": cause.flow}
     return named | ({"same_as": names(cause.same_as)} if cause.same_as else {})

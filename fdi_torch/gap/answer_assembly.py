@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.diagnosis import fault_flow
 from fdi_torch.gap.answer import UNKNOWN, Amount, Answer, Cause, CauseName, ProbableExplanation, names
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter, covariance, standard_errors
@@ -31,7 +32,7 @@ from fdi_torch.gap.model_comparison import (
 from fdi_torch.gap.remarks import remarks_on
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.effect import Placement, Stage
 
 MOST_EXPLANATIONS = 12
 
@@ -149,7 +150,7 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
     for p in placements:
         amounts = _amounts(fitter, fit, p, stds)
         others = equivalence_class(p.cause, plant, fit.values) - {p.cause}
-        causes.append(Cause(*p.cause, amounts, tuple(sorted(others))))
+        causes.append(Cause(*p.cause, amounts, tuple(sorted(others)), _flow(fitter, fit, p, amounts)))
     if result.posterior.best.unknown_at:
         causes.append(Cause(UNKNOWN, result.posterior.best.unknown_at))
     steps = dict(zip((s.name for s in plant.sensors), result.quantization_steps, strict=True))
@@ -178,6 +179,23 @@ def _amounts(fitter: Fitter, fit: Fit, placement: Placement, stds: Mapping[str, 
         fitted = {**fitted, size: fit.space[size].nominal + growth * left, ramp: left}
         stds = {**stds, **dict(zip((size, ramp), torch.sqrt(variance).tolist(), strict=True))}
     return {ParameterName.parse(n).field: Amount(value, stds[n], fit.space[n].unit) for n, value in fitted.items()}
+
+
+def _flow(fitter: Fitter, fit: Fit, placement: Placement, amounts: Mapping[str, Amount]) -> float | None:
+    """The flow that an effect adds at the mean levels and inputs of the first recording, m^3/s; None if it adds none or
+    if its size is a flow.
+    """
+    size = placement.effect.parameters(placement.location, fitter.data.plant)[0]
+    if placement.effect.stage is not Stage.BALANCE or placement.effect.states or size.unit == "m^3/s":
+        return None
+    plant, recording, nodes = fitter.data.plant, fitter.data.recording, fitter.data.experiment.nodes
+    path = fit.linearised.levels[0, : len(nodes), : len(plant.tanks)]
+    levels = torch.trapezoid(path, nodes, dim=0) / (nodes[-1] - nodes[0])
+    inputs = recording.inputs[:, recording.input_columns(plant.channels())].mean(dim=0)
+    which, theta = fit.space.index(placement.full_name(size.name)), fit.theta.clone()
+    theta[which] = amounts[size.name].value
+    flow, _ = fault_flow(fitter.network(fit.candidate.placements), fit.space, theta, which, levels, inputs)
+    return flow or None
 
 
 def _amounts_from_readings(placement: Placement, plant: PlantDescription) -> dict[str, Amount]:

@@ -17,6 +17,8 @@ from fdi_torch.quantities import quantity_text
 
 FORMAT_1 = "fdi_torch.gap/1"
 Named = Mapping[str, Any]
+MEAN_FLOW = "flow at mean levels"
+"""The flow of a cause in tables, beside its parameters."""
 
 
 def causes_of(explanation: Named) -> list[Named]:

@@ -13,7 +13,7 @@ from typing import Any
 
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings, read_recording
 from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monitor
-from fdi_torch.config.plant_file import chosen_plant
+from fdi_torch.config.plant_file import AnyPlant, given_plant
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.study_file import Study, build_study, load_study
 from fdi_torch.effects import units_for_display
@@ -39,7 +39,6 @@ from fdi_torch.quantities import display_in
 from fdi_torch.recording import Recording
 
 Tell = Callable[[float, str], None]
-AnyPlant = PlantDescription | str | Path
 AnyRecording = Recording | Mapping[str, Any] | str | Path
 AnyRun = Run | Mapping[str, Any] | str | Path
 
@@ -116,8 +115,9 @@ def train(
     """Estimate fault sizes and their uncertainty from recordings, as `fdi train` does, with a log and pictures.
 
     run: a run file, or a mapping such as {"plant": plant, "recordings": [recording],
-    "estimate": {"parameters": ["T1.leak"]}}; None: the built-in example. tell(share, text): progress. resume: continue
-    a killed run of the same file. listener: receives every log message.
+    "estimate": {"parameters": ["T1.leak"]}}; None: the built-in example. resume: continue a killed run of the same
+    file. listener: receives every log message. tell(share, text): receives the progress, from 0 to 1, and a line about
+    it; by default nothing is shown, and tell=print prints it.
     """
     return train_job.train(_run_of(run, "train"), tell, resume, listener)
 
@@ -135,7 +135,9 @@ def gap(
 
     plant, recordings: without recordings, plant is a run: its file or its keys, as of `train`.
     holdouts: recordings on which the corrected model is validated. out: folder of the log. settings: library, leave_out
-    (names of effects), step (s), most, named_only, as the options of `fdi gap`. Raises ValueError for other settings.
+    (names of effects), step (s), most, named_only, as the options of `fdi gap`. tell(share, text): receives the
+    progress, from 0 to 1, and a line about it; by default nothing is shown, and tell=print prints it. Raises ValueError
+    for other settings.
     """
     valid_settings = [field.name for field in fields(Settings)]
     for name in settings:  # first, because without recordings the plant counts as a run
@@ -158,7 +160,8 @@ def monitor(
     """Run a monitor along a recording, as `fdi monitor` does.
 
     run: a monitor file, or a mapping such as {"plant": plant, "recording": recording, "fault_free": ["0 s", "300 s"]}.
-    tell(share, text): progress; share is None along a live source.
+    tell(share, text): receives the progress, from 0 to 1 (None along a live source), and a line about it; by default
+    nothing is shown, and tell=print prints it.
     """
     if isinstance(run, str | Path):
         run = load_monitor(run)
@@ -226,7 +229,8 @@ def study(
     """Repeat an experiment many times and compare the estimates with their bounds, as `fdi study` does.
 
     study: a study file, or the same as a mapping. resume: continue a killed run. cluster: address of a Dask scheduler,
-    or 'local'.
+    or 'local'. tell(share, text): receives the progress, from 0 to 1, and a line about it; by default nothing is shown,
+    and tell=print prints it.
     """
     if isinstance(study, str | Path):
         study = load_study(study)
@@ -245,12 +249,9 @@ def effects(plant: AnyPlant | None = None) -> Catalogue:
 
 def plant_of(plant: AnyPlant) -> PlantDescription:
     """The plant itself, or the plant of a file or of a shipped name; its units are those for display."""
-    if isinstance(plant, str | Path):
-        return chosen_plant(plant)
-    if not isinstance(plant, PlantDescription):
-        raise TypeError(f"plant: expected a Plant or the name of a plant file, got a {type(plant).__name__}")
-    display_in(units_for_display(plant))
-    return plant
+    given = given_plant(plant)
+    display_in(units_for_display(given))
+    return given
 
 
 def recordings_of(wanted: AnyRecording | Sequence[AnyRecording], plant: PlantDescription) -> list[Recording]:

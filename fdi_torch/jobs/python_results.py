@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from fdi_torch.estimate.misfit import Misfit, misfit_of
 from fdi_torch.gap.answer import Answer, adopted
 from fdi_torch.gap.free_runs.prediction import Prediction
 from fdi_torch.gap.free_runs.refit import Refit, narrowed
-from fdi_torch.gap.verdict_words import explanation_words, verdict_sentence
+from fdi_torch.gap.verdict_words import MEAN_FLOW, explanation_words, verdict_sentence
 from fdi_torch.logbook import read_run
 from fdi_torch.monitor.events import Event
 from fdi_torch.parameters import ParameterName
@@ -52,6 +53,9 @@ class GapResult(Shown):
                 full = str(ParameterName(cause.location, cause.effect, name))
                 unit, value, std = in_display_unit(full, a.unit, a.value, a.std)
                 rows.append((effect_words(cause.effect, cause.location), name, value, std, unit))
+            if cause.flow is not None:
+                unit, flow = in_display_unit("", "m^3/s", cause.flow)
+                rows.append((effect_words(cause.effect, cause.location), MEAN_FLOW, flow, math.nan, unit))
         return (
             Table.of_rows(("cause", "parameter", "value", "std error", "unit"), rows) if rows else self.explanations()
         )
@@ -148,7 +152,7 @@ class FreeRun(Shown):
     def picture(self) -> str:
         """Measured and predicted readings, as SVG."""
         predictions = {self.plant.name: self.prediction.readings}
-        figure = fit_figure(self.recording, predictions, self.title, self.plant.outputs())
+        figure = fit_figure(self.recording, predictions, self.title, self.plant, self.plant.outputs())
         return notebook_svg(figure, "free-run", self.title)
 
     def to_xarray(self) -> Any:

@@ -79,7 +79,9 @@ class TrainResult(Shown):
     @in_its_units
     def picture(self) -> str:
         """Readings and fit of the first recording, as SVG."""
-        figure = fit_figure(self.fitting.recordings[0], {"estimate": self.result.predicted[0]}, self.headline)
+        figure = fit_figure(
+            self.fitting.recordings[0], {"estimate": self.result.predicted[0]}, self.headline, self.fitting.plant
+        )
         return notebook_svg(figure, self.log.stem, self.headline)
 
     @in_its_units
@@ -238,6 +240,6 @@ def draw(run: Run, fitting: Fitting, result: HybridResult, log: Path) -> tuple[P
     paths = []
     for k, (recording, predicted) in enumerate(zip(fitting.recordings, result.predicted, strict=True)):
         suffix = "" if len(fitting.recordings) == 1 else f"_{k + 1}"
-        figure = fit_figure(recording, {"estimate": predicted}, f"{run.name}: {result.diagnosis.headline}")
+        figure = fit_figure(recording, {"estimate": predicted}, f"{run.name}: {result.diagnosis.headline}", run.plant)
         paths.append(save(figure, log.with_name(f"{log.stem}{suffix}.png")))
     return tuple(paths)

@@ -30,7 +30,8 @@ class Metrics:
 
         self._samples = counter("samples", "samples processed")
         self._events = counter("events", "events of the monitor", "kind")
-        self._time = gauge("plant_time_seconds", "time of the last sample")
+        self._time = gauge("plant_time_seconds", "time of the last sample; NaN before the first")
+        self._time.set(float("nan"))  # a gauge without labels begins at 0, which would be a time
         self._inputs = gauge("input", "inputs of the plant, SI", "channel")
         self._readings = gauge("reading", "readings of the sensors, SI", "channel")
         self._residuals = gauge("residual", "reading less output of the observer, SI", "channel")
@@ -97,7 +98,7 @@ def serve_metrics(host: str = "127.0.0.1", port: int = PORT) -> Iterator[Metrics
     except OSError as error:
         raise ValueError(
             f"--metrics: expected a free address, got {host}:{port} ({error}); name another port"
-        ) from error
+        ) from None
     metrics.port = server.server_port
     try:
         yield metrics

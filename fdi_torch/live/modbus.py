@@ -106,7 +106,7 @@ class ModbusSource:
             self._poll()  # a device that answers nothing useful is refused at once
         except (ConnectionError, ValueError) as error:
             self._client.close()
-            raise ValueError(f"expected a Modbus device with these registers at {self._place}, got: {error}") from error
+            raise ValueError(f"expected a Modbus device with these registers at {self._place}, got: {error}") from None
 
     def read(self, timeout: float) -> list[Item]:
         wait = self._due - time.monotonic()
@@ -156,7 +156,7 @@ class ModbusSource:
         try:
             answer = getattr(self._client, TABLES[table])(first, count=count, device_id=self._device)
         except errors.ModbusException as error:
-            raise ConnectionError(str(error)) from error
+            raise ConnectionError(str(error)) from None
         if answer.isError():
             raise ValueError(f"{table}:{first} to {first + count - 1}: {answer}")
         return list(answer.bits[:count] if table in ("coil", "discrete") else answer.registers)

@@ -72,7 +72,7 @@ class MqttClient:
         try:
             self._client.connect(address.host, address.port, keepalive=KEEPALIVE)
         except OSError as error:
-            raise ValueError(f"expected an MQTT broker at {self._place}, got none ({error}); start it") from error
+            raise ValueError(f"expected an MQTT broker at {self._place}, got none ({error}); start it") from None
         self._client.loop_start()
         if self._answered.wait(WAIT) and not self._refusal:
             return

@@ -144,7 +144,7 @@ class OpcUaSource:
             try:
                 await node.read_data_value()
             except ua.UaError as error:
-                raise ValueError(f"{tag}: {_text(error)}") from error
+                raise ValueError(f"{tag}: {_text(error)}") from None
         self._subscription = await client.create_subscription(1000.0 * self._publish, self)
         every_time = ua.DataChangeFilter(Trigger=ua.DataChangeTrigger.StatusValueTimestamp)
         monitored = []

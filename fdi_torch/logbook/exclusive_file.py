@@ -25,7 +25,7 @@ class ExclusiveFile:
         except FileExistsError:
             raise LogError(_taken(path)) from None
         except OSError as error:
-            raise log_error(path, error) from error
+            raise log_error(path, error) from None
 
     def write(self, data: bytes) -> None:
         self.expect_alive()
@@ -36,7 +36,7 @@ class ExclusiveFile:
                 remaining, self.size = remaining[count:], self.size + count
         except OSError as error:
             self.dead = log_error(self.path, error)
-            raise self.dead from error
+            raise self.dead from None
 
     def expect_alive(self) -> None:
         if self.dead is not None:
@@ -47,7 +47,7 @@ class ExclusiveFile:
         try:
             os.fsync(self._file)
         except OSError as error:
-            raise log_error(self.path, error) from error
+            raise log_error(self.path, error) from None
 
     def close(self) -> None:
         os.close(self._file)

@@ -56,7 +56,7 @@ def export_attachment(run: Run, name: str, folder: str | Path) -> Path:
     except LogError:
         raise
     except OSError as error:
-        raise log_error(target, error) from error
+        raise log_error(target, error) from None
     return target
 
 
@@ -110,7 +110,7 @@ def _loaded(run: Run, message: Message) -> Any:
     try:
         return orjson.loads(message.data)
     except ValueError as error:
-        raise LogError(f"{run.path}: a message on {message.topic} is no JSON ({error})") from error
+        raise LogError(f"{run.path}: a message on {message.topic} is no JSON ({error})") from None
 
 
 def _header(name: str, unit: str) -> str:

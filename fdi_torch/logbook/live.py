@@ -91,7 +91,7 @@ def serve(name: str, host: str = "127.0.0.1", port: int = PORT) -> Iterator[Live
             message_backlog_size=BACKLOG,
         )
     except (RuntimeError, OverflowError, TypeError) as error:
-        raise ValueError(f"--live: expected a free address, got {host}:{port} ({error}); name another port") from error
+        raise ValueError(f"--live: expected a free address, got {host}:{port} ({error}); name another port") from None
     live.address = f"ws://{host}:{server.port}"
     try:
         yield live

@@ -53,7 +53,7 @@ class Message:
         try:
             return conforming(self.topic, self.channel.schema_name, decode(self.data))
         except ValueError as error:
-            raise LogError(f"{self.topic}: a message is not a JSON object ({error})") from error
+            raise LogError(f"{self.topic}: a message is not a JSON object ({error})") from None
 
     @property
     def t(self) -> float:
@@ -166,7 +166,7 @@ class Run:
             damage = scan.Damage(part.start, part.end, str(error))
             self.damages.append(damage)
             if not self.salvage:
-                raise self._damaged(damage) from error
+                raise self._damaged(damage) from None
             return []
 
     def _summary_records(self) -> Iterator[Schema | ChannelRecord]:
@@ -260,7 +260,7 @@ def map_file(path: Path) -> Any:
     except ValueError:
         raise LogError(f"{path}: the file is empty; the run was killed before it wrote anything") from None
     except OSError as error:
-        raise log_error(path, error) from error
+        raise log_error(path, error) from None
     return data
 
 

@@ -137,7 +137,7 @@ def set_aside(path: str | Path) -> Path | None:
     except BlockingIOError:
         raise LogError(f"{partial}: another run is writing this file; wait for it, or stop it") from None
     except OSError as error:
-        raise log_error(partial, error) from error
+        raise log_error(partial, error) from None
     return target
 
 

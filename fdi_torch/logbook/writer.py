@@ -120,7 +120,7 @@ class RunLog(Topics):
         try:
             os.replace(self.partial_path, self.path)
         except OSError as error:
-            raise log_error(self.path, error) from error
+            raise log_error(self.path, error) from None
 
     def _say_what_is_kept(self, error: BaseException) -> None:
         kept = self.path if self.path.exists() else self.partial_path
@@ -230,7 +230,7 @@ def _expect_free(path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         taken = path.exists()
     except OSError as error:
-        raise log_error(path, error) from error
+        raise log_error(path, error) from None
     if taken:
         raise LogError(f"{path}: exists already; choose another name, or delete it")
 

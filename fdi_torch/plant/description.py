@@ -192,6 +192,12 @@ class PlantDescription:
         """The output channels of a recording, in the order of the sensors."""
         return tuple(sensor.column for sensor in self.sensors)
 
+    def channel_words(self, channel: str) -> str:
+        """The components of a channel, by their names in the plant file: 'hB (LT_101)', or 'h1' if that is both."""
+        of_inputs = [c.name for c in self.flows_in_order() if (c.input_channel or ("",))[0] == channel]
+        names = [s.name for s in self.sensors if s.column == channel] or of_inputs
+        return channel if names in ([channel], []) else f"{', '.join(names)} ({channel})"
+
     def output_units(self) -> dict[str, str]:
         """SI unit of each output channel."""
         return {sensor.column: sensor.unit for sensor in self.sensors}

@@ -145,7 +145,8 @@ def _changes_in_gaps(recording: Recording) -> Iterator[ChannelFinding]:
             start = float(recording.time[moved[0]])
             text = (
                 f"changes in the gap after {start:g} s, at an unknown time; it counts as unchanged until the gap ends, "
-                f"unless the recording is cut there: columns: {{{name}: {{held: {GAP_STEPS * interval:g} s}}}}"
+                f"unless the recording is cut there: by columns: {{{name}: {{held: {GAP_STEPS * interval:g} s}}}} if "
+                "it is recorded at every sample, by stop and start of two entries if it is recorded on change"
             )
             yield ChannelFinding("held", name, text, {"after": start, "count": len(moved)})
 
@@ -164,12 +165,9 @@ def _missing_inputs(recording: Recording) -> Iterator[ChannelFinding]:
         unknown = torch.isnan(values)
         runs = _runs(unknown)
         if len(runs) > MANY_RUNS:
-            known = recording.time[~unknown]
-            step = float(torch.diff(known).median()) if len(known) > 1 else 0.0
             text = (
                 f"unknown at {int(unknown.sum())} of {len(values)} samples, in {len(runs)} stretches: the recording is "
-                f"cut at each; where an empty cell means the last value, say for how long: columns: "
-                f"{{{name}: {{held: {step:.3g} s}}}}"
+                f"cut at each; {_how_held(name, torch.diff(recording.time[~unknown]))}"
             )
             yield ChannelFinding("unknown", name, text, {"count": int(unknown.sum()), "stretches": len(runs)})
             continue
@@ -178,6 +176,22 @@ def _missing_inputs(recording: Recording) -> Iterator[ChannelFinding]:
             samples = counted(last - first + 1, "sample")
             text = f"unknown from {start:g} s to {stop:g} s ({samples}): the recording is cut there"
             yield ChannelFinding("unknown", name, text, {"start": start, "stop": stop})
+
+
+def _how_held(name: str, intervals: Tensor) -> str:
+    """How to say that an input keeps its value over empty cells. intervals: between its values, s."""
+    if len(intervals) > 1 and _irregular(intervals):
+        return (
+            "its values come at irregular times, as of a command that is recorded on change; if it is, each holds "
+            f"until the next: columns: {{{name}: {{held: always}}}}"
+        )
+    time = GAP_STEPS * float(intervals.median()) if len(intervals) else 0.0
+    return f"where an empty cell means the last value, say for how long: columns: {{{name}: {{held: {time:.3g} s}}}}"
+
+
+def _irregular(intervals: Tensor) -> bool:
+    """Whether times between successive values differ so much that these are logged on change."""
+    return float(intervals.quantile(0.9)) > IRREGULAR * float(intervals.quantile(0.1))
 
 
 def _missing_readings(recording: Recording) -> Iterator[ChannelFinding]:
@@ -229,8 +243,12 @@ def _on_change(name: str, values: Tensor, time: Tensor, unit: str) -> Iterator[C
     steps, intervals = torch.diff(values).abs(), torch.diff(time)
     least_step = float(steps.quantile(ODD_SHARE)) if len(steps) >= FEWEST_STEPS else 0.0
     usual = float(steps.median())
-    irregular = float(intervals.quantile(0.9)) > IRREGULAR * float(intervals.quantile(0.1))
-    if irregular and least_step > 0.0 and usual < ALIKE * least_step and least_step > FINER * resolution(values):
+    if (
+        _irregular(intervals)
+        and least_step > 0.0
+        and usual < ALIKE * least_step
+        and least_step > FINER * resolution(values)
+    ):
         text = (
             f"seems to be logged on change, when it has moved by {_shown(least_step, unit)}: readings come early or "
             "late by as much, which standard errors do not include; log at a fixed rate where accuracy matters"

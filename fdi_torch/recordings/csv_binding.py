@@ -82,7 +82,7 @@ def bind(path: Path, header: Sequence[str], name: str, source: ChannelSource | N
         si_unit = want or si_unit_of(unit)
         factor = unit_factor(unit, si_unit)
     except ValueError as error:
-        raise ValueError(f"{path}: column {column}: {error}") from error
+        raise ValueError(f"{path}: column {column}: {error}") from None
     rule = _rule(path, header, name, source)
     plus = tuple(bind(path, header, name, replace(source, column=each, plus=()), si_unit) for each in source.plus)
     return Bound(name, column, header.index(column), factor, si_unit, rule=rule, plus=plus, unit=unit)

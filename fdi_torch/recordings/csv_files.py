@@ -232,7 +232,7 @@ def _blocks(path: Path, lines: Iterable[str]) -> Iterator[list[str]]:
         while block := list(islice(lines, LINES_PER_BLOCK)):
             yield block
     except (UnicodeDecodeError, EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise ValueError(f"{path}: expected a whole CSV file, got one that is cut off or damaged: {error}") from error
+        raise ValueError(f"{path}: expected a whole CSV file, got one that is cut off or damaged: {error}") from None
 
 
 def _clock(

@@ -105,6 +105,6 @@ def _tagged(path: Path, name: str, source: ChannelSource, rows: _Rows, other_tag
     try:
         si_unit = si_unit_of(source.unit)
     except ValueError as error:
-        raise ValueError(f"{path}: {name}: {error}") from error
+        raise ValueError(f"{path}: {name}: {error}") from None
     bound = Bound(name, tag, 0, unit_factor(source.unit, si_unit), si_unit, unit=source.unit)
     return bound, np.array(rows.number), np.array(rows.time), np.array(rows.value)

@@ -142,7 +142,7 @@ def _beginning(path: Path) -> bytes:
     except EOFError:
         return b""  # cut off; the reader reports it
     except (gzip.BadGzipFile, zlib.error) as error:
-        raise ValueError(f"{path}: expected a CSV file (plain or .gz), got something else: {error}") from error
+        raise ValueError(f"{path}: expected a CSV file (plain or .gz), got something else: {error}") from None
 
 
 def _encoding(path: Path, start: bytes) -> str:

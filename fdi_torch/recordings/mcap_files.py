@@ -64,7 +64,7 @@ def _seconds(path: Path, time: ChannelSource | None) -> float:
     try:
         return unit_factor(time.unit, "s") if time and time.unit else 1.0
     except ValueError as error:
-        raise ValueError(f"{path}: t: {error}") from error
+        raise ValueError(f"{path}: t: {error}") from None
 
 
 Column = tuple[np.ndarray, np.ndarray, str]

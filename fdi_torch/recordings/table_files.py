@@ -97,7 +97,7 @@ class TableText(io.TextIOBase):
         except MemoryError:
             raise
         except ImportError as error:
-            raise ValueError(f"{self._path}: {error}") from error
+            raise ValueError(f"{self._path}: {error}") from None
         except Exception as error:  # libraries raise many types for a damaged file
             if isinstance(error, ValueError) and str(error).startswith(str(self._path)):
                 raise

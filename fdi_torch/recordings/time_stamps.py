@@ -72,8 +72,8 @@ def expect_zone(zone: str) -> None:
     """Raises ValueError for an unknown time zone."""
     try:
         ZoneInfo(zone)
-    except (ZoneInfoNotFoundError, ValueError) as error:
-        raise ValueError(f"expected a time zone by its IANA name such as Europe/Berlin, got '{zone}'") from error
+    except (ZoneInfoNotFoundError, ValueError):
+        raise ValueError(f"expected a time zone by its IANA name such as Europe/Berlin, got '{zone}'") from None
 
 
 def from_zone(local: np.ndarray, zone: str) -> np.ndarray:

@@ -107,7 +107,14 @@ def _residuals(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:
     return [
         signals(
             f"compare_residual_{k + 1}",
-            Chart(name, "time, s", axis("residual", unit), sensor_lines, level=0.0, clock="residuals"),
+            Chart(
+                runs[0].channel_words(name),
+                "time, s",
+                axis("residual", unit),
+                sensor_lines,
+                level=0.0,
+                clock="residuals",
+            ),
         )
         for k, ((name, unit), sensor_lines) in enumerate(lines.items())
     ]

@@ -63,7 +63,9 @@ def _better(compared: Comparison, runs: Sequence[Material]) -> str:
     if smaller <= chance:
         by = percent(smaller) if smaller >= 1e-3 else "less than 0.1 %"
         return f"{best} and {next_best} explain the recording equally well: residuals differ by {by}."
-    errors = _first([_both(name, residuals[first][name], residuals[second][name]) for name in common])
+    errors = _first(
+        [_both(runs[0].channel_words(name), name, residuals[first][name], residuals[second][name]) for name in common]
+    )
     return (
         f"{best} explains the recording best: its residuals are {percent(smaller)} smaller than those of {next_best} "
         f"({errors})."
@@ -85,9 +87,9 @@ def _same(runs: Sequence[Material], columns: str) -> bool:
     )
 
 
-def _both(name: str, one: SensorResidual, other: SensorResidual) -> str:
-    texts = (quantity_text(each.rms, each.unit, 3, name) for each in (one, other))
-    return f"{name} " + " against ".join(texts)
+def _both(sensor: str, channel: str, one: SensorResidual, other: SensorResidual) -> str:
+    texts = (quantity_text(each.rms, each.unit, 3, channel) for each in (one, other))
+    return f"{sensor} " + " against ".join(texts)
 
 
 def _differences(compared: Comparison, runs: Sequence[Material]) -> str:

@@ -90,7 +90,8 @@ def _cause(cause: Mapping[str, Any], plant: PlantDescription | None) -> Diagnose
     value, std = as_float(size.get("value")), as_float(size.get("std"))
     others = equivalents_words({"same_as": cause.get("same_as") or []})
     unit = str(size.get("unit", ""))
-    return DiagnosedEffect(name, location, True, value, std, unit, quantity=quantity, equivalents=others)
+    flow = as_float(cause.get("flow"))
+    return DiagnosedEffect(name, location, True, value, std, unit, flow, quantity=quantity, equivalents=others)
 
 
 def _size_of(name: str, location: str, plant: PlantDescription | None) -> str:

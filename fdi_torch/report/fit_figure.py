@@ -10,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.report.chart import thinned
 from fdi_torch.report.html import short
@@ -18,12 +19,16 @@ from fdi_torch.report.style import MARK, MODEL, SOFT, label_lines, set_title, st
 
 
 def fit_figure(
-    recording: Recording, predictions: Mapping[str, Tensor], title: str, columns: Sequence[str] | None = None
+    recording: Recording,
+    predictions: Mapping[str, Tensor],
+    title: str,
+    plant: PlantDescription,
+    columns: Sequence[str] | None = None,
 ) -> Figure:
     """Readings and predictions above, residuals below; one column per sensor.
 
     predictions: readings (T, N) in SI by the name of the model, the better one last. columns (N,): the outputs of the
-    recording that are predicted; by default all.
+    recording that are predicted; by default all. plant: names the sensors.
     """
     columns = recording.output_names if columns is None else columns
     count = len(columns)
@@ -34,6 +39,7 @@ def fit_figure(
         for i, column in enumerate(columns):
             of_sensor = {name: predicted[:, i] for name, predicted in predictions.items()}
             _draw_sensor(axes[0, i], axes[1, i], recording, recording.output_names.index(column), of_sensor)
+            axes[0, i].set_title(short(plant.channel_words(column)))
         set_title(figure, title)
     return figure
 
@@ -49,7 +55,6 @@ def _draw_sensor(upper: Axes, lower: Axes, recording: Recording, i: int, predict
         model = scale * predicted.detach().cpu().numpy()
         upper.plot(*thinned(time, model), color=colour, lw=1.0, label=name)
         lower.plot(*thinned(time, read - model), color=colour, lw=0.7)
-    upper.set_title(short(recording.output_names[i]))
     upper.set_ylabel(axis("reading", unit))
     lower.set_ylabel(axis("residual", unit))
     lower.set_xlabel("time, s")

@@ -76,6 +76,10 @@ class Material:
     def of(self, topic: str) -> list[Payload]:
         return self.events.get(topic, [])
 
+    def channel_words(self, channel: str) -> str:
+        """The name of a channel's component, with the channel where it differs; the channel if the plant is unknown."""
+        return channel if self.plant is None else self.plant.channel_words(channel)
+
     def unit(self, topic: str, name: str) -> str:
         return self.units.get(topic, {}).get(name, "")
 

@@ -122,6 +122,6 @@ def bound(folder: Path, port: int = 0) -> Iterator[tuple[str, Callable[[], None]
             listening.bind((HOST, port))
             listening.listen()  # requests that come before `serve` wait
         except (OSError, OverflowError) as error:
-            raise ValueError(f"--port: expected a free port, got {port} ({error}); name another, or none") from error
+            raise ValueError(f"--port: expected a free port, got {port} ({error}); name another, or none") from None
         server = uvicorn.Server(config)
         yield f"http://{HOST}:{listening.getsockname()[1]}/", lambda: server.run(sockets=[listening])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.recording import Recording
 from fdi_torch.report.fit_figure import fit_figure
 
@@ -17,7 +18,7 @@ def test_title_and_labels_fit_into_the_picture(sensors: int) -> None:
     read = torch.sin(time)[:, None].expand(-1, sensors)
     names = tuple(f"h{k}" for k in range(sensors))
     recording = Recording(time, time[:, None], read, ("Q",), names, ("m^3/s",), ("m",) * sensors)
-    figure = fit_figure(recording, {"estimate": 0.9 * read}, TITLE)
+    figure = fit_figure(recording, {"estimate": 0.9 * read}, TITLE, load_plant("three_tank"))
     figure.draw_without_rendering()
     title = figure.get_suptitle()
     assert title.replace("\n", " ") == TITLE

@@ -20,12 +20,14 @@ from sample_runs import (
     write_monitor,
     write_rehearsal,
     write_study,
+    write_train,
 )
 
 from fdi_torch.blind.case_kinds import KINDS
 from fdi_torch.blind.kind_meanings import KIND_MEANINGS
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.logbook import RunLog, read_run
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.report.chart import draw
 from fdi_torch.report.diagnosed_effects import diagnosed_effects
 from fdi_torch.report.material import gather
@@ -328,14 +330,35 @@ def test_numbers_with_error_and_unit_are_not_broken_into_two_lines() -> None:
     assert unbroken("3 faults: leak at T1") == "3 faults: leak at T1"
 
 
-def test_residuals_are_divided_by_the_noise_of_the_diagnosis_also_where_readings_are_rounded() -> None:
-    material = material_of(DATA / "log_format_1_gap.mcap", load_plant("three_tank"))
+def with_names_of_its_own() -> PlantDescription:
+    """The plant three_tank whose sensors and pumps have other names than their channels."""
+    plant = load_plant("three_tank")
+    sensors = tuple(replace(s, name=f"level {k}", channel=s.column) for k, s in enumerate(plant.sensors, 1))
+    return replace(
+        plant, sensors=sensors, pumps=tuple(replace(p, name=f"P{p.name}", command=p.name) for p in plant.pumps)
+    )
+
+
+@pytest.mark.parametrize("write", [write_gap, write_train, write_monitor])
+def test_a_page_names_sensors_and_pumps_as_their_plant_file_does(write: Callable[[Path], Path], tmp_path: Path) -> None:
+    """With the channel behind it, by which the recording knows them."""
+    material = material_of(write(tmp_path / "run.mcap"), with_names_of_its_own())
+    charts = [picture.chart for picture in report_of(material).pictures if picture.chart is not None]
+    named = {title for title in (chart.title for chart in charts) if re.search(r"\b[hQ][123]\b", title)}
+    assert len(named) > 2
+    assert not [title for title in named if not re.search(r"level (\d) \(h\1\)|PQ(\d) \(Q\2\)", title)]
+
+
+@pytest.mark.parametrize("plant", [load_plant("three_tank"), with_names_of_its_own()], ids=["channels", "names"])
+def test_residuals_are_divided_by_the_noise_of_the_diagnosis_also_where_readings_are_rounded(
+    plant: PlantDescription,
+) -> None:
+    material = material_of(DATA / "log_format_1_gap.mcap", plant)
     recording = material.recordings[0]
     step = 0.01
     predicted = material.arrays["augmented"]
     material.recordings[0] = replace(recording, outputs=np.round(predicted / step) * step)
-    std = {name: {"std": step / np.sqrt(12.0)} for name in recording.output_names}
-    material.answer["noise"] = std
+    material.answer["noise"] = {sensor.name: {"std": step / np.sqrt(12.0)} for sensor in plant.sensors}
     section = profile_section(material)
     assert section is not None
     charts = [block for block in section.pictures if block.chart is not None]

@@ -46,7 +46,7 @@ def _holdout_panels(material: Material, prefix: str) -> list[Picture]:
                 words, colour = MODELS[model]
                 lines.append(Line(words, time, scale * (read[:, i] - predicted[:, i]), colour))
         if lines:
-            title_here = f"{name}, {title.replace('_', ' ')}"
+            title_here = f"{material.channel_words(name)}, {title.replace('_', ' ')}"
             chart = Chart(
                 title_here, "time, s", axis("measured − model", unit), lines, level=0.0, clock=clock_of(prefix)
             )
@@ -87,7 +87,8 @@ def _excess(material: Material, recording: Signals, model: str) -> np.ndarray | 
 def _noise(material: Material, recording: Signals, read: np.ndarray) -> np.ndarray:
     """Noise (N,) by which the diagnosis weighed each sensor, rounding included; of the samples where it is unknown."""
     stated = material.answer.get("noise") or {}
-    std = [as_float((stated.get(name) or {}).get("std")) for name in recording.output_names]
+    names = {s.column: s.name for s in material.plant.sensors} if material.plant is not None else {}
+    std = [as_float((stated.get(names.get(c, c)) or {}).get("std")) for c in recording.output_names]
     readings = torch.from_numpy(read)
     of_samples = sample_noise(readings.nan_to_num(), torch.isfinite(readings).double()).clamp(min=1e-12)
     return np.where(np.array(std) > 0.0, std, of_samples.numpy())
@@ -96,10 +97,10 @@ def _noise(material: Material, recording: Signals, read: np.ndarray) -> np.ndarr
 def _variables(material: Material, recording: Signals) -> Iterator[tuple[str, str, np.ndarray]]:
     """Title, axis label and values (T,) of each variable that the gap may depend on."""
     yield "By time", "time, s", recording.time
-    for i, name in enumerate(recording.output_names):
+    for i, name in enumerate(map(material.channel_words, recording.output_names)):
         unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
         yield f"By {name}", axis(f"{name} measured", unit), scale * recording.outputs[:, i]
-    for i, name in enumerate(recording.input_names):
+    for i, name in enumerate(map(material.channel_words, recording.input_names)):
         unit, scale = shown_unit(recording.input_units[i], recording.input_names[i])
         yield f"By {name}", axis(f"{name} commanded", unit), scale * recording.inputs[:, i]
     for name, head in _heads(material, recording):

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from fdi_torch.amounts import kind_words
 from fdi_torch.clock import clock_unit
 from fdi_torch.gap.verdict_words import (
     FORMAT_1,
+    MEAN_FLOW,
     apart_from_rounding,
     causes_of,
     explanation_words,
@@ -150,4 +152,7 @@ def _cause_rows(cause: Mapping[str, Any]) -> list[list[str]]:
         value, std = scale * as_float(amount.get("value")), scale * as_float(amount.get("std"))
         rows.append([effect, location, str(name).replace("_", " "), with_error(value, std)])
         rows[-1].append(clock_unit(unit, name, value))
+    if np.isfinite(flow := as_float(cause.get("flow"))):
+        unit, scale = shown_unit("m^3/s")
+        rows.append([effect, location, MEAN_FLOW, number(scale * flow, 3), unit])
     return rows or [[effect, location, "", "", ""]]

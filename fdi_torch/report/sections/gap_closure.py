@@ -126,7 +126,7 @@ def next_input_section(material: Material) -> Section | None:
         unit, scale = shown_unit(str(units.get(name, "")), name)
         time, values = as_vector(channel["at"]), scale * as_vector(channel["value"])
         line = Line("command", np.append(time, end), np.append(values, values[-1:]), MODEL, steps=True)
-        chart = Chart(name, "time, s", axis("command", unit), [line], clock="next")
+        chart = Chart(material.channel_words(name), "time, s", axis("command", unit), [line], clock="next")
         pictures.append(signals(f"gap_next_input_{k + 1}", chart))
     return Section("Next experiment", [_next_words(proposal), pictures])
 

@@ -33,7 +33,8 @@ def residual_section(material: Material) -> Section | None:
     for k, name in enumerate(name for name in columns if name != "t" and not name.endswith(_SUFFIXES)):
         unit, scale = shown_unit(material.unit(RESIDUAL, name), name)
         line, label = Line("measured − predicted", time, scale * columns[name], MODEL), axis("residual", unit)
-        chart = Chart(name, "time, s", label, [line], level=0.0, events=alarms, clock="monitor", height=2.1)
+        title = material.channel_words(name)
+        chart = Chart(title, "time, s", label, [line], level=0.0, events=alarms, clock="monitor", height=2.1)
         pictures.append(signals(f"observer_residual_{k + 1}", chart))
     return Section("Residuals", ["Vertical lines: alarms.", pictures]) if pictures else None
 
@@ -47,7 +48,7 @@ def statistic_section(material: Material) -> Section | None:
         limit = columns.get(f"{channel}_threshold")
         lines = [Line("statistic", time, columns[name], MODEL)]
         lines += [] if limit is None else [Line("threshold", time, limit, MARK, dashed=True)]
-        title = f"Test statistic, {NAMES.get(channel, channel)}"
+        title = f"Test statistic, {NAMES.get(channel) or material.channel_words(channel)}"
         chart = Chart(title, "time, s", "statistic (no unit)", lines, log=True, events=alarms, clock="monitor")
         pictures.append(signals(f"observer_statistic_{k + 1}", chart))
     words = "Vertical lines: alarms. Dashed: thresholds." if alarms else "Dashed: thresholds. No alarm was raised."

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from fdi_torch.logbook import Signals
@@ -23,9 +25,10 @@ def fit_section(material: Material) -> Section | None:
         model = predicted(material, k)
         fitted |= model is not None
         blocks += [tag("h4", recording_name(group))] if several else []
-        blocks.append(_output_panels(recording, model, f"_{k + 1}" if several else "", clock_of(group)))
+        sensors = [material.channel_words(name) for name in recording.output_names]
+        blocks.append(_output_panels(recording, sensors, model, f"_{k + 1}" if several else "", clock_of(group)))
         if model is not None:
-            blocks += [_misfit_table(recording, model)]
+            blocks += [_misfit_table(recording, sensors, model)]
     if not blocks:
         return None
     return Section("Readings against the estimate" if fitted else "Readings", blocks)
@@ -38,7 +41,7 @@ def inputs_section(material: Material) -> Section | None:
         several = len(material.recordings) > 1
         suffix = f"_{k + 1}" if several else ""
         pictures, constant = [], []
-        for i, name in enumerate(recording.input_names):
+        for i, name in enumerate(map(material.channel_words, recording.input_names)):
             unit, scale = shown_unit(recording.input_units[i], recording.input_names[i])
             values = scale * recording.inputs[:, i]
             if np.isfinite(values).any() and np.nanmin(values) == np.nanmax(values):
@@ -67,12 +70,14 @@ def clock_of(group: str) -> str:
     return f"recording {group}"
 
 
-def _output_panels(recording: Signals, model: np.ndarray | None, suffix: str, clock: str) -> list[Column]:
+def _output_panels(
+    recording: Signals, sensors: Sequence[str], model: np.ndarray | None, suffix: str, clock: str
+) -> list[Column]:
     """A column for each sensor: readings and estimate, and below them the residual."""
     columns: list[Column] = []
     readings = np.where(recording.mask, recording.outputs, np.nan)
     time = recording.time
-    for i, name in enumerate(recording.output_names):
+    for i, name in enumerate(sensors):
         unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
         lines = [Line("measured", time, scale * readings[:, i], SOFT, wide=model is not None)]
         if model is not None:
@@ -88,10 +93,10 @@ def _output_panels(recording: Signals, model: np.ndarray | None, suffix: str, cl
     return columns
 
 
-def _misfit_table(recording: Signals, model: np.ndarray) -> str:
+def _misfit_table(recording: Signals, sensors: Sequence[str], model: np.ndarray) -> str:
     """Root mean square, mean, largest residual, and Pearson correlation of each sensor."""
     rows = []
-    for i, name in enumerate(recording.output_names):
+    for i, name in enumerate(sensors):
         unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
         counted = recording.mask[:, i] & np.isfinite(model[:, i])
         read, estimate = scale * recording.outputs[counted, i], scale * model[counted, i]
