@@ -10,7 +10,7 @@ import torch
 from scipy.optimize import least_squares, lsq_linear
 from torch import Tensor
 
-from fdi_torch.estimate.batch_algebra import apply, row_sum, solve_positive
+from fdi_torch.estimate.batch_algebra import apply, eigen_decomposed, row_sum, solve_positive
 from fdi_torch.estimate.damped_step import Quadratic, damped_step, damping_of_shorter_step, newton_decrement
 from fdi_torch.estimate.levenberg_marquardt import Competition, Progress, RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.linearisation import Linearisation, Refined, held_back
@@ -404,6 +404,17 @@ def test_solver_solves_and_keeps_its_bits_in_any_batch(parameters: int) -> None:
     assert all(torch.equal(solve_positive(matrix[i], right[i])[0], solution[i]) for i in range(50))
     assert not solve_positive(-matrix, right)[1].any()
     assert not solve_positive(matrix * math.nan, right)[1].any()
+
+
+@pytest.mark.parametrize("parameters", [3, 5, 8, 9])
+def test_eigenvectors_keep_their_bits_in_any_batch(parameters: int) -> None:
+    columns = torch.randn(40, parameters, 20, dtype=DOUBLE, generator=torch.Generator().manual_seed(parameters))
+    matrix = columns @ columns.mT
+    values, vectors = eigen_decomposed(matrix)
+    torch.testing.assert_close(vectors @ torch.diag_embed(values) @ vectors.mT, matrix)
+    for i in range(40):
+        of_one, alone = eigen_decomposed(matrix[i : i + 1].clone())
+        assert torch.equal(of_one[0], values[i]) and torch.equal(alone[0], vectors[i])
 
 
 def test_row_sum_keeps_its_bits_in_any_batch() -> None:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fdi_torch.estimate.batch_algebra import apply, dot, row_sum, solve_positive
+from fdi_torch.estimate.batch_algebra import apply, dot, eigen_decomposed, row_sum, solve_positive
 from fdi_torch.estimate.linearisation import held_back
 
 _RIDGE = 1e-10  # relative to the unit diagonal: regularises combinations of parameters without curvature
@@ -116,7 +116,7 @@ def damping_of_shorter_step(
     free = ~model.held()
     gradient = torch.where(free, model.gradient * model.unit, 0.0)
     curvature = _reduced(model.damped(torch.zeros_like(damping)), free)
-    values, vectors = torch.linalg.eigh(curvature)
+    values, vectors = eigen_decomposed(curvature)
     along = apply(vectors.mT, gradient).square()
     longest = (share * dot(step / model.unit, step / model.unit).sqrt()).unsqueeze(-1)
     # Without this shift, a curvature that is not positive definite would have no minimum within any length.
