@@ -1,7 +1,7 @@
 """Linear algebra of small vectors and matrices with results that are bit-for-bit independent of the batch size.
 
-Functions use elementwise operations in a fixed order, or treat each matrix by itself, because library products and
-factorisations choose their order of summation by the shape of the whole batch.
+All functions use elementwise operations in a fixed order, because library products and factorisations choose their
+order of summation by the shape of the whole batch.
 """
 
 from __future__ import annotations
@@ -32,17 +32,6 @@ def apply(
 ) -> Float[torch.Tensor, "*#batch M"]:
     """Matrix times vector."""
     return row_sum(matrix * vector[..., None, :])
-
-
-def eigen_decomposed(
-    matrix: Float[torch.Tensor, "L P P"],
-) -> tuple[Float[torch.Tensor, "L P"], Float[torch.Tensor, "L P P"]]:
-    """Eigenvalues, the least first, and eigenvectors (in columns) of symmetric matrices.
-
-    Each is decomposed by itself: the library rounds by the position of a matrix in memory, which depends on the batch.
-    """
-    values, vectors = zip(*(torch.linalg.eigh(each) for each in matrix), strict=True)
-    return torch.stack(values), torch.stack(vectors)
 
 
 def solve_positive(

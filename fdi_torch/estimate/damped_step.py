@@ -12,12 +12,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from fdi_torch.estimate.batch_algebra import apply, dot, eigen_decomposed, row_sum, solve_positive
+from fdi_torch.estimate.batch_algebra import apply, dot, solve_positive
 from fdi_torch.estimate.linearisation import held_back
 
 _RIDGE = 1e-10  # relative to the unit diagonal: regularises combinations of parameters without curvature
-_ROOT_ITERATIONS = 6  # of Newton's method for the damping; the length is then right to a few per cent
-_LARGEST_EXCESS = 1e6  # of a step over the length that is wanted, which is zero where the last step ended at bounds
 _MAX_CORRECTION_RATIO = 0.75  # largest 2 |correction| / |step| (Transtrum and Sethna 2012, section 3.2)
 
 
@@ -30,9 +28,6 @@ class Quadratic:
     curvature: Tensor
     low: Tensor
     high: Tensor
-
-    def __getitem__(self, keep: Tensor) -> Quadratic:
-        return Quadratic(*(value[keep] for value in vars(self).values()))
 
     @property
     def unit(self) -> Float[Tensor, "L P"]:
@@ -100,34 +95,6 @@ def damped_step(model: Quadratic, damping: Float[Tensor, " L"]) -> Step:
     change = trial - theta
     predicted = -(dot(model.gradient, change) + 0.5 * dot(change, apply(model.curvature, change)))
     return Step(trial, predicted, solvable)
-
-
-def damping_of_shorter_step(
-    model: Quadratic, damping: Float[Tensor, " L"], step: Float[Tensor, "L P"], share: Float[Tensor, " L"]
-) -> Float[Tensor, " L"]:
-    """The damping (L,), at least twice `damping` (L,), whose step has a share (L,) of the length of `step` (L, P).
-
-    share: at most a half.
-
-    Lengths are those of scaled parameters; bounds that are not active at theta are ignored. The damping is the root of
-    a nearly linear function, which Newton's method finds from below (Moré, 1978, "The Levenberg-Marquardt algorithm",
-    section 5).
-    """
-    free = ~model.held()
-    gradient = torch.where(free, model.gradient * model.unit, 0.0)
-    curvature = _reduced(model.damped(torch.zeros_like(damping)), free)
-    values, vectors = eigen_decomposed(curvature)
-    along = apply(vectors.mT, gradient).square()
-    longest = (share * dot(step / model.unit, step / model.unit).sqrt()).unsqueeze(-1)
-    # Without this shift, a curvature that is not positive definite would have no minimum within any length.
-    total = torch.maximum(2.0 * damping, _RIDGE - values[:, 0]).unsqueeze(-1)
-    for _ in range(_ROOT_ITERATIONS):
-        shifted = values + total
-        length = row_sum(along / shifted**2).unsqueeze(-1).sqrt()
-        slope = row_sum(along / shifted**3).unsqueeze(-1)
-        excess = (length / longest - 1.0).nan_to_num(nan=0.0).clamp(min=0.0, max=_LARGEST_EXCESS)
-        total = total + torch.where(slope > 0.0, excess * length**2 / slope, 0.0)
-    return total.squeeze(-1)
 
 
 def bent_step(

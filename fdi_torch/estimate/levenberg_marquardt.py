@@ -6,9 +6,8 @@ gradient g and its Gauss-Newton curvature H. A step solves
     (H + damping diag H) step = -g                                                             (Marquardt 1963)
 
 over the free parameters; a parameter at an active bound is held. A step that achieves more than a quarter of the
-predicted decrease reduces the damping to a fifth. After any other step it becomes such that a step from the same point
-would have half of the length, or a quarter after a refused step (Moré 1978, "The Levenberg-Marquardt algorithm"). A
-damping that is merely multiplied would leave the step unchanged for as long as it is below all eigenvalues of H.
+predicted decrease reduces the damping to a fifth. Any other step multiplies it by nu, where nu is 2 initially, doubles
+with each refused step and returns to 2 with an accepted one (Nielsen 1999, "Damping parameter in Marquardt's method").
 
 A lane has converged when its Newton decrement g'H^-1 g / 2, the decrease that the undamped model predicts over the free
 parameters, is below a tolerance. This criterion depends on the point only, not on the steps that led there.
@@ -28,14 +27,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.damped_step import (
-    Quadratic,
-    Step,
-    bent_step,
-    damped_step,
-    damping_of_shorter_step,
-    newton_decrement,
-)
+from fdi_torch.estimate.damped_step import Quadratic, Step, bent_step, damped_step, newton_decrement
 from fdi_torch.estimate.linearisation import (
     ABANDONED,
     CONVERGED,
@@ -55,9 +47,9 @@ from fdi_torch.estimate.linearisation import (
 )
 
 _MOST_DAMPING, _LEAST_DAMPING = 1e14, 1e-12
-# The damping is multiplied by the first number if actual decrease / predicted decrease exceeds the second.
+# The damping is multiplied by the first number if actual decrease / predicted decrease exceeds the second. It falls
+# fast and rises slowly at first ("delayed gratification", Transtrum and Sethna 2012, section 4.1).
 _DAMPING_REDUCTION, _GOOD_GAIN_RATIO = 0.2, 0.25
-_SHORTER, _SHORTER_IF_REFUSED = 0.5, 0.25  # shares of the length of a step, for that after it (Moré 1978: 0.1 to 0.5)
 
 
 @dataclass(frozen=True)
@@ -124,9 +116,9 @@ class _Lanes:
     high: Tensor
     model: Linearisation
     damping: Tensor
+    growth: Tensor  # Nielsen's nu: factor on the damping after an unsatisfactory step
     actual_decrease: Tensor  # actual decrease of the cost by the last accepted step, infinite before
     refused_decrease: Tensor  # predicted decrease of the last step if it was refused, else infinite
-    refused_damping: Tensor  # damping of the last step if it was refused, else zero
     negligible_step: Tensor  # bool: the last step was accepted and below the step tolerance
     after_refusals: Tensor  # bool: the last step was accepted after refusals
 
@@ -197,9 +189,9 @@ def _begin(linearise: Linearise, theta: Tensor, low: Tensor, high: Tensor, setti
             f"got {shapes}; make `linearise` return one of each for every lane"
         )
     damping = torch.full_like(model.cost, settings.damping)
-    infinite, zero = torch.full_like(model.cost, math.inf), torch.zeros_like(model.cost)
+    nu, infinite = torch.full_like(model.cost, 2.0), torch.full_like(model.cost, math.inf)
     false = torch.zeros_like(lanes, dtype=torch.bool)
-    return _Lanes(lanes, theta, low, high, model, damping, infinite, infinite, zero, false, false)
+    return _Lanes(lanes, theta, low, high, model, damping, nu, infinite, infinite, false, false)
 
 
 def _filed(result: Refined, finished: _Lanes, status: Tensor, decrement: Tensor, iteration: int) -> Refined:
@@ -236,7 +228,7 @@ def _status(
         hopeless = (excess > settings.competition.behind) & slow & (decrement < excess)
         status = torch.where(hopeless, ABANDONED, status)
     # With less damping, a negligible prediction may also be due to a bound that shortened the step.
-    no_gain = (lanes.refused_decrease <= tolerance) & (lanes.refused_damping > 1.0)
+    no_gain = (lanes.refused_decrease <= tolerance) & (lanes.damping > 1.0)
     negligible_gain = lanes.after_refusals & (lanes.actual_decrease <= tolerance)
     status = torch.where(no_gain | negligible_gain | (lanes.damping > _MOST_DAMPING), STALLED, status)
     status = torch.where(converged | lanes.negligible_step, CONVERGED, status)
@@ -287,24 +279,18 @@ def _advance(
     decrease = torch.zeros_like(lanes.damping).index_copy(0, hopeful, lanes.model.cost[hopeful] - model.cost)
     decrease = torch.where(accepted, decrease, 0.0)
     well_predicted = decrease > _GOOD_GAIN_RATIO * step.predicted
-    change = step.trial - lanes.theta
-    damping = _DAMPING_REDUCTION * lanes.damping
-    poor = (~(accepted & well_predicted)).nonzero().flatten()
-    if len(poor):
-        share = torch.where(accepted[poor], _SHORTER, _SHORTER_IF_REFUSED)
-        shorter = damping_of_shorter_step(lanes.quadratic[poor], lanes.damping[poor], change[poor], share)
-        damping = damping.index_copy(0, poor, shorter)
-    width = typical_size(lanes.theta, lanes.low, lanes.high)
-    below_tolerance = (change.abs() <= settings.step_tolerance * width).all(-1)
+    factor = torch.where(accepted & well_predicted, _DAMPING_REDUCTION, lanes.growth)
+    change = (step.trial - lanes.theta).abs()
+    below_tolerance = (change <= settings.step_tolerance * typical_size(lanes.theta, lanes.low, lanes.high)).all(-1)
     advanced = replace(
         lanes,
         theta=torch.where(accepted[:, None], step.trial, lanes.theta),
         model=lanes.model.replaced(hopeful[better], model[better]),
-        damping=damping.clamp(min=_LEAST_DAMPING),
+        damping=(lanes.damping * factor).clamp(min=_LEAST_DAMPING),
+        growth=torch.where(accepted, 2.0, 2.0 * lanes.growth),
         actual_decrease=torch.where(accepted, decrease, lanes.actual_decrease),
         refused_decrease=torch.where(accepted, math.inf, step.predicted),
-        refused_damping=torch.where(accepted, 0.0, lanes.damping),
         negligible_step=accepted & below_tolerance & (lanes.damping <= 1.0),
-        after_refusals=accepted & (lanes.refused_damping > 0.0),
+        after_refusals=accepted & (lanes.growth > 2.0),
     )
     return advanced, accepted

@@ -77,7 +77,7 @@ ADAPTIVE_STEPS = (2.0, 0.05)
 LOOSE_DECREASE, TIGHT_DECREASE = 1e-2, 1e-4
 # Moves along a valley of equally good points towards nominal: their largest number, and the share of a parameter's
 # range below which one ends them.
-MOST_MOVES, NEAREST_WITHIN = 10, 1e-3
+MOST_MOVES, NEAREST_WITHIN = 10, 0.01
 
 
 def starting_points(
