@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
 
 from fdi_torch.cli import DONE, main
 from fdi_torch.config.loaded_recordings import named_recordings
@@ -21,12 +19,9 @@ from fdi_torch.gap.diagnose import recalibrate
 from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
 from fdi_torch.gap.marginal_likelihood import log_evidence
 from fdi_torch.gap.problem import PLAIN, problem_of
-from fdi_torch.gap.trajectory_problem import TrajectoryProblem, descend
-from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Placement
 from fdi_torch.recording import Recording
-from fdi_torch.simulate.linearised import Linearised
 from tests.rigs import blank_recording, random_steps
 
 RIG = """
@@ -176,55 +171,3 @@ def test_a_recalibration_at_nearly_equal_levels_gains_nothing_from_an_added_and_
     beside = fitter.fit(Candidate((flow,), ({"T6.unmetered_flow.flow": 1e-7},)), null)
     again = fitter.fit(Candidate(), beside)
     assert again.converged and again.cost > null.cost - 0.5
-
-
-class Kinked:
-    """A plant of one parameter x and one reading, |x| + least, and the chi-square of a reading of zero."""
-
-    def __init__(self, least: float) -> None:
-        self.least, self.space = least, ParameterSpace([Parameter("x", "1", 0.0, -9.0, 9.0)])
-
-    def trajectories(self, theta: Tensor, guess: Tensor | None = None) -> Tensor:
-        return theta.unsqueeze(-1)
-
-    def read(self, levels: Tensor, theta: Tensor) -> Tensor:
-        return levels.abs() + self.least
-
-    def linearise(self, theta: Tensor, levels: Tensor) -> Linearised:
-        slope = torch.ones_like(levels).copysign(levels).unsqueeze(-1)
-        nothing = torch.zeros(len(theta), 0, 1, 1, dtype=theta.dtype)
-        zero = torch.zeros(len(theta), dtype=theta.dtype)
-        readings = self.read(levels, theta)
-        return Linearised(levels, torch.ones_like(slope), readings, slope, nothing, nothing, zero, levels)
-
-    def box(self, space: ParameterSpace) -> tuple[Tensor, Tensor, Tensor]:
-        return space.low(), space.high(), torch.ones(1, dtype=torch.float64)
-
-    def residual(self, readings: Tensor) -> Tensor:
-        return -readings
-
-    def whiten(self, x: Tensor) -> Tensor:
-        return x
-
-    def white(self, linearised: Linearised) -> tuple[Tensor, Tensor]:
-        return -linearised.readings, linearised.jacobian
-
-    def chi_square(self, space: ParameterSpace, theta: Tensor, residual: Tensor) -> Tensor:
-        return residual.square().sum((-1, -2))
-
-    def normal(
-        self, space: ParameterSpace, theta: Tensor, residual: Tensor, jacobian: Tensor, scale: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        columns = jacobian.flatten(1, 2)
-        gradient = (columns.mT @ residual.flatten(1).unsqueeze(-1)).squeeze(-1)
-        return self.chi_square(space, theta, residual), gradient, columns.mT @ columns
-
-
-@pytest.mark.parametrize(("least", "converged"), [(0.3, True), (0.9, False)])
-def test_a_descent_that_ends_at_a_kink_has_converged_if_little_is_missing(least: float, converged: bool) -> None:
-    """At the kink, the model still predicts a decrease by least^2 / 2 nats: 0.045 or 0.4."""
-    plant: Any = Kinked(least)
-    start = torch.tensor([[3.7]], dtype=torch.float64)
-    end = descend(TrajectoryProblem(plant, plant), start, readings=1)
-    assert end.theta.abs().item() < 0.1
-    assert end.converged.tolist() == [converged]
