@@ -1,4 +1,4 @@
-"""PlantDescription: a rig as plain data in SI, and the checks of its names, references and numbers.
+"""PlantDescription: a rig as plain data in SI.
 
 `TankNetwork` holds the physics. A component's name is also a location for faults and unmodelled effects.
 """
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.components import COMMAND_UNITS, OUTSIDE, READING_UNITS, Component, Sensor, Tank
+from fdi_torch.plant.description_checks import check_names, check_numbers, check_references
 from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
 from fdi_torch.plant.kinds.pipe import Pipe
 from fdi_torch.plant.kinds.pump import Pump
@@ -38,9 +39,6 @@ __all__ = [
 ]
 
 Kind = TypeVar("Kind", bound=Component)
-
-SMALLEST, LARGEST = 1e-12, 1e9
-"""Range of every plausible area, height and flow of a rig, SI; a number outside has a wrong unit or exponent."""
 
 
 def _flows(kind: type[FlowComponent]) -> Any:
@@ -104,9 +102,9 @@ class PlantDescription:
     units: dict[str, str] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
-        _check_names(self)
-        _check_references(self)
-        _check_numbers(self)
+        check_names(self)
+        check_references(self)
+        check_numbers(self)
 
     def components(self) -> Iterator[Tank | FlowComponent | Sensor]:
         yield from self.tanks
@@ -234,72 +232,3 @@ def _depths(plant: PlantDescription) -> dict[str, int]:
             before = [depth[o.name] + 1 for o in flows if o.order == c.order and o.target == c.source]
             depth[c.name] = min(max(before, default=0), len(flows))
     return depth
-
-
-def _check_names(plant: PlantDescription) -> None:
-    if not plant.tanks:
-        raise ValueError(f"plant {plant.name}: expected at least one tank, got none; add one under tanks")
-    seen: set[str] = {OUTSIDE}
-    for name in plant.locations():
-        if name in seen:
-            raise ValueError(f"plant {plant.name}: expected each name once, got '{name}' twice; rename one")
-        seen.add(name)
-
-
-def _check_references(plant: PlantDescription) -> None:
-    tanks = [t.name for t in plant.tanks]
-
-    def expect_tank(place: str, name: str, also: tuple[str, ...] = ()) -> None:
-        if name not in (*tanks, *also):
-            known = ", ".join((*tanks, *also))
-            raise ValueError(f"plant {plant.name}: {place}: expected one of the tanks {known}, got '{name}'")
-
-    for component in plant.flow_components():
-        place = f"{component.part()}.{component.name}"
-        if component.source != OUTSIDE or component.order != FlowOrder.INFLOW:
-            expect_tank(f"{place}.source", component.source)
-        expect_tank(f"{place}.target", component.target, () if component.source == OUTSIDE else (OUTSIDE,))
-        if component.source == component.target:
-            raise ValueError(f"plant {plant.name}: {place}: expected two different ends, got {component.source} twice")
-    for sensor in plant.sensors:
-        expect_tank(f"sensors.{sensor.name}.tank", sensor.tank)
-    for tank in plant.tanks:
-        expect_tank(f"tanks.{tank.name}.overflow_to", tank.overflow_to, (OUTSIDE,))
-        pipes = [p.name for p in plant.pipes]
-        if tank.leak_reference is not None and tank.leak_reference not in pipes:
-            known = ", ".join(pipes) or "(the plant has none)"
-            raise ValueError(
-                f"plant {plant.name}: tanks.{tank.name}.leak_reference: expected one of the pipes {known}, "
-                f"got '{tank.leak_reference}'"
-            )
-
-
-def _check_numbers(plant: PlantDescription) -> None:
-    positive = [
-        (f"tanks.{t.name}.{f}", getattr(t, f), u) for t in plant.tanks for f, u in (("area", "m^2"), ("height", "m"))
-    ]
-    for component in plant.flow_components():
-        place = f"{component.part()}.{component.name}"
-        positive += [(f"{place}.{name}", getattr(component, name), unit) for name, unit in component.positive_fields()]
-    positive += [("gravity", plant.gravity, "m/s^2")]
-    for field_name, value, unit in positive:
-        if not value > 0:
-            raise ValueError(
-                f"plant {plant.name}: {field_name}: expected a positive number, got {value} {unit}".rstrip()
-            )
-        if not SMALLEST <= value <= LARGEST:
-            raise ValueError(
-                f"plant {plant.name}: {field_name}: expected {SMALLEST:g} to {LARGEST:g} {unit}, got {value:g}; "
-                "is its unit right?"
-            )
-    for component in plant.flow_components():
-        for problem in component.problems():
-            raise ValueError(f"plant {plant.name}: {component.part()}.{component.name}.{problem}")
-    for sensor in plant.sensors:
-        place = f"plant {plant.name}: sensors.{sensor.name}"
-        if sensor.gain == 0:
-            raise ValueError(f"{place}.gain: expected a number other than 0, got 0")
-        if sensor.low is not None and sensor.high is not None and not sensor.low < sensor.high:
-            raise ValueError(
-                f"{place}: expected low < high, got {sensor.low:g} and {sensor.high:g} {sensor.unit}; swap them"
-            )
