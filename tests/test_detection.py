@@ -34,7 +34,7 @@ def noise(*shape: int, seed: int = 0) -> torch.Tensor:
 def known(rate: ChartRate, run_length: float, channels: int) -> FalseAlarmDesign:
     """The design for noise that is known."""
     zeros, median = torch.zeros(channels, dtype=torch.float64), torch.full((1, channels), 0.5, dtype=torch.float64)
-    return FalseAlarmDesign(rate, lambda threshold: zeros, median, run_length, 1.0)
+    return FalseAlarmDesign(rate, lambda threshold: 1, lambda length: zeros, median, run_length, 1.0)
 
 
 def cusum_run_length(threshold: float, drift: float, std: float = 1.0) -> float:

@@ -13,7 +13,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Literal
 
 import torch
@@ -40,13 +40,14 @@ ChartRate = Callable[[float, Tensor], Tensor]
 class FalseAlarmDesign:
     """Threshold and false-alarm rate of a chart.
 
-    chart_rate: of the chart. error: standard error (C,) of ln of the standard deviation of those sums of the residual
-    that decide about an alarm at a threshold. share (D, C): probabilities at which the posterior is drawn. run_length:
-    expected number of samples to a false alarm. interval: between samples, s.
+    chart_rate: of the chart. length: of the sums of the residual that decide about an alarm at a threshold. error:
+    standard error (C,) of ln of the standard deviation of sums of that length. share (D, C): probabilities at which
+    the posterior is drawn. run_length: expected number of samples to a false alarm. interval: between samples, s.
     """
 
     chart_rate: ChartRate
-    error: Callable[[float], Tensor]
+    length: Callable[[float], int]
+    error: Callable[[int], Tensor]
     share: Tensor
     run_length: float
     interval: float
@@ -68,8 +69,18 @@ class FalseAlarmDesign:
 
     def std(self, threshold: float) -> Tensor:
         """Draws (D, C) of the standard deviation of sums over the learnt one: quantiles of its posterior."""
-        half_freedom = 0.25 / self.error(threshold).clamp(min=SMALLEST_ERROR).square()
-        return (half_freedom / torch.from_numpy(gammaincinv(half_freedom.numpy(), self.share.numpy()))).sqrt()
+        return self._std_of_sums(self.length(threshold))
+
+    @cached_property
+    def _std_of_sums(self) -> Callable[[int], Tensor]:
+        """Draws by the length of the sums; kept, because the steps of a bisection share few lengths."""
+
+        @cache
+        def std(length: int) -> Tensor:
+            half_freedom = 0.25 / self.error(length).clamp(min=SMALLEST_ERROR).square()
+            return (half_freedom / torch.from_numpy(gammaincinv(half_freedom.numpy(), self.share.numpy()))).sqrt()
+
+        return std
 
     @cached_property
     def rates(self) -> Tensor:
@@ -91,7 +102,7 @@ class FalseAlarmDesign:
 
     def longer(self, factor: float) -> FalseAlarmDesign:
         """The design after learning for `factor` times as long: standard errors fall with the square root of time."""
-        return replace(self, error=lambda threshold: self.error(threshold) * factor**-0.5)
+        return replace(self, error=lambda length: self.error(length) * factor**-0.5)
 
     def learning_factor(self, accuracy: float) -> float:
         """How many times as long the noise must be learnt to know the rate within a factor of `accuracy` (95 %)."""
@@ -195,7 +206,7 @@ def make_detector(
         )
     rate: ChartRate
     update: Callable[[Tensor, Tensor | None], tuple[Tensor, Tensor]]
-    length: Callable[[float], int]  # of the sums that decide about an alarm
+    length: Callable[[float], int]
     if chart == "fixed":
         rate, length, update = fixed_rate, lambda threshold: 1, max_abs
     elif chart == "cusum":
@@ -205,14 +216,13 @@ def make_detector(
     else:
         raise ValueError(f"expected a detector of {', '.join(CHARTS)}, got '{chart}'")
 
-    def error(threshold: float) -> Tensor:
-        if learnt is None:
-            return torch.zeros(channels, dtype=torch.float64)
-        return learnt.error_of_sums(length(threshold))
+    @cache
+    def error(length: int) -> Tensor:
+        return torch.zeros(channels, dtype=torch.float64) if learnt is None else learnt.error_of_sums(length)
 
     median = torch.full((1, channels), 0.5, dtype=torch.float64)
     share = median if learnt is None else latin_hypercube(channels, generator)
-    return Detector(chart, FalseAlarmDesign(rate, error, share, run_length, sampling), update)
+    return Detector(chart, FalseAlarmDesign(rate, length, error, share, run_length, sampling), update)
 
 
 def max_abs(white: Tensor, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
