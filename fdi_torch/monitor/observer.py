@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -157,7 +158,8 @@ class Observer:
     def _lanes(self, samples: Samples) -> torch.Size:
         """Batch shape of recordings, parameters and gains together."""
         values = [v.shape for own in self.values.values() for v in own.values()]
-        return torch.broadcast_shapes(samples.batch, self.gain.steady.shape[:-2], *values)
+        # numpy's: torch's loads a library for symbolic shapes, which takes a second
+        return torch.Size(np.broadcast_shapes(samples.batch, self.gain.steady.shape[:-2], *values))
 
     def _expect_shape(self, network: TankNetwork) -> None:
         shape = (network.order, len(network.description.sensors))

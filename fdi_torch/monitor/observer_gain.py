@@ -11,6 +11,7 @@ from fdi_torch.monitor.stepper import Stepper, slopes
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.network import PlaceValues
 from fdi_torch.plant.scales import length_scale
+from fdi_torch.simulate.forward_mode import constants_with_slopes, with_slope
 
 DOUBLINGS = 60
 LONGEST_TRANSIENT = 2000  # samples until the gain must be steady
@@ -55,10 +56,12 @@ def linearised(stepper: Stepper, levels: Tensor, inputs: Tensor, span: float, va
     """The plant linearised about levels (*batch, tanks), effects steady, inputs (*batch, channels) held `span` s."""
 
     def moved(x: Tensor) -> Tensor:
-        return stepper.advance(stepper.start(x, inputs, values), lambda share: inputs, 0.0, span, values).levels
+        held, given = with_slope(inputs), constants_with_slopes(values)
+        return stepper.advance(stepper.start(x, held, given), lambda share: held, 0.0, span, given).levels
 
     def read(x: Tensor) -> Tensor:
-        return stepper.read(stepper.start(x, inputs, values), span, span, values)[0]
+        given = constants_with_slopes(values)
+        return stepper.read(stepper.start(x, with_slope(inputs), given), span, span, given)[0]
 
     state = stepper.start(levels, inputs, values).levels
     return Linear(slopes(moved, state), slopes(read, state))

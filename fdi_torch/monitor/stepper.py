@@ -16,6 +16,7 @@ from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.plant.signals import Clock
+from fdi_torch.simulate.forward_mode import ZeroSlopes
 
 # In units of the plant's time scale. RK4 with this step has an error of 1e-3 cm on three_tank, far below sensor
 # resolution.
@@ -124,11 +125,14 @@ def substeps(begin: float, span: float, longest: float) -> list[tuple[float, flo
 
 
 def slopes(function: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
-    """Forward-mode Jacobian (*batch, out, in) of a lane-wise function (*batch, in) -> (*batch, out)."""
+    """Forward-mode Jacobian (*batch, out, in) of a lane-wise function (*batch, in) -> (*batch, out).
+
+    The function gives tensors that it does not compute from its argument slopes of zero, see `forward_mode.py`.
+    """
     width = point.shape[-1]
     tangents = torch.eye(width, dtype=point.dtype, device=point.device)
     tangents = tangents.reshape(width, *[1] * (point.dim() - 1), width).expand(width, *point.shape)
-    with forward_ad.dual_level():
+    with forward_ad.dual_level(), ZeroSlopes():
         dual = forward_ad.make_dual(point.expand(width, *point.shape).contiguous(), tangents.contiguous())
         value, slope = forward_ad.unpack_dual(function(dual))
     slope = torch.zeros_like(value) if slope is None else slope

@@ -15,6 +15,8 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.overrides import TorchFunctionMode
 
+from fdi_torch.plant.operating_point import Constants, PlaceValues
+
 _ARITHMETIC = {
     name
     for stem in ("add", "sub", "mul", "div", "truediv")
@@ -28,8 +30,14 @@ def with_slope(value: Tensor, slope: Tensor | None = None) -> Tensor:
     if slope is None:
         if not value.is_floating_point() or forward_ad.unpack_dual(value).tangent is not None:
             return value
+        value = value.contiguous()  # torch refuses expanded tensors
         slope = torch.zeros_like(forward_ad.unpack_dual(value).primal)
     return forward_ad.make_dual(value, forward_ad.unpack_dual(slope).primal)
+
+
+def constants_with_slopes(values: PlaceValues) -> PlaceValues:
+    """The constants of a plant, each with a slope of zero unless it has one."""
+    return Constants({place: {f: with_slope(v) for f, v in constants.items()} for place, constants in values.items()})
 
 
 def value_and_slope(value: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -14,11 +14,17 @@ from torch.autograd import forward_ad
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
-from fdi_torch.plant.operating_point import Constants
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.engine import Engine, expect_columns
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.forward_mode import ZeroSlopes, directions, stack_with_slope, value_and_slope, with_slope
+from fdi_torch.simulate.forward_mode import (
+    ZeroSlopes,
+    constants_with_slopes,
+    directions,
+    stack_with_slope,
+    value_and_slope,
+    with_slope,
+)
 from fdi_torch.simulate.gradient import expect_no_gradient
 
 
@@ -99,9 +105,7 @@ class ReferenceEngine(Engine):
         """lanes (L, P) -> readings (S, L, sensors), with slopes if the lanes have them."""
         values = self.network.bind(self.space, lanes)
         if value_and_slope(lanes)[1] is not None:
-            values = Constants(
-                {place: {f: with_slope(v) for f, v in constants.items()} for place, constants in values.items()}
-            )
+            values = constants_with_slopes(values)
         levels, commands, values = self._integrate(values, len(lanes))
         with self.arithmetic:
             return self._read(self._sample(levels, commands, values), values)
