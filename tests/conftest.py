@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -33,3 +37,18 @@ def real_data() -> Path:
         if folder and Path(folder).is_dir():
             return Path(folder)
     pytest.skip("no real recordings: set FDI_TORCH_DATA")
+
+
+@pytest.fixture(scope="session")
+def watched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str, Any]]]:
+    """Folder, with the log in `logs`, and events of one run of the monitor along the recording of
+    `test_monitor_follow`.
+    """
+    from fdi_torch.cli import main
+    from tests.test_monitor_follow import config, written
+
+    folder, printed = tmp_path_factory.mktemp("watched"), io.StringIO()
+    written(folder / "rig.csv")
+    with redirect_stdout(printed):
+        assert main(["monitor", "--config", config(folder), "--json", "--quiet"]) == 0
+    return folder, [json.loads(line) for line in printed.getvalue().splitlines()]

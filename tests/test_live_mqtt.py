@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from live_servers import Broker, broker, free_port
-from test_monitor_follow import config, growing, logged_events, monitored, readings, texts, written
+from test_monitor_follow import config, growing, logged_events, monitored, readings, texts
 
 from fdi_torch.cli import INTERRUPTED, MISUSE, main
 from fdi_torch.live.mqtt import MqttClient
@@ -101,11 +101,10 @@ def told(events: list[dict[str, object]]) -> list[tuple[object, ...]]:
 
 
 @pytest.fixture
-def expected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> list[tuple[object, ...]]:
+def expected(watched: tuple[Path, list[dict[str, Any]]]) -> list[tuple[object, ...]]:
     """The events of the file."""
-    events = monitored(["--config", config(tmp_path, recording={"file": str(written(tmp_path / "all.csv"))})], capsys)
-    assert [kind for _, kind, *_ in told(events)][:3] == ["watching", "alarm", "isolated"]
-    return told(events)
+    assert [kind for _, kind, *_ in told(watched[1])][:3] == ["watching", "alarm", "isolated"]
+    return told(watched[1])
 
 
 def test_a_recording_through_a_broker_gives_the_events_of_the_file(
@@ -157,6 +156,7 @@ def test_a_broker_that_is_stopped_and_started_again_loses_no_event(
 def test_a_killed_run_of_a_source_with_dates_is_resumed_with_its_time_origin(
     tmp_path: Path,
     running: Broker,
+    expected: list[tuple[object, ...]],
     when_subscribed: WhenSubscribed,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -183,15 +183,15 @@ def test_a_killed_run_of_a_source_with_dates_is_resumed_with_its_time_origin(
     rig.send(dated[225:])
     late = monitored([*words, "--resume"], capsys)
     rig.close()
-    whole = monitored(["--config", config(tmp_path, recording={"file": str(written(tmp_path / "all.csv"))})], capsys)
-    assert told(early) + told(late) == told(whole)
+    assert told(early) + told(late) == expected
     [log] = (tmp_path / "logs").glob("watch.mcap")
-    assert [time for time, *_ in told(logged_events_as_told(log))] == [time for time, *_ in told(whole)]
+    assert [time for time, *_ in told(logged_events_as_told(log))] == [time for time, *_ in expected]
 
 
 def test_samples_of_a_run_that_is_killed_while_it_learns_are_kept(
     tmp_path: Path,
     running: Broker,
+    expected: list[tuple[object, ...]],
     when_subscribed: WhenSubscribed,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -213,8 +213,7 @@ def test_samples_of_a_run_that_is_killed_while_it_learns_are_kept(
     rig.send(MESSAGES[100:])
     resumed = monitored([*words, "--resume"], capsys)
     rig.close()
-    whole = monitored(["--config", config(tmp_path, recording={"file": str(written(tmp_path / "all.csv"))})], capsys)
-    assert told(resumed) == told(whole)
+    assert told(resumed) == expected
     assert not kept.exists()
 
 
