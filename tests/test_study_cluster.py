@@ -49,7 +49,8 @@ def test_killing_one_of_two_workers_changes_no_trial(plan: Plan) -> None:
     assert sorted(alone) == list(range(16))
 
 
-def test_nobody_at_the_address_is_said(plan: Plan) -> None:
+def test_nobody_at_the_address_is_said(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdi_torch.study.cluster.CONNECT_SECONDS", 0.5)
     with pytest.raises(ValueError, match="expected a Dask scheduler at tcp"):
         next(run_on_cluster(plan, plan.blocks(), "tcp://127.0.0.1:1"))
 

@@ -22,6 +22,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 LOCAL = "local"
 LOOPBACK = "127.0.0.1"  # address of a local cluster, not reachable from other machines
+CONNECT_SECONDS = 10.0  # to wait for a scheduler
 # Number of lost workers per block after which the study fails.
 LOST_WORKERS = 20
 
@@ -75,7 +76,7 @@ def connected(address: str, workers: int | None = None) -> Iterator[Client]:
             yield client
         return
     try:
-        client = Client(address, timeout="10s")
+        client = Client(address, timeout=CONNECT_SECONDS)
     except (OSError, ValueError) as error:
         raise ValueError(
             f"expected a Dask scheduler at {address}, got no answer; give its address as in tcp://host:8786, or 'local'"
