@@ -214,9 +214,7 @@ def test_a_trusted_recording_is_not_refused() -> None:
 
 
 FAULTS = [
-    {"T1.leak.size": 0.5},
     {"Q1.pump_gain.factor": 0.3},
-    {"P13.plugging.size": 0.8},
     {"h2.sensor_gain.factor": 0.3},
     {"h2.sensor_bias.bias": 0.2},
     {"Q1.pump_delay.delay": 40.0},

@@ -89,7 +89,7 @@ def test_there_are_such_effects_and_they_have_states_in_a_network() -> None:
 
 
 @pytest.mark.slow
-@each_place
+@at_the_first_place
 def test_adaptive_steps_agree_with_short_fixed_steps(placement: Placement) -> None:
     plant = with_effect(placement)
     recording, network = recording_of(plant, 100), build_network(plant)
@@ -156,7 +156,7 @@ def test_training_recovers_its_size(placement: Placement) -> None:
 
 
 @pytest.mark.slow
-@each_place
+@at_the_first_place
 def test_gap_names_it(placement: Placement) -> None:
     recording = noisy(recording_of(with_effect(placement), 600))
     answer = diagnose(

@@ -88,7 +88,7 @@ def recorded(
     return replace(blank, outputs=torch.tensor(rows, dtype=torch.float64) + noise, mask=None)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("flow", "hold", "seed"), [(4e-5, 1, 2), (8e-6, 5, 1), (2e-5, 5, 2), (2e-5, 5, 1)])
+@pytest.mark.parametrize(("flow", "hold", "seed"), [(4e-5, 1, 2), (2e-5, 5, 1)])
 def test_large_random_flows_are_no_unknown_cause(flow: float, hold: int, seed: int) -> None:
     """The lag of a pipe's flow is close to a random flow of the same step, if it is computed from later readings."""
     fitter, null, _ = recalibrate(problem_of(nominal_plant(), (recorded(flow, hold, seed),), (), Settings()).data)
@@ -144,9 +144,8 @@ def test_a_plugging_in_mid_record_is_found_despite_random_flows() -> None:
     assert abs(onset.value - 350.0) < max(5.0 * onset.std, 2.0)
 
 
-@pytest.mark.parametrize("seed", [3, 5])
-def test_an_onset_is_found_although_slow_random_flows_explain_a_flow_that_changed_long_ago(seed: int) -> None:
-    recording = recorded(3e-6, 100, seed, plugged=0.2, onset=385.0)
+def test_an_onset_is_found_although_slow_random_flows_explain_a_flow_that_changed_long_ago() -> None:
+    recording = recorded(3e-6, 100, seed=3, plugged=0.2, onset=385.0)
     problem = problem_of(nominal_plant(), [recording], [], Settings(("plugging",)))
     fitter, null, _ = recalibrate(problem.data)
     pool = ExplanationPool(fitter, null, len(problem.library))
@@ -158,8 +157,10 @@ def test_an_onset_is_found_although_slow_random_flows_explain_a_flow_that_change
     assert abs(best.fit.values["P13.plugging.onset"] - 385.0) < 5.0
 
 
-@pytest.mark.parametrize("between", [(95, 330), (180, 560), (20, 60)])
-@pytest.mark.parametrize(("flow", "hold"), [(0.0, 1), (3e-6, 100)])
+@pytest.mark.parametrize(
+    ("between", "flow", "hold"),
+    [((20, 60), 0.0, 1), ((95, 330), 3e-6, 100), ((180, 560), 3e-6, 100), ((20, 60), 3e-6, 100)],
+)
 def test_both_ends_of_an_interval_are_found_wherever_they_are(between: tuple[int, int], flow: float, hold: int) -> None:
     recording = recorded(flow, hold, seed=6, inflow=-3e-5, between=between)
     problem = problem_of(nominal_plant(), [recording], [], Settings(("unmetered_flow", "leak")))

@@ -217,9 +217,11 @@ def test_kills_at_any_moment(
         code, _ = struck(job, folder, signal.SIGKILL, 10 * share if share < 0 else share)
         assert code in (-signal.SIGKILL, cli.DONE)
         expect_whole(folder)
+        if job.name not in RESUMED and k < kills - 1:  # it starts anew, whatever the kill left: once is enough
+            continue
         end = expect_the_same_end(job, folder, capsys)
         ends[end] = ends.get(end, 0) + 1
         expect_whole(folder)
-    assert sum(ends.values()) == kills
+    assert sum(ends.values()) == (kills if job.name in RESUMED else 1)
     with capsys.disabled():
         sys.stdout.write(f"\n{job.name}: {ends}\n")

@@ -96,8 +96,7 @@ def test_a_detector_beside_no_known_fault_gets_the_white_residuals() -> None:
     assert torch.equal(state.white, state.tested)
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("bias", [0.0, 5e-3])
+@pytest.mark.parametrize(("bias", "seed"), [(0.0, 0), (5e-3, 0), (5e-3, 1)])
 def test_the_end_of_a_fault_shows_as_soon_as_its_pump_runs_again_even_if_another_fault_came_meanwhile(
     bias: float, seed: int
 ) -> None:
