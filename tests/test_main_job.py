@@ -42,7 +42,7 @@ def test_the_built_in_fault_is_found(done: TrainResult) -> None:
 @pytest.mark.slow
 def test_the_reference_engine_finds_the_same(tmp_path: Path) -> None:
     """In Python steps are dear: it searches more roughly and refines adaptively, to the same end."""
-    short = ["simulate.duration=150 s", "estimate.parameters=[T1.leak, T3.leak, P13.openness]"]
+    short = ["simulate.duration=100 s", "estimate.parameters=[T1.leak, T3.leak, P13.openness]"]
     short += ["simulate.faults={T1.leak: 0.3, T3.leak: 0.5, P13.openness: 0.6}"]
     ends = []
     for engine in ("compiled", "reference"):
