@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -15,6 +17,7 @@ from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.array_program import BLOCK
 from fdi_torch.simulate.pointwise import partials
+from fdi_torch.simulate.program import build_program
 from fdi_torch.simulate.traced_rates import RateSlopes, TracedRates, traced_rates
 from tests.rigs import three_tank
 
@@ -125,3 +128,20 @@ def test_plants_share_a_trace_only_if_their_equations_are_the_same() -> None:
     assert traced_rates(networks[0], names[:1]) is not first
     free = (build_network(three_tank(), [Placement(FreeInflow({"level": [0.0, 0.6]}, s), "T1")]) for s in (1.0, 2.0))
     assert len({id(traced_rates(network, names[:1])) for network in free}) == 2
+
+
+def test_equal_plants_share_what_was_traced_and_others_do_not() -> None:
+    """Whatever the equations depend on: the effects and their places, the limits of a sensor, the rims."""
+    at_both = TankNetwork(three_tank(), [place("leak", "T1"), place("leak", "T2")])
+    names = at_both.constants.names
+    at_each = [at_both.restricted_to([prefix]) for prefix in ("T1.leak", "T2.leak")]
+    first, *rest = three_tank().sensors
+    limited = replace(three_tank(), sensors=(replace(first, high=0.5), *rest))
+    others = [*at_each, at_both.without_overflow(), TankNetwork(limited, at_both.placements)]
+    programs = [build_program(network, names, False) for network in (at_both, *others)]
+    assert len({id(program) for program in programs}) == 5
+    again = TankNetwork(three_tank(), at_both.placements)
+    assert build_program(again, names, False) is programs[0]
+    assert build_program(again, names, True) is not programs[0]
+    assert traced_rates(again, names) is traced_rates(at_both, names)
+    assert len({id(traced_rates(network, names)) for network in (at_both, *others[:3])}) == 4

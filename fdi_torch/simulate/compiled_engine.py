@@ -221,14 +221,10 @@ class CompiledEngine(Engine):
 
 
 @lru_cache(maxsize=128)
-def _source(network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptive: bool, inner: bool, real: str) -> str:
+def _source(program: Program, inner: bool, real: str) -> str:
     # With adaptive steps the lanes of a block wait for the slowest one; one register's width keeps that short.
-    lanes = "VECTOR" if adaptive else TANGENT_LANES if tangent else VALUE_LANES
-    return emit(_program(network, names, tangent, adaptive), inner, real, lanes)
-
-
-def _program(network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptive: bool) -> Program:
-    return build_program(network, names, tangent, adaptive, network.order <= MOST_UNROLLED)
+    lanes = "VECTOR" if program.adaptive else TANGENT_LANES if program.tangent else VALUE_LANES
+    return emit(program, inner, real, lanes)
 
 
 @lru_cache(maxsize=128)
@@ -236,7 +232,6 @@ def _kernel(
     network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptive: bool, inner: bool, real: str
 ) -> tuple[Any, Tensor]:
     """The compiled function, and the numbers of the equations that are its arguments."""
-    source = _source(network, names, tangent, adaptive, inner, real)
-    run = _RUN(("run", load_library(source, "run", level=LEVEL)))
-    lifted = _program(network, names, tangent, adaptive).graph.lifted
-    return run, torch.tensor(lifted or [0.0], dtype=torch.float64)
+    program = build_program(network, names, tangent, adaptive, network.order <= MOST_UNROLLED)
+    run = _RUN(("run", load_library(_source(program, inner, real), "run", level=LEVEL)))
+    return run, torch.tensor(program.graph.lifted or [0.0], dtype=torch.float64)

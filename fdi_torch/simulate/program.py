@@ -20,10 +20,11 @@ from fdi_torch.simulate.elimination import Elimination, eliminate
 from fdi_torch.simulate.expression import Graph, Varies
 from fdi_torch.simulate.runge_kutta import Stages, substituted
 from fdi_torch.simulate.section import Output, Place, Row, Section
+from fdi_torch.simulate.structure import Structure, structure_of
 from fdi_torch.simulate.tracer import Tracer
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Program:
     """The sections of a simulation, each a tuple of outputs.
 
@@ -82,9 +83,14 @@ def build_program(
 ) -> Program:
     """The program of a plant whose parameters `names` are the columns of theta; tangent: with the Jacobian.
 
-    Adaptive steps are never unrolled.
+    Adaptive steps are never unrolled. Equal plants share one program.
     """
-    return _Builder(network, names, tangent, adaptive, unrolled and not adaptive).program()
+    return _shared(structure_of(network, names), names, tangent, adaptive, unrolled and not adaptive)
+
+
+@lru_cache(maxsize=64)
+def _shared(structure: Structure, names: tuple[str, ...], tangent: bool, adaptive: bool, unrolled: bool) -> Program:
+    return _Builder(structure.network, names, tangent, adaptive, unrolled).program()
 
 
 class _Builder:

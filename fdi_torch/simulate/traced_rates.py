@@ -15,6 +15,7 @@ from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.array_program import ArrayProgram, NewtonControl
 from fdi_torch.simulate.expression import Graph, Varies
 from fdi_torch.simulate.section import Place
+from fdi_torch.simulate.structure import Structure, structure_of_rates
 from fdi_torch.simulate.tracer import Tracer
 
 Entry = tuple[int, int]
@@ -142,25 +143,9 @@ class _Slopes:
 
 def traced_rates(network: TankNetwork, names: Sequence[str]) -> TracedRates:
     """The traced rates of a plant; plants with the same components and effects share one trace."""
-    plant = network.description
-    structure = type(network), network.may_overflow, plant.gravity, plant.tanks, *plant.flow_components()
-    effects = tuple(p.effect for p in network.placements)  # the names of their constants hold their places
-    return _shared(_Structure((structure, effects, network.constants.names, tuple(names)), network))
-
-
-class _Structure:
-    """A network as the key of a cache: two are equal if all that their equations depend on is equal."""
-
-    def __init__(self, key: tuple[object, ...], network: TankNetwork) -> None:
-        self.key, self.network = key, network
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Structure) and self.key == other.key
+    return _shared(structure_of_rates(network, names), tuple(names))
 
 
 @lru_cache(maxsize=256)
-def _shared(structure: _Structure) -> TracedRates:
-    return TracedRates(structure.network, structure.key[-1])  # type: ignore[arg-type]
+def _shared(structure: Structure, names: tuple[str, ...]) -> TracedRates:
+    return TracedRates(structure.network, names)
