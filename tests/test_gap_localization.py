@@ -206,16 +206,15 @@ def test_noise_and_evidence_of_a_discrepancy_refer_to_one_trajectory(
     assert likely.log_likelihood == pytest.approx(least, abs=1e-2)
 
 
-@pytest.mark.parametrize("nearest", [140, 180])
-def test_the_thresholds_of_a_relay_are_found_between_those_of_the_grid(nearest: int) -> None:
-    """An outlet that gains 1 % of flow while a relay of its head is on. nearest: thresholds of the grid near those."""
+def test_the_thresholds_of_a_relay_are_found_between_those_of_the_grid() -> None:
+    """An outlet that gains 1 % of flow while a relay of its head is on."""
     case = problem_of(nominal_plant(), (recorded({}, 8, samples=2500),), (), Settings())
     plain, null, _ = recalibrate(case.data)
     fitter, likely = with_estimated_noise(plain, null)
     regression = DiscrepancyRegression(fitter, null, (), LevelFilter(likely.noise))
     (relays,) = [f for f in regression.at("OUT2")[0][0].fine if isinstance(f, Relays)]
     spacing = float(relays.thresholds[0, 1] - relays.thresholds[0, 0])
-    truth = relays.thresholds[nearest] + spacing * torch.tensor([0.3, -0.4], dtype=torch.float64)
+    truth = relays.thresholds[140] + spacing * torch.tensor([0.3, -0.4], dtype=torch.float64)
     influence = 0.01 * regression.influence("OUT2", 0, relays.functions_at(truth.unsqueeze(0)))
     observed = fitter.of(replace(fitter.data, readings=fitter.data.readings + influence[..., 0]))
     regression = DiscrepancyRegression(observed, null, (), LevelFilter(likely.noise))

@@ -189,16 +189,10 @@ FLOW = {"std": 2.5e-6, "unit": "m^3/s", "correlation_time": 15.0}
 
 
 @pytest.mark.parametrize("plant", ["three_tank", "quadruple_tank"])
-@pytest.mark.parametrize("further", [{}, {"disturbances": {"T1": FLOW}}], ids=["usual", "random flows"])
-def test_the_result_of_a_gap_is_on_one_screen(
-    browser: Any,  # noqa: F811
-    plant: str,
-    further: dict[str, Any],
-    tmp_path: Path,
-) -> None:
-    """plant: with tanks in a row, or in two. further: a section more, by which the index fills a line more."""
+def test_the_result_of_a_gap_is_on_one_screen(browser: Any, plant: str, tmp_path: Path) -> None:  # noqa: F811
+    """With tanks in a row, or in two; random flows are a section more, by which the index fills a line more."""
     target, height = tmp_path / "gap.html", 900
-    log = write_gap(tmp_path / "gap.mcap", **further)
+    log = write_gap(tmp_path / "gap.mcap", disturbances={"T1": FLOW})
     target.write_text(page([report_of(material_of(log, load_plant(plant)))]))
     tab, _ = opened(browser, target)
     for title in ("The rig", "What causes it", "Where the gap lies", "How far it closes"):

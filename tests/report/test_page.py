@@ -12,7 +12,7 @@ from sample_runs import NASTY, material_of, write_train
 from fdi_torch import cli
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.logbook import RunLog
-from fdi_torch.report.page import page, report_of, write_pictures
+from fdi_torch.report.page import RunReport, page, report_of, write_pictures
 from fdi_torch.report.verdict import headline
 
 # Eight lists, each ten times the one before: a hundred million values.
@@ -38,22 +38,31 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_train(tmp_path_factory.mktemp("logs") / "run.mcap")
 
 
-def test_the_verdict_comes_first_in_words(log: Path) -> None:
-    text = page([report_of(material_of(log, load_plant("three_tank")))])
+@pytest.fixture(scope="module")
+def reported(log: Path) -> RunReport:
+    return report_of(material_of(log, load_plant("three_tank")))
+
+
+@pytest.fixture(scope="module")
+def text(reported: RunReport) -> str:
+    return page([reported])
+
+
+def test_the_verdict_comes_first_in_words(log: Path, text: str) -> None:
     assert headline(material_of(log)) == "Fault: leak at T1 (size 0.3004 ± 0.0020, 30 cm³/s)"
     assert text.index("Fault: leak at T1") < text.index("<svg")
     assert "0.3004 ± 0.0020" in text
     assert "leak at T1 changes the flow by 30 cm³/s, as a sharp-edged hole of 4.8 mm would" in text
 
 
-def test_each_section_is_there_that_the_log_has_something_for(log: Path) -> None:
-    with_plant = [s.title for s in report_of(material_of(log, load_plant("three_tank"))).sections]
+def test_each_section_is_there_that_the_log_has_something_for(log: Path, reported: RunReport) -> None:
+    with_plant = [s.title for s in reported.sections]
     assert with_plant[:4] == ["The rig", "Estimate", "Readings against the estimate", "Inputs"]
     assert [s.title for s in report_of(material_of(log)).sections] == with_plant[1:]
 
 
-def test_the_page_needs_nothing_from_outside(log: Path) -> None:
-    tags = Tags(page([report_of(material_of(log, load_plant("three_tank")))]))
+def test_the_page_needs_nothing_from_outside(text: str) -> None:
+    tags = Tags(text)
     assert tags.names.count("script") == 1, "the charts, which the policy allows by their hash"
     assert not {"link", "iframe", "object", "img", "foreignobject"} & set(tags.names)
     pointing = [v for n, v in tags.attributes if n in ("href", "src", "xlink:href", "action")]
@@ -61,8 +70,8 @@ def test_the_page_needs_nothing_from_outside(log: Path) -> None:
     assert not [n for n, _ in tags.attributes if n.startswith("on")]
 
 
-def test_ids_are_unique_and_every_reference_has_its_target(log: Path) -> None:
-    text = page([report_of(material_of(log, load_plant("three_tank")))] * 2)
+def test_ids_are_unique_and_every_reference_has_its_target(reported: RunReport) -> None:
+    text = page([reported] * 2)
     ids = [v for n, v in Tags(text).attributes if n == "id"]
     assert len(ids) == len(set(ids))
     assert set(re.findall(r'(?:url\(#|href="#)([^")]+)', text)) == set(ids)
