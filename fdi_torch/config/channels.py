@@ -120,19 +120,19 @@ def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[s
     header = ", ".join(map(shortened, _header(path)))
     lines = "\n".join(f"    {line}" for line in mapped(path, plant, also_known))
     raise ValueError(
-        f"{path}: expected a column for {', '.join(missing)}, got {header or 'numbers without a header'}; "
+        f"{path}: expected a column with its unit for {', '.join(missing)}, got {header or 'numbers without a header'}; "
         f"{other_fix.format(inputs=inputs[0]) if other_fix and inputs else ''}"
-        f"{'if columns have other names, ' if header else ''}save these lines as runs.yaml, completed and checked, and "
+        f"{'if columns have other names or no unit, ' if header else ''}save these lines as runs.yaml, completed and checked, and "
         f"name runs.yaml instead:\nrecordings:\n  - file: {path.name}\n{lines}"
     )
 
 
 def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()) -> list[str]:
-    """Lines for a recording file, to be completed, that map the channels without a column of their name in the table.
+    """Lines for a recording file, to be completed, that map the channels without a column of their name with a unit.
 
-    Each is mapped to the next column with a unit of its kind, if there is one. A file whose rows have more cells than
-    its first line has no header: its columns are numbered. A file with a row per value is mapped by its tags. Empty if
-    no channel lacks a column.
+    Each is mapped to the column of its name, else to the next one with a unit of its kind, if there is one. A file
+    whose rows have more cells than its first line has no header: its columns are numbered. A file with a row per value
+    is mapped by its tags. Empty if no channel lacks a column.
     """
     kinds, missing = _units(plant), _missing(path, plant, also_known)
     if not missing:
@@ -153,15 +153,21 @@ def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()
     found = {column: si_unit_of(pair[1]) for column in header if (pair := header_unit(column)) and pair[0] not in kinds}
     lines = ["columns:    # units only where the header has none"]
     for name in missing:
-        column = next((c for c, kind in found.items() if kind == kinds[name]), None)
+        same_kind = (c for c, kind in found.items() if kind == kinds[name])
+        column = None if name in header else next(same_kind, None)
         found.pop(column or "", None)
-        lines.append(f"  {name}: {{column: " + (f'"{column}"}}' if column else "..., unit: ...}"))
+        without_unit = f'"{name}"' if name in header else "..."
+        lines.append(f"  {name}: {{column: " + (f'"{column}"}}' if column else f"{without_unit}, unit: ...}}"))
     return lines
 
 
 def _missing(path: Path, plant: PlantDescription, also_known: Collection[str]) -> list[str]:
-    known = {*unrecorded_valves(path, plant), *also_known}
-    return [name for name in without_column(path, _units(plant)) if name not in known]
+    """The channels that need a column with a unit and have none in the table."""
+    if is_log(path):
+        return []
+    complete = names_in([column for column in _header(path) if header_unit(column)])
+    known = {*unrecorded_valves(path, plant), *also_known, *complete}
+    return [name for name in _units(plant) if name not in known]
 
 
 def _header(path: Path) -> tuple[str, ...]:
