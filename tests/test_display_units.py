@@ -59,6 +59,20 @@ def test_a_plant_file_decides_the_units() -> None:
     assert units == {"m": "mm", "m^2": "mm^2", "m^3/s": "l/min", "1/m": "%/m", "p": "%"}
 
 
+def test_a_gain_per_per_cent_is_displayed_as_written() -> None:
+    text = PLANT.replace("max_flow: 6 l/min}", "max_flow: 6 l/min, gain: 0.06 l/min/%}")
+    plant = build_plant(yaml.safe_load(text), "plant.yaml")
+    assert plant.units["Q.gain"] == "l/min/%" and plant.units["Q"] == "%"
+    with displayed_in(plant.units):
+        assert quantity_text(1e-4, "m^3/s", name="Q.gain") == "0.06 l/min/%"
+    assert "gain: 0.06 l/min/%" in dump_plant(plant) and "units:" not in dump_plant(plant)
+    pump = Pump("Q", "A", max_flow="6 l/min", gain="0.06 l/min/%")
+    rig = Plant(plant.tanks, plant.pipes, [pump], plant.sensors)
+    assert rig.units["Q.gain"] == "l/min/%" and rig.units["Q"] == "%"
+    chosen = build_plant(yaml.safe_load(text) | {"units": {"Q.gain": "m^3/h/%"}}, "plant.yaml")
+    assert build_plant(yaml.safe_load(dump_plant(chosen)), "again").units == chosen.units
+
+
 def test_a_plant_in_code_is_displayed_as_it_was_written() -> None:
     tank = Tank("A", area="16000 mm^2", height="500 mm", leak_reference="OUT")
     pipe = Pipe("OUT", "A", "outside", area="60 mm^2", discharge_coefficient=0.6)
