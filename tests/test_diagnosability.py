@@ -52,8 +52,8 @@ def test_a_correlation_sees_neither_bias_nor_gain_of_a_sensor() -> None:
 def test_plugging_of_the_outlet_and_a_leak_of_its_tank_are_one_and_the_reason_is_told() -> None:
     found = diagnosability(PLANT, SINGLES, steady(), millimetre())
     assert found.groups == (
-        "leak at T2 and plugging at OUT2 cannot be told apart: they act through the same sqrt(2 g h) of T2, "
-        "so that only their sum is seen",
+        "leak at T2 and plugging at OUT2 are indistinguishable: both are flows in proportion to sqrt(2 g h) of T2, "
+        "so that the data determine only their sum",
     )
     assert found.smallest_isolable[1] == math.inf and found.smallest_isolable[5] == math.inf
     assert all(math.isfinite(size) for size in found.smallest_detectable)
