@@ -145,7 +145,7 @@ def test_the_command_prints_a_table_with_units_as_do_inspect_and_the_page(
     ("change", "sentence"),
     [
         ("simulate.duration=1 s", "expected more readings than parameters, got 6 readings for 8 parameters"),
-        ("device=cuda:99", "device: expected one that torch can use here, such as cpu, got 'cuda:99'"),
+        ("device=cuda:99", "device: expected one that torch can use here, got 'cuda:99'; write device: cpu"),
         ("estimate.parameters=[]", "estimate.parameters: expected at least one, got none"),
         ("estimate.parameters=[T1.leek]", "the nearest is 'T1.leak'"),
         ("estimate.parameters=[T9.leak]", "estimate.parameters: plant three_tank: expected one of T1, T2"),
