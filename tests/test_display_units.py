@@ -150,5 +150,5 @@ def test_a_channel_is_displayed_in_the_unit_of_its_column(folder: Path, capsys: 
     (folder / "run.csv").write_text("\n".join(inches))
     recording = read_recording("run.csv", load_plant("plant.yaml"))
     assert recording.written == {"t": "s", "Q": "l/min", "h": "in", "p": "%"}
-    assert display_unit("m", "h")[0] == "in" and display_unit("m^3/s")[0] == "cm^3/s"
+    assert display_unit("m", "h")[0] == "in" and display_unit("m^3/s")[0] == "l/min"
     assert recording.origin["unit.h"] == "in"

@@ -125,7 +125,8 @@ class PlantConfig(component_sections(_NamedPlant)):  # type: ignore[misc]
     )
     units: dict[str, str] = Field(
         default_factory=dict,
-        description="units for display by SI unit, channel or gain of a pump, such as m: mm; by default the units of this file",
+        description="units for display by SI unit, channel or gain of a pump, such as m: mm; by default those of this "
+        "file",
     )
 
 
@@ -146,11 +147,11 @@ def given_plant(plant: AnyPlant) -> PlantDescription:
     return plant
 
 
-def chosen_plant(name: str | Path) -> Plant:
-    """The plant that a command is about; from now on quantities are displayed in its units. Raises ConfigError."""
-    plant = load_plant(name)
-    display_in(units_for_display(plant))
-    return plant
+def chosen_plant(plant: AnyPlant) -> PlantDescription:
+    """As `given_plant`, for the plant that a command is about: from now on quantities are displayed in its units."""
+    chosen = given_plant(plant)
+    display_in(units_for_display(chosen))
+    return chosen
 
 
 def placeholders(path: Path) -> list[str]:

@@ -166,6 +166,8 @@ def set_up(
     """Set up the fit of `parameters` ('T1.leak', 'T1.leak.size', or a Parameter with its own range) to one or several
     recordings.
 
+    plant, recordings: `fdi_torch.set_up` also takes their names, as `gap` does. A recording in memory is taken as it
+    is; one from a file is split into segments with known inputs.
     start: initial levels, one choice for all tanks or a mapping by tank, for all recordings or a sequence with one
     entry per recording. A choice is 'equilibrium' (the level of the plant file, else the equilibrium under the first
     inputs), 'free' (estimated) or a level in m. The fit is computed on the device of the recordings.
