@@ -364,7 +364,7 @@ def test_columns_of_the_right_names_without_units_are_mapped_to_themselves(
     words = ["--plant", "rig.yaml", "--recording", "run.csv"]
     assert cli.main(["check", *words]) == cli.MISUSE
     message = capsys.readouterr().err
-    assert "expected a column with its unit for Q, hA, got" in message
+    assert "expected a column for Q, hA, got t_s, Q, hA, hB_mm; if columns have other names or no unit, " in message
     lines = message.partition("recordings:\n")[2].replace('"Q", unit: ...', '"Q", unit: l/min')
     Path("runs.yaml").write_text("recordings:\n" + lines.replace('"hA", unit: ...', '"hA", unit: cm'))
     assert cli.main(["check", "--plant", "rig.yaml", "--recording", "runs.yaml"]) == cli.NOT_EXPLAINED

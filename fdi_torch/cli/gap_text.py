@@ -70,8 +70,9 @@ def next_steps(
         )
     moved = [name for name, c in answer.constants.items() if _tolerances_off(c, "augmented") > MOVED]
     if moved:
+        still = "even with the causes, " if has_causes(answer.to_dict()) else ""
         steps.append(
-            f"{'even with the causes, ' if has_causes(answer.to_dict()) else ''}{listed(moved)} {'is' if len(moved) == 1 else 'are'} more than {MOVED:g} "
+            f"{still}{listed(moved)} {'is' if len(moved) == 1 else 'are'} more than {MOVED:g} "
             f"tolerances off {'its nominal value' if len(moved) == 1 else 'their nominal values'}: calibrate the plant "
             "file with a fault-free recording (fdi refit --adopt), then repeat the diagnosis with the calibrated file"
         )

@@ -120,10 +120,10 @@ def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[s
     header = ", ".join(map(shortened, _header(path)))
     lines = "\n".join(f"    {line}" for line in mapped(path, plant, also_known))
     raise ValueError(
-        f"{path}: expected a column with its unit for {', '.join(missing)}, got {header or 'numbers without a header'}; "
+        f"{path}: expected a column for {', '.join(missing)}, got {header or 'numbers without a header'}; "
         f"{other_fix.format(inputs=inputs[0]) if other_fix and inputs else ''}"
-        f"{'if columns have other names or no unit, ' if header else ''}save these lines as runs.yaml, completed and checked, and "
-        f"name runs.yaml instead:\nrecordings:\n  - file: {path.name}\n{lines}"
+        f"{'if columns have other names or no unit, ' if header else ''}save these lines as runs.yaml, completed and "
+        f"checked, and name runs.yaml instead:\nrecordings:\n  - file: {path.name}\n{lines}"
     )
 
 

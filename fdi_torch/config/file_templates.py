@@ -165,7 +165,9 @@ def _shares(plant: PlantDescription, channel: str, shares: Sequence[float]) -> l
     """Commands that are these shares of a pump's or transfer's range; of a valve, fully open."""
     full = {c.channel: (c.full_command, c.command_unit) for c in plant.metered_flows()}
     return (
-        [quantity_text(share * full[channel][0], full[channel][1], 3, channel) for share in shares] if channel in full else ["1"]
+        [quantity_text(share * full[channel][0], full[channel][1], 3, channel) for share in shares]
+        if channel in full
+        else ["1"]
     )
 
 
@@ -174,7 +176,9 @@ AT_RIM = {"1": 1.0, "V": 10.0, "A": 0.02, "Pa": 9810.0 * HEIGHT}
 """What a sensor reads at the rim, by the unit of its reading: 100 %, 10 V, 20 mA, water."""
 READING = re.compile(r"[LHX]|P[A-Z]|.*(level|füllstand|niveau|pegel|pressure|druck)", re.IGNORECASE)
 """Tags of levels and pressures (ISA-5.1: PT, PI; P-101 is a pump), letters of levels by custom, and words."""
-COMMAND = re.compile(r".*(pump|valve|ventil|pwm|duty|cmd|command|speed|drehzahl)|[A-Z]+C\W?\d+\W?(out|op)$", re.IGNORECASE)
+COMMAND = re.compile(
+    r".*(pump|valve|ventil|pwm|duty|cmd|command|speed|drehzahl)|[A-Z]+C\W?\d+\W?(out|op)$", re.IGNORECASE
+)
 """Words, and tags of a controller's output (LIC-101.OUT)."""
 PUMPS = "pumps:    # ! the tank that each fills, and its greatest flow; a flow out of a tank belongs under transfers"
 

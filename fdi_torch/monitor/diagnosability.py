@@ -181,7 +181,8 @@ def _reason(plant: PlantDescription, members: Sequence[str]) -> str:
     tanks = {c.name for c in components if isinstance(c, Tank)}
     holes = [c for c in components if isinstance(c, Tank) or (isinstance(c, Pipe) and c.is_outlet)]
     if sources and len(holes) == len(components) and len(sources | tanks) == 1:
-        return f"both are flows in proportion to sqrt(2 g h) of {next(iter(sources))}, so that the data determine only their sum"
+        tank = next(iter(sources))
+        return f"both are flows in proportion to sqrt(2 g h) of {tank}, so that the data determine only their sum"
     return "their signatures are the same under these inputs; other inputs or sensors may distinguish them"
 
 
