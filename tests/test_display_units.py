@@ -66,9 +66,9 @@ def test_a_gain_per_per_cent_is_displayed_as_written() -> None:
     with displayed_in(plant.units):
         assert quantity_text(1e-4, "m^3/s", name="Q.gain") == "0.06 l/min/%"
     assert "gain: 0.06 l/min/%" in dump_plant(plant) and "units:" not in dump_plant(plant)
-    pump = Pump("Q", "A", max_flow="6 l/min", gain="0.06 l/min/%")
+    pump = Pump("Q", "A", max_flow="6 l/min", gain="0.06 l/min/%", command="SIC1")
     rig = Plant(plant.tanks, plant.pipes, [pump], plant.sensors)
-    assert rig.units["Q.gain"] == "l/min/%" and rig.units["Q"] == "%"
+    assert rig.units["Q.gain"] == "l/min/%" and rig.units["SIC1"] == "%"
     chosen = build_plant(yaml.safe_load(text) | {"units": {"Q.gain": "m^3/h/%"}}, "plant.yaml")
     assert build_plant(yaml.safe_load(dump_plant(chosen)), "again").units == chosen.units
 
