@@ -176,6 +176,12 @@ def test_an_unwritable_folder_is_said(tmp_path: Path, capsys: pytest.CaptureFixt
     assert str(blocked) in capsys.readouterr().err
 
 
+def test_a_simulated_command_beyond_the_pump_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wish = ["simulate.inputs.Q1=150 cm^3/s", "simulate.duration=20 s", "output.name=much"]
+    assert main(["simulate", "--out", str(tmp_path), *(word for each in wish for word in ("--set", each))]) == 0
+    assert "Q1 asks for up to 150 cm^3/s of Q1, which delivers 90 cm^3/s at most" in capsys.readouterr().err
+
+
 def test_simulate_writes_a_recording_that_train_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", "--quiet", "--out", str(tmp_path), "--set", "simulate.duration=400 s"]) == DONE
     assert "401 samples" in capsys.readouterr().out
