@@ -177,3 +177,10 @@ def test_inputs_may_come_from_a_file_that_maps_the_columns(tmp_path: Path, capsy
     listing.write_text(f"recordings: [{lab}, {lab}]\n")
     assert main(words) == 2
     assert "--input: expected one recording with known inputs, got 2" in capsys.readouterr().err
+
+
+def test_the_inputs_are_those_of_a_recording_by_either_name(tmp_path: Path) -> None:
+    (tmp_path / "planned.csv").write_text("t_s,Q1_cm3_s,Q2_cm3_s\n0,50,50\n300,70,50\n600,50,50\n")
+    for name in ("--input", "--recording"):
+        words = ["diagnosability", "--plant", "three_tank", name, str(tmp_path / "planned.csv"), "--quiet"]
+        assert main([*words, "--faults", "T1.leak"]) == 0
