@@ -360,13 +360,17 @@ def test_columns_of_the_right_names_without_units_are_mapped_to_themselves(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     fdi("new", "plant", "--out", "rig.yaml", "--quiet")
-    Path("run.csv").write_text("t_s;Q;hA;hB_mm\n" + "".join(f"{k};3,1;{20 + k % 2};{155 + k % 3}\n" for k in range(60)))
+    Path("run.csv").write_text(
+        "t_s;Q;hA_inch.;hB_mm\n" + "".join(f"{k};3,1;{20 + k % 2};{155 + k % 3}\n" for k in range(60))
+    )
     words = ["--plant", "rig.yaml", "--recording", "run.csv"]
     assert cli.main(["check", *words]) == cli.MISUSE
     message = capsys.readouterr().err
-    assert "expected a column for Q, hA, got t_s, Q, hA, hB_mm; if columns have other names or no unit, " in message
+    assert (
+        "expected a column for Q, hA, got t_s, Q, hA_inch., hB_mm; if columns have other names or no unit, " in message
+    )
     lines = message.partition("recordings:\n")[2].replace('"Q", unit: ...', '"Q", unit: l/min')
-    Path("runs.yaml").write_text("recordings:\n" + lines.replace('"hA", unit: ...', '"hA", unit: cm'))
+    Path("runs.yaml").write_text("recordings:\n" + lines.replace('"hA_inch.", unit: ...', '"hA_inch.", unit: cm'))
     assert cli.main(["check", "--plant", "rig.yaml", "--recording", "runs.yaml"]) == cli.NOT_EXPLAINED
     assert "run.csv: 60 samples" in capsys.readouterr().out
     fdi("new", "run", *words)

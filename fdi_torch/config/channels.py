@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
@@ -130,7 +131,7 @@ def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[s
 def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()) -> list[str]:
     """Lines for a recording file, to be completed, that map the channels without a column of their name with a unit.
 
-    Each is mapped to the column of its name, else to the next one with a unit of its kind, if there is one. A file
+    Each is mapped to the column of its name, without a known unit, else to the next one with a unit of its kind. A file
     whose rows have more cells than its first line has no header: its columns are numbered. A file with a row per value
     is mapped by its tags. Empty if no channel lacks a column.
     """
@@ -151,13 +152,14 @@ def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()
         lines = [f"tags: {{tag: {tags.tag}, value: {tags.value}{quality}}}    # one row per value", "columns:"]
         return [*lines, *(f"  {name}: {{column: TAG, unit: ...}}" for name in missing)]
     found = {column: si_unit_of(pair[1]) for column in header if (pair := header_unit(column)) and pair[0] not in kinds}
+    without_unit = [column for column in header if header_unit(column) is None]
     lines = ["columns:    # units only where the header has none"]
     for name in missing:
-        same_kind = (c for c, kind in found.items() if kind == kinds[name])
-        column = None if name in header else next(same_kind, None)
-        found.pop(column or "", None)
-        without_unit = f'"{name}"' if name in header else "..."
-        lines.append(f"  {name}: {{column: " + (f'"{column}"}}' if column else f"{without_unit}, unit: ...}}"))
+        own = next((c for c in without_unit if re.match(rf"{re.escape(name)}(?![^\W_])", c)), None)
+        same_kind = None if own else next((c for c, kind in found.items() if kind == kinds[name]), None)
+        found.pop(same_kind or "", None)
+        column = f'"{own or same_kind}"' if own or same_kind else "..."
+        lines.append(f"  {name}: {{column: {column}" + ("}" if same_kind else ", unit: ...}"))
     return lines
 
 
