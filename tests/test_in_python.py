@@ -424,6 +424,12 @@ def test_an_effect_without_a_field_means_its_size() -> None:
         fdi_torch.set_up(RIG, [simulated()], ["A.leek"])
 
 
+@pytest.mark.parametrize("level", ["70 cm", "-1 cm"])
+def test_an_initial_level_lies_between_floor_and_rim(level: str) -> None:
+    with pytest.raises(ValueError, match=rf"start level of A: expected a level from the floor to .*, got {level}"):
+        fdi_torch.simulate(RIG, inputs={"Q": "3 l/min"}, duration="10 s", start_levels={"A": level})
+
+
 def test_an_initial_level_that_is_free_needs_no_mention() -> None:
     with pytest.raises(ValueError, match=r"A.start_level: expected no initial level among the parameters, as it is"):
         fdi_torch.set_up(RIG, [simulated()], ["A.start_level"])
