@@ -68,7 +68,7 @@ class EvaluatedDiscrepancy:
 
     @property
     def held(self) -> Mapping[str, float]:
-        """The parameters of the effects at the place, which are not refitted: the discrepancy is the error of their laws."""
+        """Parameters of the effects at the place. They stay fixed: the discrepancy is the error of their laws."""
         fit = self.regression.fit
         return fit.values_of([p for p in fit.candidate.placements if p.location == self.location])
 
