@@ -121,7 +121,7 @@ def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
     first, last = float(read.time[0]), float(read.time[-1])
     enough = _rounded_up(_learning_time(read, every))
     until = first + min(enough, 0.5 * (last - first))
-    return f"[{first:.10g} s, {until:.10g} s]    # the noise is learnt from it; {enough:.10g} s suffice if it is white"
+    return f"[{first:.10g} s, {until:.10g} s]    # the noise is learnt from it; white noise needs some {enough:.10g} s"
 
 
 def _learning_time(recording: Recording, false_alarms_every: float) -> float:
