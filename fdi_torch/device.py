@@ -18,7 +18,7 @@ def usable_device(name: str) -> torch.device:
     try:
         torch.zeros(1, device=name)
     except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"device: expected one that torch can use here, such as cpu, got '{name}'") from error
+        raise ValueError(f"device: expected one that torch can use here, got '{name}'; write device: cpu") from error
     return torch.device(name)
 
 

@@ -118,6 +118,7 @@ def test_overrides_reach_into_lists() -> None:
         ("simulate.duration=1000", "simulate.duration: expected a quantity in s, got the bare number 1000"),
         ("simulate.duration=1000 cm", "simulate.duration: expected a quantity in s .* got '1000 cm'"),
         ("engine=fast", "engine: expected 'auto', 'reference', 'compiled' or 'traced', got 'fast'"),
+        ("device=gpu", "device: expected cpu, cuda or a number of a GPU such as cuda:1, got 'gpu'; correct it"),
         ("seed=-1", "seed: expected greater than or equal to 0, got -1"),
         ("plant=three_tanks", "plant: expected a plant file .* got 'three_tanks'; the nearest is 'three_tank'"),
         ("plant=7", "plant: expected a shipped plant, a plant file or a plant, got 7"),

@@ -52,8 +52,8 @@ def test_a_correlation_sees_neither_bias_nor_gain_of_a_sensor() -> None:
 def test_plugging_of_the_outlet_and_a_leak_of_its_tank_are_one_and_the_reason_is_told() -> None:
     found = diagnosability(PLANT, SINGLES, steady(), millimetre())
     assert found.groups == (
-        "leak at T2 and plugging at OUT2 cannot be told apart: they act through the same sqrt(2 g h) of T2, "
-        "so that only their sum is seen",
+        "leak at T2 and plugging at OUT2 are indistinguishable: both are flows in proportion to sqrt(2 g h) of T2, "
+        "so that the data determine only their sum",
     )
     assert found.smallest_isolable[1] == math.inf and found.smallest_isolable[5] == math.inf
     assert all(math.isfinite(size) for size in found.smallest_detectable)
@@ -177,3 +177,10 @@ def test_inputs_may_come_from_a_file_that_maps_the_columns(tmp_path: Path, capsy
     listing.write_text(f"recordings: [{lab}, {lab}]\n")
     assert main(words) == 2
     assert "--input: expected one recording with known inputs, got 2" in capsys.readouterr().err
+
+
+def test_the_inputs_are_those_of_a_recording_by_either_name(tmp_path: Path) -> None:
+    (tmp_path / "planned.csv").write_text("t_s,Q1_cm3_s,Q2_cm3_s\n0,50,50\n300,70,50\n600,50,50\n")
+    for name in ("--input", "--recording"):
+        words = ["diagnosability", "--plant", "three_tank", name, str(tmp_path / "planned.csv"), "--quiet"]
+        assert main([*words, "--faults", "T1.leak"]) == 0

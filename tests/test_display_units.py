@@ -59,6 +59,20 @@ def test_a_plant_file_decides_the_units() -> None:
     assert units == {"m": "mm", "m^2": "mm^2", "m^3/s": "l/min", "1/m": "%/m", "p": "%"}
 
 
+def test_a_gain_per_per_cent_is_displayed_as_written() -> None:
+    text = PLANT.replace("max_flow: 6 l/min}", "max_flow: 6 l/min, gain: 0.06 l/min/%}")
+    plant = build_plant(yaml.safe_load(text), "plant.yaml")
+    assert plant.units["Q.gain"] == "l/min/%" and plant.units["Q"] == "%"
+    with displayed_in(plant.units):
+        assert quantity_text(1e-4, "m^3/s", name="Q.gain") == "0.06 l/min/%"
+    assert "gain: 0.06 l/min/%" in dump_plant(plant) and "units:" not in dump_plant(plant)
+    pump = Pump("Q", "A", max_flow="6 l/min", gain="0.06 l/min/%", command="SIC1")
+    rig = Plant(plant.tanks, plant.pipes, [pump], plant.sensors)
+    assert rig.units["Q.gain"] == "l/min/%" and rig.units["SIC1"] == "%"
+    chosen = build_plant(yaml.safe_load(text) | {"units": {"Q.gain": "m^3/h/%"}}, "plant.yaml")
+    assert build_plant(yaml.safe_load(dump_plant(chosen)), "again").units == chosen.units
+
+
 def test_a_plant_in_code_is_displayed_as_it_was_written() -> None:
     tank = Tank("A", area="16000 mm^2", height="500 mm", leak_reference="OUT")
     pipe = Pipe("OUT", "A", "outside", area="60 mm^2", discharge_coefficient=0.6)
@@ -136,5 +150,5 @@ def test_a_channel_is_displayed_in_the_unit_of_its_column(folder: Path, capsys: 
     (folder / "run.csv").write_text("\n".join(inches))
     recording = read_recording("run.csv", load_plant("plant.yaml"))
     assert recording.written == {"t": "s", "Q": "l/min", "h": "in", "p": "%"}
-    assert display_unit("m", "h")[0] == "in" and display_unit("m^3/s")[0] == "cm^3/s"
+    assert display_unit("m", "h")[0] == "in" and display_unit("m^3/s")[0] == "l/min"
     assert recording.origin["unit.h"] == "in"

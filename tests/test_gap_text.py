@@ -96,7 +96,9 @@ def test_random_flows_below_the_noise_are_left_out(capsys: pytest.CaptureFixture
     assert "random" not in capsys.readouterr().out
 
 
-def test_constants_that_stay_out_of_their_tolerances_are_to_be_calibrated_first() -> None:
+def test_constants_that_stay_out_of_their_tolerances_are_to_be_calibrated_first(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     beyond = {"nominal": 0.6, "tolerance": 0.02, "recalibrated": 0.66, "augmented": 0.66, "std": 0.001, "unit": "1"}
     absorbed = {**beyond, "augmented": 0.61}  # back within its tolerance with the causes
     answer = replace(BOTH, constants={"P13.discharge_coefficient": beyond, "OUT2.discharge_coefficient": absorbed})
@@ -109,6 +111,11 @@ def test_constants_that_stay_out_of_their_tolerances_are_to_be_calibrated_first(
         in next_steps(two, False, None, None, None)[0]
     )
     assert "calibrate" not in " ".join(next_steps(BOTH, False, None, None, None))
+    assert first.startswith("even with the causes, P13.discharge_coefficient")
+    no_gap = replace(answer, verdict="no_gap", causes=[])
+    assert next_steps(no_gap, False, None, None, None)[0].startswith("P13.discharge_coefficient is")
+    show(no_gap, nominal_plant(), [], Screen())
+    assert "constant                   nominal  tolerance  fitted  std error" in capsys.readouterr().out
 
 
 def test_an_ambiguous_verdict_states_which_causes_are_certain() -> None:

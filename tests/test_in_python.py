@@ -408,6 +408,13 @@ def test_a_calibration_in_python_recovers_the_constant_and_narrows_its_tolerance
     assert "mean square error h 0.09" in found.headline and "discharge_coefficient" in repr(found)
 
 
+def test_refit_and_predict_tell_how_far_they_are() -> None:
+    for job in (fdi_torch.refit, fdi_torch.predict):
+        shares: list[float] = []
+        job(RIG, simulated(), tell=lambda share, text, shares=shares: shares.append(share))
+        assert shares[0] == 0.0 and shares[-1] == 1.0 and shares == sorted(shares)
+
+
 def test_an_effect_without_a_field_means_its_size() -> None:
     fitting = fdi_torch.set_up(RIG, [simulated()], ["A.leak", "Q.gain"], "equilibrium")
     assert fitting.space.names == ("A.leak.size", "Q.gain")
@@ -415,6 +422,12 @@ def test_an_effect_without_a_field_means_its_size() -> None:
         fdi_torch.set_up(RIG, [simulated()], ["A.heigt"])
     with pytest.raises(ValueError, match=r"parameters: expected .* got 'A.leek'; the nearest is 'A.leak'"):
         fdi_torch.set_up(RIG, [simulated()], ["A.leek"])
+
+
+@pytest.mark.parametrize("level", ["70 cm", "-1 cm"])
+def test_an_initial_level_lies_between_floor_and_rim(level: str) -> None:
+    with pytest.raises(ValueError, match=rf"start level of A: expected a level from the floor to .*, got {level}"):
+        fdi_torch.simulate(RIG, inputs={"Q": "3 l/min"}, duration="10 s", start_levels={"A": level})
 
 
 def test_an_initial_level_that_is_free_needs_no_mention() -> None:

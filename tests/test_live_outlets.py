@@ -60,6 +60,7 @@ def test_metrics_follow_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     lines = dict(line.rsplit(" ", 1) for line in pages[0].splitlines() if not line.startswith("#"))
     assert float(lines["fdi_samples_total"]) == SAMPLES and float(lines["fdi_plant_time_seconds"]) == SAMPLES - 1
     assert float(lines['fdi_events_total{kind="alarm"}']) == 1
+    assert float(lines['fdi_events_total{kind="recovered"}']) == 0
     assert float(lines[f'fdi_fault_present{{fault="{FAULT}"}}']) == 1
     assert float(lines[f'fdi_fault_size{{fault="{FAULT}"}}']) == pytest.approx(0.05, abs=0.01)
     assert float(lines['fdi_input{channel="Q1"}']) == pytest.approx(50e-6)

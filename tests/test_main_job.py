@@ -145,7 +145,7 @@ def test_the_command_prints_a_table_with_units_as_do_inspect_and_the_page(
     ("change", "sentence"),
     [
         ("simulate.duration=1 s", "expected more readings than parameters, got 6 readings for 8 parameters"),
-        ("device=cuda:99", "device: expected one that torch can use here, such as cpu, got 'cuda:99'"),
+        ("device=cuda:99", "device: expected one that torch can use here, got 'cuda:99'; write device: cpu"),
         ("estimate.parameters=[]", "estimate.parameters: expected at least one, got none"),
         ("estimate.parameters=[T1.leek]", "the nearest is 'T1.leak'"),
         ("estimate.parameters=[T9.leak]", "estimate.parameters: plant three_tank: expected one of T1, T2"),
@@ -174,6 +174,12 @@ def test_an_unwritable_folder_is_said(tmp_path: Path, capsys: pytest.CaptureFixt
     blocked.write_text("")
     assert main(["train", "--quiet", "--out", str(blocked)]) == MISUSE
     assert str(blocked) in capsys.readouterr().err
+
+
+def test_a_simulated_command_beyond_the_pump_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    wish = ["simulate.inputs.Q1=150 cm^3/s", "simulate.duration=20 s", "output.name=much"]
+    assert main(["simulate", "--out", str(tmp_path), *(word for each in wish for word in ("--set", each))]) == 0
+    assert "Q1 asks for up to 150 cm^3/s of Q1, which delivers 90 cm^3/s at most" in capsys.readouterr().err
 
 
 def test_simulate_writes_a_recording_that_train_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -365,6 +365,36 @@ def test_columns_of_historians_are_recognised_by_their_usual_names(header: str, 
     assert lines[0].startswith(f"tags: {{{tags}}} " if tags else "columns:")
 
 
+def test_columns_of_the_right_names_without_units_are_mapped_to_themselves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fdi("new", "plant", "--out", "rig.yaml", "--quiet")
+    Path("run.csv").write_text(
+        "t_s;Q;hA_inch.;hB_mm\n" + "".join(f"{k};3,1;{20 + k % 2};{155 + k % 3}\n" for k in range(60))
+    )
+    words = ["--plant", "rig.yaml", "--recording", "run.csv"]
+    assert cli.main(["check", *words]) == cli.MISUSE
+    message = capsys.readouterr().err
+    assert (
+        "expected a column for Q, hA, got t_s, Q, hA_inch., hB_mm; if columns have other names or no unit, " in message
+    )
+    lines = message.partition("recordings:\n")[2].replace('"Q", unit: ...', '"Q", unit: l/min')
+    Path("runs.yaml").write_text("recordings:\n" + lines.replace('"hA_inch.", unit: ...', '"hA_inch.", unit: cm'))
+    assert cli.main(["check", "--plant", "rig.yaml", "--recording", "runs.yaml"]) == cli.NOT_EXPLAINED
+    assert "run.csv: 60 samples" in capsys.readouterr().out
+    fdi("new", "run", *words)
+    assert "run.yaml; next: complete the columns, then fdi train" in capsys.readouterr().out
+
+
+def test_the_output_of_a_controller_is_a_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("loop.csv").write_text("t_s,LIC-101.PV (%),LIC-101.OUT (%),PC 7 OP [%]\n0,40,36,10\n1,41,35,10\n")
+    fdi("new", "plant", "--recording", "loop.csv", "--out", "loop.yaml")
+    plant = load_plant(Path("loop.yaml"))
+    assert [s.column for s in plant.sensors] == ["LIC-101.PV"] and list(plant.channels()) == ["LIC-101.OUT", "PC 7 OP"]
+
+
 def test_a_recording_without_a_header_is_mapped_by_numbers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -167,6 +167,28 @@ def test_a_steady_state_without_noise_is_no_wrong_unit(tmp_path: Path, flow: str
     assert wrong_units(plant, read) == ""
 
 
+@pytest.mark.parametrize(
+    ("sensor", "written", "sentence"),
+    [
+        ("hA: {tank: A}", "mm", "the levels hA are 10 times too large (write mm in place of cm)"),
+        ("hA: {tank: A, gain: 98.1 mbar/m, offset: 5 mbar}", "mbar", "the pressures hA are 10 times too large"),
+    ],
+)
+def test_a_wrong_unit_concerns_the_sensors_of_its_kind(
+    tmp_path: Path, sensor: str, written: str, sentence: str
+) -> None:
+    """B is read in %, of which no unit can be wrong in this way."""
+    text = PLANT.replace("hA: {tank: A}, hB: {tank: B}", f"{sensor}, hB: {{tank: B, gain: 166.7 %/m}}")
+    (tmp_path / "rig.yaml").write_text(text)
+    plant = load_plant(tmp_path / "rig.yaml")
+    noise = {"std": {"hA": f"0.5 {written}", "hB": "0.1 %"}}
+    run = fdi_torch.simulate(plant, inputs={"Q": {"steps": STEPS}}, duration="600 s", noise=noise)
+    unit = "cm" if written == "mm" else "kPa"
+    wrong = replace(run, outputs=run.outputs * torch.tensor([10.0, 1.0]), written={"hA": unit})
+    assert wrong_units(plant, run) == ""
+    assert sentence in wrong_units(plant, wrong)
+
+
 def test_flows_follow_from_levels_not_from_readings(folder: Path) -> None:
     plant = load_plant(folder / "rig.yaml")
     run = recorded(plant, {})

@@ -49,7 +49,10 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     for config in recordings:
         from fdi_torch.jobs.recording_check import checked, usable_spans
 
-        recording, check = checked(config, plant, base)
+        with screen.progress("check") as advance:
+            advance(0.0, config.file)
+            recording, check = checked(config, plant, base)
+            advance(1.0, "done")
         checks.append(check)
         _show(check, screen)
         if spans := usable_spans(recording, config, plant):

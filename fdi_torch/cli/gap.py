@@ -93,7 +93,8 @@ def _adopt(
         return []
     named = any(cause.effect != UNKNOWN for cause in answer.causes)
     if not named and not (arguments.with_constants and answer.verdict == "no_gap"):
-        screen.complain(f"fdi gap: nothing to adopt: the verdict is {answer.verdict.replace('_', ' ')}")
+        constants = "; --with-constants writes the fitted constants" if answer.verdict == "no_gap" else ""
+        screen.complain(f"fdi gap: nothing to adopt: the verdict is {answer.verdict.replace('_', ' ')}{constants}")
         return []
     if named and not answer.converged:
         screen.complain("fdi gap: nothing adopted: the fit of the likeliest explanation has not converged")

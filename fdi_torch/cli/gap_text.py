@@ -46,7 +46,7 @@ def show(answer: Answer, plant: PlantDescription, steps: Sequence[str], screen: 
     _disturbances(flows_that_matter(as_json, plant), screen)
     if answer.closure:
         _closure(as_json, screen)
-    _constants(answer.constants, screen)
+    _constants(answer.constants, has_causes(answer.to_dict()), screen)
     for remark in [*_confusability(answer.impostors), *_limits(answer)]:
         screen.say(f"- {remark}")
 
@@ -70,8 +70,9 @@ def next_steps(
         )
     moved = [name for name, c in answer.constants.items() if _tolerances_off(c, "augmented") > MOVED]
     if moved:
+        still = "even with the causes, " if has_causes(answer.to_dict()) else ""
         steps.append(
-            f"even with the causes, {listed(moved)} {'is' if len(moved) == 1 else 'are'} more than {MOVED:g} "
+            f"{still}{listed(moved)} {'is' if len(moved) == 1 else 'are'} more than {MOVED:g} "
             f"tolerances off {'its nominal value' if len(moved) == 1 else 'their nominal values'}: calibrate the plant "
             "file with a fault-free recording (fdi refit --adopt), then repeat the diagnosis with the calibrated file"
         )
@@ -179,17 +180,19 @@ def _closure(answer: Mapping[str, Any], screen: Screen) -> None:
         )
 
 
-def _constants(constants: Mapping[str, Any], screen: Screen) -> None:
-    """Constants that moved far out of their tolerance."""
+def _constants(constants: Mapping[str, Any], causes: bool, screen: Screen) -> None:
+    """Constants that moved far out of their tolerance; causes: whether the last fit has any."""
+    fits = ("recalibrated", "augmented") if causes else ("augmented",)
+    stages = ("nominal", "tolerance", *fits[:-1])
     rows = []
     for name, c in constants.items():
-        if max(_tolerances_off(c, stage) for stage in ("recalibrated", "augmented")) > MOVED:
+        if max(_tolerances_off(c, stage) for stage in fits) > MOVED:
             unit, scale = display_unit(c["unit"], name)
-            numbers = [f"{scale * c[stage]:.4g}" for stage in ("nominal", "tolerance", "recalibrated")]
+            numbers = [f"{scale * c[stage]:.4g}" for stage in stages]
             fitted = [rounded(scale * c[stage], scale * c["std"]) for stage in ("augmented", "std")]
             rows.append([name, *numbers, *fitted, unit])
     if rows:
-        header = ("constant", "nominal", "tolerance", "recalibrated", "with the causes", "std error", "unit")
+        header = ("constant", *stages, "with the causes" if causes else "fitted", "std error", "unit")
         screen.table(f"constants more than {MOVED:g} tolerances off", header, rows)
 
 

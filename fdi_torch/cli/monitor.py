@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import Any, get_args
 
 import orjson
 
@@ -22,7 +22,7 @@ from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.logbook import Listener
 from fdi_torch.logbook.topic_definitions import Channel
-from fdi_torch.monitor.events import FORMAT, Event
+from fdi_torch.monitor.events import FORMAT, Event, Kind
 from fdi_torch.monitor.monitor_setup import PreparedMonitor
 from fdi_torch.quantities import quantity_text
 
@@ -95,7 +95,7 @@ def _metrics(wish: str, screen: Screen) -> Iterator[Listener]:
     from fdi_torch.live.metrics import serve_metrics
 
     host, port = host_and_port("--metrics", wish, "127.0.0.1:9464")
-    with serve_metrics(host, port) as metrics:
+    with serve_metrics(host, port, get_args(Kind)) as metrics:
         screen.note(f"metrics: http://{host}:{metrics.port}/metrics ({access_text(host)})")
         yield metrics
 

@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     with named_errors(path), path.open("x", encoding="utf-8") as file:
         file.write(text)
     recording = f" --recording {arguments.recording}" if arguments.recording else ""
-    unknown = {"column: ...": "complete the columns, then ", "tag: null": "complete the tags, then "}
+    unknown = {"unit: ...": "complete the columns, then ", "tag: null": "complete the tags, then "}
     to_complete = next((words for mark, words in unknown.items() if mark in text), "")
     screen.say(f"{path}; next: {to_complete}{NEXT[arguments.kind].format(path, recording=recording)}")
     screen.result({"format": "fdi_torch.new/1", "file": str(path), "kind": arguments.kind})

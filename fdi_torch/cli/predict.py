@@ -42,7 +42,12 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     recordings = [r for name in names for r in _recordings(name, plant, arguments)]
     for note in dict.fromkeys(note for r in recordings for note in r.notes):
         screen.note(note)
-    predictions = [(recording, _predict(plant, recording, arguments)) for recording in recordings]
+    with screen.progress("predict") as advance:
+        predictions = []
+        for k, recording in enumerate(recordings):
+            advance(k / len(recordings), Path(recording.source).name)
+            predictions.append((recording, _predict(plant, recording, arguments)))
+        advance(1.0, "done")
     misfits = [misfit_of(prediction.rmse, [recording], plant) for recording, prediction in predictions]
     worst = max(misfits, key=lambda misfit: misfit.ratio)
     name = Path(recordings[misfits.index(worst)].source).name

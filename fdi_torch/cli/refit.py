@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -30,7 +31,6 @@ from fdi_torch.jobs.gap import one_thread
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_unit, parse_level_deviation
-from fdi_torch.recording import Recording
 
 DISTURBED = (
     "the standard errors below take the residual for noise of the sensors; fdi gap --adopt FILE --narrow calibrates "
@@ -47,12 +47,12 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     white = parse_level_deviation(arguments.white, "--white") if arguments.white else None
     hold, vary, leave_out = (names(text) for text in (arguments.hold, arguments.vary, arguments.leave_out))
 
-    def fitted_to(others: Sequence[Recording]) -> Refit:
-        return refit(plant, others, leave_out, arguments.step, hold, white, vary)
+    fitted_to = partial(refit, plant, leave_out=leave_out, step=arguments.step, hold=hold, white=white, vary=vary)
 
     trials: list[LeftOutRun] = []
     with one_thread():
-        fitted = fitted_to(recordings)
+        with screen.progress("refit") as advance:
+            fitted = fitted_to(recordings, tell=advance)
         misfit = misfit_of(fitted.rmse, recordings, plant)
         say_first(misfit, screen, DISTURBED)
         _show(fitted, plant, screen)

@@ -30,6 +30,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         screen.note(
             f"device: {job.config.device} is for fdi train and fdi study; one simulation is computed on the CPU"
         )
+    for note in recording.notes:
+        screen.note(note)
     screen.say(f"{len(recording)} samples, {float(recording.time[-1]):g} s: {path}")
     if path != named:
         screen.say(f"- {named} existed and was kept; with --replace it is overwritten")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
@@ -122,17 +123,17 @@ def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[s
     raise ValueError(
         f"{path}: expected a column for {', '.join(missing)}, got {header or 'numbers without a header'}; "
         f"{other_fix.format(inputs=inputs[0]) if other_fix and inputs else ''}"
-        f"{'if columns have other names, ' if header else ''}save these lines as runs.yaml, completed and checked, and "
-        f"name runs.yaml instead:\nrecordings:\n  - file: {path.name}\n{lines}"
+        f"{'if columns have other names or no unit, ' if header else ''}save these lines as runs.yaml, completed and "
+        f"checked, and name runs.yaml instead:\nrecordings:\n  - file: {path.name}\n{lines}"
     )
 
 
 def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()) -> list[str]:
-    """Lines for a recording file, to be completed, that map the channels without a column of their name in the table.
+    """Lines for a recording file, to be completed, that map the channels without a column of their name with a unit.
 
-    Each is mapped to the next column with a unit of its kind, if there is one. A file whose rows have more cells than
-    its first line has no header: its columns are numbered. A file with a row per value is mapped by its tags. Empty if
-    no channel lacks a column.
+    Each is mapped to the column of its name, without a known unit, else to the next one with a unit of its kind. A file
+    whose rows have more cells than its first line has no header: its columns are numbered. A file with a row per value
+    is mapped by its tags. Empty if no channel lacks a column.
     """
     kinds, missing = _units(plant), _missing(path, plant, also_known)
     if not missing:
@@ -151,17 +152,24 @@ def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()
         lines = [f"tags: {{tag: {tags.tag}, value: {tags.value}{quality}}}    # one row per value", "columns:"]
         return [*lines, *(f"  {name}: {{column: TAG, unit: ...}}" for name in missing)]
     found = {column: si_unit_of(pair[1]) for column in header if (pair := header_unit(column)) and pair[0] not in kinds}
+    without_unit = [column for column in header if header_unit(column) is None]
     lines = ["columns:    # units only where the header has none"]
     for name in missing:
-        column = next((c for c, kind in found.items() if kind == kinds[name]), None)
-        found.pop(column or "", None)
-        lines.append(f"  {name}: {{column: " + (f'"{column}"}}' if column else "..., unit: ...}"))
+        own = next((c for c in without_unit if re.match(rf"{re.escape(name)}(?![^\W_])", c)), None)
+        same_kind = None if own else next((c for c, kind in found.items() if kind == kinds[name]), None)
+        found.pop(same_kind or "", None)
+        column = f'"{own or same_kind}"' if own or same_kind else "..."
+        lines.append(f"  {name}: {{column: {column}" + ("}" if same_kind else ", unit: ...}"))
     return lines
 
 
 def _missing(path: Path, plant: PlantDescription, also_known: Collection[str]) -> list[str]:
-    known = {*unrecorded_valves(path, plant), *also_known}
-    return [name for name in without_column(path, _units(plant)) if name not in known]
+    """The channels that need a column with a unit and have none in the table."""
+    if is_log(path):
+        return []
+    complete = names_in([column for column in _header(path) if header_unit(column)])
+    known = {*unrecorded_valves(path, plant), *also_known, *complete}
+    return [name for name in _units(plant) if name not in known]
 
 
 def _header(path: Path) -> tuple[str, ...]:

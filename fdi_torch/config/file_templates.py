@@ -121,7 +121,7 @@ def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
     first, last = float(read.time[0]), float(read.time[-1])
     enough = _rounded_up(_learning_time(read, every))
     until = first + min(enough, 0.5 * (last - first))
-    return f"[{first:.10g} s, {until:.10g} s]    # the noise is learnt from it; {enough:.10g} s suffice if it is white"
+    return f"[{first:.10g} s, {until:.10g} s]    # the noise is learnt from it; white noise needs some {enough:.10g} s"
 
 
 def _learning_time(recording: Recording, false_alarms_every: float) -> float:
@@ -165,7 +165,9 @@ def _shares(plant: PlantDescription, channel: str, shares: Sequence[float]) -> l
     """Commands that are these shares of a pump's or transfer's range; of a valve, fully open."""
     full = {c.channel: (c.full_command, c.command_unit) for c in plant.metered_flows()}
     return (
-        [quantity_text(share * full[channel][0], full[channel][1], 3) for share in shares] if channel in full else ["1"]
+        [quantity_text(share * full[channel][0], full[channel][1], 3, channel) for share in shares]
+        if channel in full
+        else ["1"]
     )
 
 
@@ -174,7 +176,10 @@ AT_RIM = {"1": 1.0, "V": 10.0, "A": 0.02, "Pa": 9810.0 * HEIGHT}
 """What a sensor reads at the rim, by the unit of its reading: 100 %, 10 V, 20 mA, water."""
 READING = re.compile(r"[LHX]|P[A-Z]|.*(level|füllstand|niveau|pegel|pressure|druck)", re.IGNORECASE)
 """Tags of levels and pressures (ISA-5.1: PT, PI; P-101 is a pump), letters of levels by custom, and words."""
-COMMAND = re.compile(r".*(pump|valve|ventil|pwm|duty|cmd|command|speed|drehzahl)", re.IGNORECASE)
+COMMAND = re.compile(
+    r".*(pump|valve|ventil|pwm|duty|cmd|command|speed|drehzahl)|[A-Z]+C\W?\d+\W?(out|op)$", re.IGNORECASE
+)
+"""Words, and tags of a controller's output (LIC-101.OUT)."""
 PUMPS = "pumps:    # ! the tank that each fills, and its greatest flow; a flow out of a tank belongs under transfers"
 
 
@@ -275,7 +280,7 @@ def _pump(column: _Column, tank: str) -> str:
         flow = f"{significant(max(column.highest, per_unit) / per_unit, 3)} {column.unit}"
     fields = [f"target: {tank}", f"max_flow: {flow}"]
     if column.kind == "1":
-        fields.append("gain: 6 l/min")
+        fields.append(f"gain: {significant(6.0 * per_unit, 3)} l/min" + (f"/{column.unit}" if per_unit < 1.0 else ""))
     elif column.kind != "m^3/s":
         largest = 5.9 * per_unit / (column.highest or 1.0)  # rounded, the highest command stays below the greatest flow
         fields.append(f"gain: {significant(largest, 3)} l/min/{column.unit}")

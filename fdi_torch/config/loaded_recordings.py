@@ -20,7 +20,7 @@ from fdi_torch.config.channels import (
     unrecorded_valves,
     without_column,
 )
-from fdi_torch.config.plant_file import AnyPlant, chosen_plant, given_plant
+from fdi_torch.config.plant_file import AnyPlant, chosen_plant
 from fdi_torch.config.problems import ConfigError, explain
 from fdi_torch.config.recording_config import (
     ColumnConfig,
@@ -153,7 +153,7 @@ def read_recording(
 ) -> Recording:
     """The plant's inputs and outputs in a recording, cropped, masked and decimated; unknown inputs are NaN.
 
-    From now on its channels are displayed in the units that its file has for them.
+    From now on quantities are displayed in the units of the plant, and the channels in those of the file.
     config: the name of the file, or the recording's entry in a run file: {"file": "run.xlsx", "columns": {"h1":
     {"column": "LT-101", "unit": "mm"}}}. plant: or the name of its file. base: folder of relative paths. given:
     recordings in memory, by the name that `file` gives them; the result is on the CPU. Raises ConfigError naming file,
@@ -161,7 +161,7 @@ def read_recording(
     """
     if not isinstance(config, RecordingConfig):
         config = config_of(config)
-    plant = chosen_plant(plant) if isinstance(plant, str | Path) else given_plant(plant)
+    plant = chosen_plant(plant)
     channels, columns = plant.channels(), plant.outputs()
     in_memory = (given or {}).get(config.file)
     folder = base or Path.cwd()

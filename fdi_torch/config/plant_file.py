@@ -125,7 +125,8 @@ class PlantConfig(component_sections(_NamedPlant)):  # type: ignore[misc]
     )
     units: dict[str, str] = Field(
         default_factory=dict,
-        description="units for display by SI unit or output channel, such as m: mm; by default the units of this file",
+        description="units for display by SI unit, channel or gain of a pump, such as m: mm; by default those of this "
+        "file",
     )
 
 
@@ -146,11 +147,11 @@ def given_plant(plant: AnyPlant) -> PlantDescription:
     return plant
 
 
-def chosen_plant(name: str | Path) -> Plant:
-    """The plant that a command is about; from now on quantities are displayed in its units. Raises ConfigError."""
-    plant = load_plant(name)
-    display_in(units_for_display(plant))
-    return plant
+def chosen_plant(plant: AnyPlant) -> PlantDescription:
+    """As `given_plant`, for the plant that a command is about: from now on quantities are displayed in its units."""
+    chosen = given_plant(plant)
+    display_in(units_for_display(chosen))
+    return chosen
 
 
 def placeholders(path: Path) -> list[str]:
@@ -172,13 +173,13 @@ def build_plant(data: dict[str, Any], source: str) -> Plant:
 
 def _valid_units(units: dict[str, str], plant: Plant) -> dict[str, str]:
     """The key `units`. Raises ValueError for an unknown key, and for a unit of another kind than its key."""
-    sensors = plant.output_units()
-    kinds = dict.fromkeys((*SI_UNITS, *READING_UNITS))
+    gains = {f"{c.name}.gain": c.gain_unit for c in plant.metered_flows()}
+    known = {kind: kind for kind in (*SI_UNITS, *READING_UNITS)} | gains | plant.channel_units() | plant.output_units()
     for key, unit in units.items():
-        if key not in sensors and key not in kinds:
-            raise ValueError(f"units: {unknown('an output channel or an SI unit', key, (*sensors, *kinds))}")
+        if key not in known:
+            raise ValueError(f"units: {unknown('a channel, the gain of a pump or an SI unit', key, known)}")
         with naming(f"units.{key}"):
-            unit_factor(unit, sensors.get(key, key))
+            unit_factor(unit, known[key])
     return units
 
 

@@ -166,6 +166,7 @@ def _units_as_written(plant: PlantDescription) -> dict[str, str]:
     """Units for display, from the quantities of the components that were given as text."""
     listed = {"tanks": plant.tanks, "sensors": plant.sensors, "flows": plant.flow_components()}
     texts = {part: {c.name: c.written for c in components} for part, components in listed.items()}
+    texts["flows"] |= {c.name: {**c.written, "command": c.channel} for c in plant.metered_flows()}
     return written_units(texts | {"sensors": {s.column: s.written for s in plant.sensors}})
 
 

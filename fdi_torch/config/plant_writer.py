@@ -68,7 +68,7 @@ def _component_mapping(component: Component) -> dict[str, Any]:
             unit = getattr(component, f.metadata["unit_field"])
         is_default = value == f.default and unit in ("", "1", f.metadata.get("unit"))
         if not is_default:
-            mapping[f.name] = _text(value, unit) if unit else value
+            mapping[f.name] = _text(value, unit, f"{component.name}.{f.name}") if unit else value
     return mapping
 
 
@@ -105,13 +105,13 @@ def _shares(values: dict[str, float]) -> dict[str, str | float]:
     return {n: percents[n] if exact else v for n, v in values.items()}
 
 
-def _text(value: float, unit: str) -> str | float:
+def _text(value: float, unit: str, name: str = "") -> str | float:
     """'160 cm^2': the unit for display, or else the first customary unit, in which the number is short and reads back
     exactly. A number that is short in none has as many digits as it needs.
     """
     if unit == "1":
         return value
-    units = dict.fromkeys((display_unit(unit)[0], *_UNITS.get(unit, ()), unit))
+    units = dict.fromkeys((display_unit(unit, name)[0], *_UNITS.get(unit, ()), unit))
     for digits in range(9, 18):
         for shown in units:
             text = f"{value / parse_quantity(f'1 {shown}', unit):.{digits}g} {shown}"

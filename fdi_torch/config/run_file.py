@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from fdi_torch.config.estimation import EstimationConfig
 from fdi_torch.config.loaded_recordings import separate_recordings
@@ -27,10 +28,15 @@ class RunConfig(Strict):
     estimate: EstimationConfig = Field(default_factory=EstimationConfig)
     output: OutputConfig = Field(default_factory=OutputConfig)
     seed: int = Field(0, ge=0, description="seed of all random numbers")
-    device: str = Field(
-        "cpu", pattern=r"^(cpu|cuda(:\d{1,2})?)$", description="of the search and the refinement: cpu or cuda"
-    )
+    device: str = Field("cpu", description="of the search and the refinement: cpu or cuda")
     engine: EngineKind = Field("auto", description="simulation engine; compiled only on the CPU")
+
+    @field_validator("device")
+    @classmethod
+    def _known_device(cls, name: str) -> str:
+        if not re.fullmatch(r"cpu|cuda(:\d{1,2})?", name):
+            raise ValueError(f"expected cpu, cuda or a number of a GPU such as cuda:1, got '{name}'; correct it")
+        return name
 
     @model_validator(mode="after")
     def _one_source(self) -> RunConfig:

@@ -14,10 +14,11 @@ _NOT_CHOSEN = ("1", "s")  # a share is written in % where it is a tolerance, and
 
 
 def written_units(data: Mapping[str, Any]) -> dict[str, str]:
-    """The units for display that follow from the mapping of a plant file: by SI unit, and by output channel.
+    """The units for display that follow from the mapping of a plant file: by SI unit, channel, and gain of a pump.
 
     A quantity is displayed in the unit in which the file first writes a quantity of that kind, tanks first, then
     sensors and pumps. A sensor whose gain has a unit, such as 16.7 %/m, is displayed in the unit of its readings (%).
+    Where the gain of a pump or transfer is written per %, which has no dimension, so are gain and command displayed.
     """
     units: dict[str, str] = {}
     for unit in _units_in([data.get(part) for part in _FIRST] + [v for k, v in data.items() if k not in _FIRST]):
@@ -29,6 +30,11 @@ def written_units(data: Mapping[str, Any]) -> dict[str, str]:
         reading = _reading_unit(sensor)
         if reading is not None:
             units[str(sensor.get("channel") or name)] = spelled(reading)
+    for part in (part for name, part in data.items() if name != "sensors" and isinstance(part, dict)):
+        for name, component in part.items():
+            gain = component.get("gain") if isinstance(component, Mapping) else None
+            for unit in (unit for unit in _units_in(gain) if unit.endswith("/%")):
+                units |= {f"{name}.gain": spelled(unit), str(component.get("command") or name): "%"}
     return units
 
 

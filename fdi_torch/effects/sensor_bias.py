@@ -13,8 +13,8 @@ class SensorBias(Effect):
     """The reading is y + b from an onset on, at once or over a ramp (abrupt and incipient bias; Isermann, 2006,
     "Fault-Diagnosis Systems", ch. 5).
 
-    Typical: 0.2 to 5 % of the range. The same as another sensor offset if it acts from the start; the same as a leak or
-    plugging if the plant has one sensor and is at rest.
+    Typical: 0.2 to 5 % of the range. From the start of a recording it is indistinguishable from an error of the
+    sensor's `offset`; in a plant at rest with one sensor, also from a leak or plugging.
     """
 
     name = "sensor_bias"

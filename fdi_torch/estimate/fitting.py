@@ -166,6 +166,8 @@ def set_up(
     """Set up the fit of `parameters` ('T1.leak', 'T1.leak.size', or a Parameter with its own range) to one or several
     recordings.
 
+    plant, recordings: `fdi_torch.set_up` also takes their names, as `gap` does. A recording in memory is taken as it
+    is; one from a file is split into segments with known inputs.
     start: initial levels, one choice for all tanks or a mapping by tank, for all recordings or a sequence with one
     entry per recording. A choice is 'equilibrium' (the level of the plant file, else the equilibrium under the first
     inputs), 'free' (estimated) or a level in m. The fit is computed on the device of the recordings.
@@ -205,7 +207,7 @@ def start_levels(
     """Initial levels (tanks,) in m, and parameters with search ranges for those that are estimated.
 
     start: 'equilibrium', 'free' or a level in m, see `set_up`. A tank that a mapping omits is 'free'. Raises ValueError
-    for an unknown tank.
+    for an unknown tank, and for a level below the floor or above the rim.
     """
     by_tank = start if isinstance(start, Mapping) else {tank.name: start for tank in plant.tanks}
     unknown = set(by_tank) - {tank.name for tank in plant.tanks}
@@ -227,7 +229,11 @@ def start_levels(
                 rest_levels = equilibrium(network, _first_inputs(plant, recording))
             levels.append(float(rest_levels[i]))
         else:
-            levels.append(float(tank.start_level or 0.0) if isinstance(choice, str) else choice)
+            level = float(tank.start_level or 0.0) if isinstance(choice, str) else choice
+            if not 0.0 <= level <= tank.height:
+                rim, given = (quantity_text(each, "m") for each in (tank.height, level))
+                raise ValueError(f"start level of {tank.name}: expected a level from the floor to {rim}, got {given}")
+            levels.append(level)
     return torch.tensor(levels, dtype=torch.float64), free
 
 

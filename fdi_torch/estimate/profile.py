@@ -245,7 +245,7 @@ class _Profiler:
                 return
 
     def _limit(self, side: int) -> tuple[float, bool]:
-        """Limit of the interval on one side, and whether nothing but the range ends it there."""
+        """Limit of the interval on one side, and whether the parameter's range sets it instead of the likelihood."""
         for _ in range(MOST_BISECTIONS):
             inside = (self.ratio <= self.threshold).nonzero().flatten()
             a = int(inside[0] if side < 0 else inside[-1])

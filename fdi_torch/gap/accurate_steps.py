@@ -70,8 +70,8 @@ def _divided(part: RecordingPart, errors: Float[Tensor, " K"], most: int) -> Rec
 def errors_by_readings(part: RecordingPart, noise: Float[Tensor, " C"]) -> Float[Tensor, " K"]:
     """Error of the midpoint rule in each step, dt^3 |d^3h/dt^3| / 24, in units of the readings' noise (C,).
 
-    The third derivative is the largest of all sensors and of all four neighbouring samples that enclose the step, by
-    divided differences. White noise alone makes errors of 0.19 (standard deviation).
+    The third derivative comes from divided differences of four neighbouring samples; of all sensors and all such
+    quadruples around the step the largest counts. White noise alone makes errors of 0.19 (standard deviation).
     """
     times, steps = part.experiment.sample_times, part.experiment.steps
     derivative = torch.where(part.mask, part.readings, torch.nan) / noise

@@ -252,7 +252,7 @@ def _most_likely(likelihood: Tensor, count: int) -> int:
 
 
 def with_rounding(noise: Noise, steps: Sequence[float], readings: Tensor) -> Noise:
-    """Add the rounding error of channels (C,) with steps > 0. readings (S, C): about the unrounded readings.
+    """Add the rounding error of channels (C,) with steps > 0. readings (S, C): close to the readings before rounding.
 
     Its variance is step^2 / 12 (Widrow and Kollar, 2008), added to the noise of the other channels. It is constant
     until the level has moved by a good part of a step, which gives its correlation.

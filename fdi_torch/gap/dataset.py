@@ -68,7 +68,7 @@ class DataSet:
 
     @property
     def experiment(self) -> Experiment:
-        """That of the first recording."""
+        """Of the first recording."""
         return self.experiments[0]
 
     @property

@@ -55,7 +55,7 @@ class RankedExplanation:
 
     @property
     def negative_log_posterior(self) -> float:
-        """That of the fitted parameters under this noise, up to a constant; infinite if it is undefined."""
+        """-ln of the posterior of the fitted parameters under this noise, up to a constant; infinite if undefined."""
         value = 0.5 * (self.fit.cost + self.fitter.log_det)
         return value if math.isfinite(value) else math.inf
 

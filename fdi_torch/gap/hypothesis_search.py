@@ -1,9 +1,9 @@
 """Search over hypotheses with a discrepancy: which unknown, beside which effects.
 
-It starts from the explanations that the structure search found. Beside the likeliest, and beside none, a discrepancy is
-evaluated at each place. About the likeliest hypothesis, effects are then removed and added, and the discrepancy moved
-to other places, while that improves it: an effect may only have compensated the discrepancy, which may also have hidden
-an effect.
+It starts from the explanations that the structure search found. At each place a discrepancy is evaluated, once beside
+the likeliest explanation and once beside no effect. From the likeliest hypothesis, effects are then removed and added,
+and the discrepancy is moved to other places, as long as that improves it: an effect may only have compensated the
+discrepancy, which may also have hidden an effect.
 """
 
 from __future__ import annotations

@@ -140,7 +140,7 @@ def log_evidence(fitter: Fitter, fit: Fit, choices: int) -> float:
 
 
 def evidence_under(fitter: Fitter, fit: Fit, choices: int) -> float:
-    """Log evidence of a fit under the noise of a fitter, which may be another than that of its descent."""
+    """Log evidence of a fit under the noise of a fitter, which may differ from that of its descent."""
     return log_evidence(fitter, replace(fit, cost=fitter.cost(fit)), choices)
 
 

@@ -90,8 +90,9 @@ def likeliest_starts(
 
 @dataclass(frozen=True)
 class _Projected:
-    """Chi-square minimised over linear parameters. basis (S C, P), factor (P, P): of the decomposition Q R of their
-    whitened sensitivities; the rows of Q for the readings. pull (P,), off: Q'r and r'r of their priors."""
+    """Chi-square minimised over linear parameters. basis (S C, P), factor (P, P): of the QR decomposition of their
+    whitened sensitivities, the rows of Q that belong to the readings, and R. pull (P,), off: Q'r and r'r over the rows
+    of the priors, with their residuals r."""
 
     objective: Objective
     basis: Tensor

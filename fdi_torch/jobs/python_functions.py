@@ -13,10 +13,9 @@ from typing import Any
 
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings, read_recording
 from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monitor
-from fdi_torch.config.plant_file import AnyPlant, given_plant
+from fdi_torch.config.plant_file import AnyPlant, chosen_plant
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.study_file import Study, build_study, load_study
-from fdi_torch.effects import units_for_display
 from fdi_torch.effects.catalogue import Catalogue
 from fdi_torch.effects.catalogue import effects as catalogue_of
 from fdi_torch.estimate.misfit import misfit_of
@@ -35,7 +34,6 @@ from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.monitor.events import Event
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.quantities import display_in
 from fdi_torch.recording import Recording
 
 Tell = Callable[[float, str], None]
@@ -67,7 +65,7 @@ def _run_of(run: Any, job: str) -> Run:
 def _plant_and_recordings(plant: Any, recordings: Any, job: str) -> tuple[PlantDescription, list[Recording]]:
     """A plant and segments of its recordings, given apart or, without recordings, as a run."""
     if recordings is not None:
-        return (of := plant_of(plant)), recordings_of(recordings, of)
+        return (of := chosen_plant(plant)), recordings_of(recordings, of)
     run = _run_of(plant, job)
     if run.config.simulate is not None:
         return run.plant, [simulate_recording(run)]
@@ -180,24 +178,25 @@ def predict(
     step: float | None = None,
     settle: float | None = None,
     vary: Sequence[str] = (),
+    tell: Tell = silent,
 ) -> FreeRun:
     """Simulate a plant freely along a recording and compare it with the readings, as `fdi predict` does.
 
     plant, recording: without a recording, plant is a run with one: its file or its keys, as of `train`.
     start_samples: number of samples for estimating the initial levels; settle: the same as a time, s. step: of the
-    integration, s. vary: patterns of constants that are estimated from the start too. Raises ValueError if an input is
-    unknown for a time.
+    integration, s. vary: patterns of constants that are estimated from the start too. tell(share, text): as of `gap`.
+    Raises ValueError if an input is unknown for a time.
     """
     if isinstance(recording, list | tuple):
         raise TypeError(f"predict: expected one recording, got a list of {len(recording)}; call it for each of them")
     plant, parts = _plant_and_recordings(plant, recording, "predict")
     if len(parts) != 1:
         raise ValueError(
-            f"{parts[0].source}: expected a recording whose inputs are known throughout, got {len(parts)} stretches; "
+            f"{parts[0].source}: expected a recording whose inputs are known throughout, got {len(parts)} segments; "
             "cut one with Recording.known_segments()"
         )
     with one_thread():
-        prediction = run_freely(plant, parts[0], start_samples, step, settle, vary)
+        prediction = run_freely(plant, parts[0], start_samples, step, settle, vary, tell)
     return FreeRun(plant, parts[0], prediction)
 
 
@@ -206,16 +205,18 @@ def refit(
     recordings: AnyRecording | Sequence[AnyRecording] | None = None,
     *,
     step: float | None = None,
+    tell: Tell = silent,
     **choices: Any,
 ) -> RefitResult:
     """Fit all constants with a tolerance and all effects of a plant to recordings, as `fdi refit` does: calibrate it.
 
     plant, recordings: without recordings, plant is a run: its file or its keys, as of `train`.
     step: of the simulation, s. choices: leave_out, hold, vary (names or patterns), as the options of `fdi refit`.
+    tell(share, text): as of `gap`.
     """
     plant, segments = _plant_and_recordings(plant, recordings, "refit")
     with one_thread():
-        fit = refitted(plant, segments, step=step, **choices)
+        fit = refitted(plant, segments, step=step, tell=tell, **choices)
     return RefitResult(fit, misfit_of(fit.rmse, segments, plant))
 
 
@@ -244,14 +245,7 @@ def effects(plant: AnyPlant | None = None) -> Catalogue:
 
     plant: determines places and parameter ranges; None for a generic rig with tanks of 1 m.
     """
-    return catalogue_of(None if plant is None else plant_of(plant))
-
-
-def plant_of(plant: AnyPlant) -> PlantDescription:
-    """The plant itself, or the plant of a file or of a shipped name; its units are those for display."""
-    given = given_plant(plant)
-    display_in(units_for_display(given))
-    return given
+    return catalogue_of(None if plant is None else chosen_plant(plant))
 
 
 def recordings_of(wanted: AnyRecording | Sequence[AnyRecording], plant: PlantDescription) -> list[Recording]:

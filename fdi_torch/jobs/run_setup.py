@@ -21,6 +21,7 @@ from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.operating_range import bounded_by_recording
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.plant_limits import input_findings
 from fdi_torch.simulate.simulated_recording import clean_readings, with_noise
 
 
@@ -54,7 +55,10 @@ def _usable_readings(run: Run, recording: Recording) -> Recording:
 
 
 def simulate_recording(run: Run) -> Recording:
-    """Simulate what `simulate:` of a run file describes, with faults and noise. Deterministic for a seed."""
+    """Simulate what `simulate:` of a run file describes, with faults and noise. Deterministic for a seed.
+
+    Commands beyond the limits of a pump or valve, which the plant cuts, are notes of the recording.
+    """
     config = run.config.simulate
     if config is None:
         raise ValueError(f"{run.source}: expected simulate, got none; fdi new run writes a file that shows its keys")
@@ -71,7 +75,9 @@ def simulate_recording(run: Run) -> Recording:
     clean = clean_readings(network, planned, values)
     seed = run.config.seed if config.seed is None else config.seed
     generator = torch.Generator().manual_seed(seed)
-    return with_noise(planned, clean, noise_std(config.noise, run.plant, clean), generator, network)
+    notes = tuple(f"{finding.channel} {finding.text}" for finding in input_findings(planned, run.plant))
+    recording = with_noise(planned, clean, noise_std(config.noise, run.plant, clean), generator, network)
+    return replace(recording, notes=notes)
 
 
 def _expect_onsets_within(duration: float, values: Mapping[str, float]) -> None:

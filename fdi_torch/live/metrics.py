@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -16,9 +16,12 @@ PORT = 9464
 
 
 class Metrics:
-    """Listener that turns logged messages into metrics. Created by `serve_metrics`. Numbers are SI."""
+    """Listener that turns logged messages into metrics. Created by `serve_metrics`. Numbers are SI.
 
-    def __init__(self, library: Any) -> None:
+    kinds: of events, whose counters begin at 0, so that a rate of Prometheus sees the first event.
+    """
+
+    def __init__(self, library: Any, kinds: Iterable[str] = ()) -> None:
         self.registry = library.CollectorRegistry()
         self.port = 0
 
@@ -30,6 +33,8 @@ class Metrics:
 
         self._samples = counter("samples", "samples processed")
         self._events = counter("events", "events of the monitor", "kind")
+        for kind in kinds:
+            self._events.labels(kind)
         self._time = gauge("plant_time_seconds", "time of the last sample; NaN before the first")
         self._time.set(float("nan"))  # a gauge without labels begins at 0, which would be a time
         self._inputs = gauge("input", "inputs of the plant, SI", "channel")
@@ -89,10 +94,13 @@ def _set_all(gauge: Any, payload: dict[str, Any]) -> None:
 
 
 @contextmanager
-def serve_metrics(host: str = "127.0.0.1", port: int = PORT) -> Iterator[Metrics]:
-    """A server of /metrics during the block. port 0: any free port. Raises ValueError for an address in use."""
+def serve_metrics(host: str = "127.0.0.1", port: int = PORT, kinds: Iterable[str] = ()) -> Iterator[Metrics]:
+    """A server of /metrics during the block. port 0: any free port. kinds: as of `Metrics`.
+
+    Raises ValueError for an address in use.
+    """
     library = needed("prometheus_client", "prometheus")
-    metrics = Metrics(library)
+    metrics = Metrics(library, kinds)
     try:
         server, thread = library.start_http_server(port, host, metrics.registry)
     except OSError as error:

@@ -168,21 +168,22 @@ def _groups(plant: PlantDescription, faults: Sequence[str], apart: Tensor) -> li
         if identical:
             members = [faults[first], *(faults[j] for j in identical)]
             words = listed([parameter_words(member) for member in members])
-            texts.append(f"{words} cannot be told apart: {_reason(plant, members)}")
+            texts.append(f"{words} are indistinguishable: {_reason(plant, members)}")
     return texts
 
 
 def _reason(plant: PlantDescription, members: Sequence[str]) -> str:
     places = dict.fromkeys(ParameterName.parse(name).place for name in members)
     if len(places) == 1:
-        return f"they are the same change of {next(iter(places))}"
+        return f"each is the same change of {next(iter(places))}"
     components = [plant.component(place) for place in places]
     sources = {c.source for c in components if isinstance(c, Pipe) and c.is_outlet}
     tanks = {c.name for c in components if isinstance(c, Tank)}
     holes = [c for c in components if isinstance(c, Tank) or (isinstance(c, Pipe) and c.is_outlet)]
     if sources and len(holes) == len(components) and len(sources | tanks) == 1:
-        return f"they act through the same sqrt(2 g h) of {next(iter(sources))}, so that only their sum is seen"
-    return "their signatures are the same under these inputs; other inputs or sensors may separate them"
+        tank = next(iter(sources))
+        return f"both are flows in proportion to sqrt(2 g h) of {tank}, so that the data determine only their sum"
+    return "their signatures are the same under these inputs; other inputs or sensors may distinguish them"
 
 
 def _remarks(readings: Tensor, length: Tensor, faults: Sequence[str]) -> tuple[str, ...]:

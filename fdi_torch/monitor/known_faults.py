@@ -1,4 +1,6 @@
-"""Known faults: a change of their size, the record of it, and whether they recovered or the readings would not show."""
+"""Known faults: changes of their size, the record of these, and whether a fault has recovered, or whether the readings
+cannot show it any more.
+"""
 
 from __future__ import annotations
 

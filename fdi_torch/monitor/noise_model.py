@@ -132,8 +132,9 @@ def _noise(network: TankNetwork, linear: Linear, best: _Candidate) -> NoiseModel
 def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation) -> Whitening:
     """Whitening of an observer's residuals: random flows by their Kalman filter, what remains by an autoregression.
 
-    Where flows beside white noise of sensors leave a correlation, or have none in time themselves, it may be the noise
-    of sensors that is correlated: both are then estimated together. Without a compiler there is no flow filter.
+    First the noise of the sensors is taken as white. If the residuals remain correlated, or if the random flows are
+    uncorrelated in time, the sensors' noise may be correlated: flows and sensor noise are then estimated together.
+    Without a compiler there is no flow filter.
     """
     residual, interval = seen.steady_residual, usual_interval(seen.time)
     std, start = residual.square().nanmean(dim=0).sqrt(), start_uncertainty(network.description, residual)

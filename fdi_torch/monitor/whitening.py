@@ -35,8 +35,9 @@ class Whitening:
     def error_of_sums(self, length: int) -> Tensor:
         """Standard error (C,) of ln of the standard deviation of sums of `length` successive e.
 
-        That of a single e is 1 / sqrt(2 n), n: samples. A sum is assumed to be much longer than the memory of the
-        autoregression, so that its error is `slow_error`, to which uncertain intensities of the random flows add.
+        For length 1 the error is 1 / sqrt(2 n), with n = `samples`. A longer sum is assumed to be much longer than the
+        memory of the autoregression, so that its error is `slow_error`, to which uncertain intensities of the random
+        flows add.
         """
         if length == 1:
             return torch.full_like(self.slow_error, (2.0 * self.samples) ** -0.5)

@@ -34,7 +34,8 @@ def quantity_field(
     """A dataclass field that holds a quantity of that unit.
 
     meaning: of its key in a plant file. role: 'estimated' for a positive constant that can be estimated and have a
-    relative tolerance, 'constant' for one whose value can only be varied. least, most: the values that a file may have.
+    relative tolerance, 'constant' for one that simulations may change and
+    that is never estimated. least, most: the values that a file may have.
     none: the word for None. given: further arguments of `dataclasses.field`.
     """
     metadata = {"unit": unit, "meaning": meaning, "role": role, "least": least, "most": most, "none": none}

@@ -134,8 +134,8 @@ class FlowComponent(Component):
     def smoothing_width(self, gravity: float, inverse_areas: float, resolution: torch.Tensor) -> torch.Tensor | None:
         """Head below which square roots and divisors are smoothed, m, at the time scale `resolution` (s).
 
-        inverse_areas: sum of 1/A over the tanks at both ends, 1/m^2: d(head)/dt per unit of flow. None: the width of
-        the tank's leak reference, for a law without a head.
+        inverse_areas: sum of 1/A over the tanks at both ends, 1/m^2: d(head)/dt per unit of flow. None, for a law
+        without a head: its tank is smoothed over the width of its leak reference.
         """
         return None
 

@@ -11,7 +11,7 @@ from fdi_torch.plant.components import COMMAND_UNITS
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.plant.local_conditions import Local, Values
 
-GAIN_MEANING = "flow for a command of 1: none, l/min/V, l/min/mA, l/min/Hz; l/min of a duty"
+GAIN_MEANING = "flow for a command of 1: none, l/min/V, l/min/mA, l/min/Hz, l/min/%; l/min of a duty"
 
 
 def gain_field() -> Any:

@@ -26,7 +26,7 @@ GOOD_WORDS = frozenset({"good", "ok", "valid", "g", "192", "0xc0", "0x00c0", "go
 
 @dataclass(frozen=True)
 class Rule:
-    """What cells of a column mean that hold a word in place of a number.
+    """The meaning of words that stand in a column in place of numbers.
 
     words: lower-case text -> value in the column's unit, BAD for a bad reading. quality: position of the column with
     the quality of the value; good: its words for a valid value.

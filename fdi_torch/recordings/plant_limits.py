@@ -119,6 +119,11 @@ def plant_limit_findings(recording: Recording, plant: PlantDescription) -> Itera
             valid = recording.mask[:, column]
             readings, time = recording.outputs[valid, column], recording.time[valid]
             yield from _level_findings(sensor, plant, readings, time, denied.get(sensor.column))
+    yield from input_findings(recording, plant)
+
+
+def input_findings(recording: Recording, plant: PlantDescription) -> Iterator[ChannelFinding]:
+    """Findings of the pumps, transfers and valves that the recording has."""
     for pump in plant.metered_flows():
         if pump.channel in recording.input_names:
             yield from _pump_findings(pump, recording.inputs[:, recording.input_names.index(pump.channel)])

@@ -1,4 +1,4 @@
-"""Units that are wrong for a whole kind of number: all areas, flows, levels or times, or the area of a tank.
+"""Units that are wrong for a whole kind of number: all areas, flows, levels, pressures or times, or the area of a tank.
 
 A correction divides these numbers by the ratio of the unit in which they were written to another usual unit. By Bayes'
 theorem, the likelihoods of the unchanged plant file and of each correction, which follow from the volume balance of the
@@ -26,6 +26,7 @@ from fdi_torch.units import same_kind
 
 UNITS = {
     "m": ("mm", "cm", "dm", "m"),
+    "Pa": ("Pa", "mbar", "kPa", "bar"),
     "m^2": ("mm^2", "cm^2", "dm^2", "m^2"),
     "m^3/s": ("ml/min", "cm^3/s", "l/h", "l/min", "l/s", "m^3/h", "m^3/s"),
     "s": ("ms", "s", "min", "h"),
@@ -102,13 +103,19 @@ def _corrections(plant: PlantDescription, recording: Recording, as_is: Balance) 
     for right, ratio in _other_units("m^3/s", written):
         slower = as_is.scaled(metered=all_tanks / ratio, by_laws=all_tanks)
         yield Correction(f"the flows of {', '.join(channels)} are", written, right, ratio, slower)
-    columns = plant.outputs()
-    written = _written("m", columns[0], recording)
-    for right, ratio in _other_units("m", written):
-        corrected = replace(plant, sensors=tuple(replace(s, gain=ratio * s.gain) for s in plant.sensors))
-        if _fits_into_tanks(corrected, recording):
-            lower = balance_along(corrected, recording, unit=1.0 / ratio)
-            yield Correction(f"the levels {', '.join(columns)} are", written, right, ratio, lower)
+    first = {s.tank: s for s in reversed(plant.sensors) if s.column in recording.output_names}  # gives the tank's level
+    for kind, numbers in (("m", "levels"), ("Pa", "pressures")):
+        columns = [sensor.column for sensor in plant.sensors if sensor.unit == kind]
+        written = _written(kind, columns[0], recording) if columns else ""
+        for right, ratio in _other_units(kind, written) if columns else ():
+            sensors = (
+                replace(s, gain=ratio * s.gain, offset=ratio * s.offset) if s.unit == kind else s for s in plant.sensors
+            )
+            corrected = replace(plant, sensors=tuple(sensors))
+            if _fits_into_tanks(corrected, recording):
+                units = {tank: 1.0 / ratio for tank, sensor in first.items() if sensor.unit == kind}
+                lower = balance_along(corrected, recording, units)
+                yield Correction(f"the {numbers} {', '.join(columns)} are", written, right, ratio, lower)
     written = recording.written.get("t", "")  # none: the clock has dates, or is that of a simulation
     for right, ratio in _other_units("s", written) if written else ():
         yield Correction("the times are", written, right, ratio, as_is.scaled(all_tanks / ratio, all_tanks / ratio))

@@ -11,6 +11,7 @@ of consecutive sums, which count as independent (Liang and Zeger, 1986, Biometri
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -116,11 +117,11 @@ class Balance:
         return torch.tensor([tank.log_evidence(HALF_OF_DIGITS * largest) for tank in self.tanks])
 
 
-def balance_along(plant: PlantDescription, recording: Recording, unit: float = 1.0) -> Balance:
+def balance_along(plant: PlantDescription, recording: Recording, units: Mapping[str, float] | None = None) -> Balance:
     """The balance between samples of a recording whose inputs are known, thinned to about SAMPLES.
 
-    unit: of the level changes, m. Metered flows are not limited here, since they are proportional to a wrong unit only
-    below their greatest flow.
+    units: of the level changes of tanks, m, by default 1. Metered flows are not limited here, since they are
+    proportional to a wrong unit only below their greatest flow.
     """
     recording = recording.every(math.ceil(len(recording) / SAMPLES))
     network = build_network(plant)
@@ -147,7 +148,8 @@ def balance_along(plant: PlantDescription, recording: Recording, unit: float = 1
         entering = [flows[each.name] if each.target == tank.name else -flows[each.name] for each in own]
         entering.append(total - sum(entering))  # by effects
         metered = torch.tensor([*(isinstance(component, MeteredFlow) for component in own), False])
-        changes = torch.stack([torch.diff(level), *(interval * per_area * flow for flow in entering)], dim=-1) / unit
+        changes = torch.stack([torch.diff(level), *(interval * per_area * flow for flow in entering)], dim=-1)
+        changes /= (units or {}).get(tank.name, 1.0)
         changes = changes[torch.isfinite(changes).all(dim=-1)]
         intervals = len(changes) // (GROUPS * SUMS)
         sums = changes[: GROUPS * SUMS * intervals].reshape(GROUPS, SUMS, intervals, 2 + len(own)).sum(dim=2)

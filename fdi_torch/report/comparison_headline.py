@@ -25,6 +25,7 @@ from fdi_torch.units import UnitError, in_unit, number_and_unit
 MOST_LISTED, MOST_LETTERS = 4, 60
 AT_95 = 1.96
 VERSIONS = ("env", "git")
+MONITOR = "monitor"  # the kind of run whose model follows the readings
 NOT_IN_WORDS = ("sha256", "output.name", "output.folder")
 NONE = ("", "null")  # texts of a missing setting
 ROUNDING = 1e-9  # relative error of an amount that was converted to another unit
@@ -42,18 +43,19 @@ def comparison_headline(compared: Comparison, runs: Sequence[Material]) -> list[
 
 
 def _better(compared: Comparison, runs: Sequence[Material]) -> str:
-    """A sentence that names the run with the smallest residuals; if the runs did not read the same recording, their
-    verdicts instead.
+    """A sentence that names the run with the smallest residuals; the verdicts instead if the runs did not read the same
+    recording, or if a monitor, whose observer follows the readings, stands beside a fit.
 
     A run's size is the geometric mean of its sensors' root mean squares. Two sizes from N independent readings differ
     by chance by up to 1.96 / sqrt(N) of them at 95 %: the relative variance of each is 1 / (2 N).
     """
     residuals = [sensor_residuals(run) for run in runs]
     common = [name for name in residuals[0] if all(name in each and each[name].rms > 0.0 for each in residuals)]
-    same = _same_readings(runs)
-    if not same or not common:
+    same, of_one_kind = _same_readings(runs), len({run.kind == MONITOR for run in runs}) == 1
+    if not (same and of_one_kind and common):
         verdicts = "; ".join(f"{label}: {headline(run)}" for label, run in zip(compared.labels, runs, strict=True))
-        reason = "" if same else " They read different recordings, so their residuals do not rank them."
+        reason = "" if of_one_kind else " A monitor's observer follows the readings, so residuals do not rank them."
+        reason = reason if same else " They read different recordings, so their residuals do not rank them."
         return f"{verdicts}.{reason}"
     sizes = [float(np.mean([math.log(each[name].rms) for name in common])) for each in residuals]
     first, second = np.argsort(sizes, kind="stable")[:2]

@@ -191,7 +191,8 @@ def d_name(place: Place) -> str:
 def step_invariant_nodes(graph: Graph) -> frozenset[int]:
     """The nodes that vary between lanes and otherwise only with the length of a step, such as a lag's exp(-dt / tau).
 
-    They are recomputed only when that length changes. Only those that depend on an expensive operation are worth it.
+    They are recomputed only when that length changes. Nodes without an expensive operation (EXPENSIVE) are left out,
+    because to store them costs more than to recompute them.
     """
     steady: set[int] = set()
     expensive: set[int] = set()

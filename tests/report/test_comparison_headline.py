@@ -26,6 +26,7 @@ def write_fit(
     explained: bool = True,
     flow: float = 4e-5,
     held_out: float | None = None,
+    kind: str = "train",
 ) -> Path:
     """A fit of two sensors whose residuals alternate between + and - `error`, m, of readings that vary with `level`.
 
@@ -34,7 +35,7 @@ def write_fit(
     time = np.arange(float(SAMPLES))
     read = level + 0.01 * np.sin(time)[:, None] * np.ones(2)
     model = read - error * np.where(np.arange(SAMPLES) % 2, 1.0, -1.0)[:, None]
-    with RunLog(path, "train", config_text="plant: three_tank\n", config=config or {}, env={}, git={}) as log:
+    with RunLog(path, kind, config_text="plant: three_tank\n", config=config or {}, env={}, git={}) as log:
         log.recording(time, np.full((SAMPLES, 1), flow), read, ("Q1",), ("h1", "h2"), ("m^3/s",), ("m", "m"))
         if held_out is None:
             log.result_arrays(predicted=model)
@@ -94,6 +95,11 @@ def test_runs_of_different_recordings_are_not_ranked(tmp_path: Path) -> None:
         "They read different recordings, so their residuals do not rank them."
     )
     assert differ == "They differ in the recording (simulated: other readings)."
+
+
+def test_a_monitor_and_a_fit_are_not_ranked(tmp_path: Path) -> None:
+    fit, followed = write_fit(tmp_path / "a.mcap", 0.004), write_fit(tmp_path / "b.mcap", 0.001, kind="monitor")
+    assert sentences(fit, followed)[0].endswith("follows the readings, so residuals do not rank them.")
 
 
 def test_a_live_source_is_not_called_simulated(tmp_path: Path) -> None:

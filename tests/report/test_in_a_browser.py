@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import re
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -159,6 +160,20 @@ def test_a_page_can_be_read_on_a_desk_and_a_phone(browser: Any, path: Path, widt
     pixels = imread(target)[:, :, :3]
     assert pixels.shape[1] == width and pixels.std() > 0.02
     assert (pixels.mean() > 0.8) if scheme == "light" else (pixels.mean() < 0.3)
+    tab.context.close()
+
+
+def test_rows_of_charts_are_full(browser: Any, tmp_path: Path) -> None:  # noqa: F811
+    """Of a wide page; with two columns an odd number leaves one place free."""
+    path = tmp_path / "page.html"
+    style = (resources.files("fdi_torch.report") / "assets" / "page.css").read_text()
+    grids = "".join(f"<div class=grid>{'<figure><svg></svg></figure>' * count}</div>" for count in range(2, 12))
+    path.write_text(f"<style>{style}</style><main><section>{grids}</section></main>")
+    tab, _ = opened(browser, path)
+    tops = "[...document.querySelectorAll('.grid')].map(grid => [...grid.children].map(figure => figure.offsetTop))"
+    for of_grid in tab.evaluate(tops):
+        rows = [of_grid.count(top) for top in dict.fromkeys(of_grid)]
+        assert set(rows) <= {2, 3} and rows == sorted(rows, reverse=True)
     tab.context.close()
 
 

@@ -24,6 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--faults", metavar="NAME,NAME", help="such as T1.leak.size (default: the usual faults)")
     parser.add_argument(
         "--input",
+        "--recording",
         metavar="FILE|AMOUNTS",
         required=True,
         help="a recording (or a YAML file that lists one) whose inputs are used, or constant inputs "

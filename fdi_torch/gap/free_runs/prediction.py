@@ -65,6 +65,7 @@ def predict(
     step: float | None = None,
     settle: float | None = None,
     vary: Collection[str] = (),
+    tell: Callable[[float, str], None] = lambda share, text: None,
 ) -> Prediction:
     """Simulate the plant along the recording with the constants of its file, from estimated initial levels.
 
@@ -73,7 +74,7 @@ def predict(
 
     settle: length of the initial segment (s), used in place of start_samples. The run continues from the levels at its
     end, and errors are counted after it. vary: patterns of further constants with a tolerance that the first samples
-    determine.
+    determine. tell(share, text): receives the progress.
 
     Raises ValueError if there is no sample to start from, or none left to predict.
     """
@@ -87,7 +88,8 @@ def predict(
     duration = float(recording.time[-1] - recording.time[0])
     step = step or max(0.5 * float(torch.median(torch.diff(recording.time))), duration / MOST_STEPS)
     defect = math.inf
-    for _ in range(HALVINGS):
+    for attempt in range(HALVINGS):
+        tell(attempt / HALVINGS, f"steps of {step:.3g} s")
         data = data_set_of(plant, nominal_effects, recording, step)
         prediction, previous = _run(data, start_samples, skipped), defect
         defect = prediction.defect
@@ -95,6 +97,7 @@ def predict(
         if prediction.settled or stalled:  # an empty tank oscillates at its floor with any step
             break
         step *= 0.5
+    tell(1.0, "done")
     return prediction
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -77,6 +77,7 @@ def refit(
     hold: Collection[str] = (),
     white: float | None = None,
     vary: Collection[str] = (),
+    tell: Callable[[float, str], None] = lambda share, text: None,
 ) -> Refit:
     """Fit all effects and constants of a plant to recordings.
 
@@ -84,7 +85,7 @@ def refit(
     patterns of constants that are not fitted. white: standard deviation of white noise of the levels, m, that replaces
     the estimated noise. Use it for free runs with equations that are not quite the rig's: the estimated noise weights
     fast errors more than slow ones. vary: patterns of further constants with a tolerance that each recording has for
-    itself.
+    itself. tell(share, text): receives the progress.
 
     Raises ValueError for a pattern that matches no name.
     """
@@ -107,9 +108,12 @@ def refit(
     if white is not None:
         noise = Noise.white(white * data.readings.new_tensor([abs(s.gain) for s in plant.sensors]))
     fitter = Fitter(data, noise)
+    turns = TURNS if white is None else 1
+    tell(0.0, "fit of the constants")
     null = _with_a_trajectory(fit_by_continuation(fitter, Candidate()), recordings)
     fit, base = null, null if white is None else None
-    for _ in range(TURNS if white is None else 1):
+    for turn in range(turns):
+        tell((1 + turn) / (1 + turns), f"fit of constants and effects, turn {turn + 1} of {turns}")
         if white is None:
             fitter = Fitter(data, estimate_noise(data.readings - fit.linearised.readings[0], data.mask))
         candidate = Candidate(tuple(free), (start,))
@@ -124,6 +128,7 @@ def refit(
     )
     residuals = (data.readings - each.linearised.readings[0] for each in (null, fit))
     before, after = (rmse_by_sensor(plant, residual, data.mask) for residual in residuals)
+    tell(1.0, "done")
     return Refit(refitted, before, after, len(fit.space), _errors(fitter, fit), run_constants)
 
 

@@ -68,7 +68,7 @@ class EvaluatedDiscrepancy:
 
     @property
     def held(self) -> Mapping[str, float]:
-        """The parameters of the effects at the place, which keep them: the discrepancy is the error of their laws."""
+        """Parameters of the effects at the place. They stay fixed: the discrepancy is the error of their laws."""
         fit = self.regression.fit
         return fit.values_of([p for p in fit.candidate.placements if p.location == self.location])
 
@@ -180,8 +180,8 @@ class Ascent:
         """The likeliest discrepancy at a place under this noise or under ones with smaller random flows.
 
         Random flows that absorb a law with many changes hide each of them, so that neither one more regressor nor
-        smaller flows gain anything, but both together do. Each regression starts from the regressors of the one before;
-        the flows are lowered until two in succession were worse.
+        smaller flows gain anything, but both together do. The intensity of the random flows is therefore reduced in
+        steps, and each regression starts from the regressors of the previous one, until two successive ones are worse.
         """
         evaluated = [self.with_finer_positions(self.evaluate(regression, regression.of(place), place, noise))]
         for share in LESS_NOISE:

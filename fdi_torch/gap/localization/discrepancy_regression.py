@@ -81,7 +81,7 @@ class Regressors:
         return family.function(position.index)
 
     def sinusoids(self, frequency: Tensor) -> Tensor:
-        """Harmonics of each frequency (F,), Hz, times the factor: (F, W, K)."""
+        """Sines and cosines at each frequency (F,), Hz, multiplied by `factor` (K,): (F, W, K)."""
         return harmonics(self.time, frequency) * self.factor
 
 

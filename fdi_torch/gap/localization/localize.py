@@ -170,9 +170,9 @@ def _first_order_gains(
 def _evidence_bound(fitter: Fitter, fit: Fit, noise: StateNoise) -> float:
     """Upper bound of the log evidence of a discrepancy in addition to a fit.
 
-    It is that of one regressor that explains everything except sensor noise. A regressor that reduces chi-square by G
-    costs (1 + log G) / 2 nats at its most likely precision, plus the logarithm of the number of steps in time for its
-    selection.
+    It is the evidence of a single regressor that explains everything except sensor noise. A regressor that reduces
+    chi-square by G costs (1 + log G) / 2 nats at its most likely precision, plus the logarithm of the number of steps
+    in time for its selection.
     """
     undisturbed = with_disturbances(fitter, fit, replace(noise, intensity=torch.zeros_like(noise.intensity)))
     count, residual = int(fitter.data.mask.sum()), undisturbed.residual(fit.linearised.readings)

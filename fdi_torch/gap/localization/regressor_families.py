@@ -106,7 +106,7 @@ class Pulses:
 
     @property
     def spacing(self) -> Tensor:
-        """Distance of neighbours on the grid, (3,); that of a frequency moves a pulse by 1/PHASES at the end."""
+        """Grid spacing of the parameters, (3,). One step of the frequency shifts the last pulse by 1/PHASES periods."""
         return self.time.new_tensor([1.0 / float(self.time[-1]), 1.0, 1.0]) / PHASES
 
     def parameters(self, i: int) -> Tensor:
