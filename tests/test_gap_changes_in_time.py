@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from fdi_torch.gap.answer_assembly import amounts_of
 from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.candidate_fit import standard_errors
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
@@ -75,6 +76,16 @@ def test_a_ramp_that_has_not_ended_is_told_by_the_size_that_it_has_reached() -> 
     onset, ramp, size = (leak.parameters[name] for name in ("onset", "ramp", "size"))
     assert onset.value + ramp.value == pytest.approx(999.0)
     assert size.value == pytest.approx(0.5 * 699.0 / 1400.0, abs=4.0 * size.std) and size.std < 0.02
+
+
+def test_a_change_at_the_very_end_of_the_recording_is_told_as_fitted() -> None:
+    case = problem_of(nominal_plant(), (recorded({}, 1, samples=600),), (), Settings(("leak",)))
+    fitter, null, _ = recalibrate(case.data)
+    (placement,) = [p for p in case.library if p.location == "T1"]
+    fitted = {"T1.leak.size": 0.3, "T1.leak.onset": 599.0}
+    fit = fitter.fit(Candidate((placement,), (fitted,)), null, held=fitted)
+    amounts = amounts_of(fitter, fit, placement, standard_errors(fitter, fit))
+    assert {name: amount.value for name, amount in amounts.items()} == {"size": 0.3, "onset": 599.0}
 
 
 def test_a_fault_from_the_start_at_the_floor_has_neither_onset_nor_height() -> None:

@@ -32,7 +32,8 @@ class UnmeteredFlow(Effect):
 
     def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         flow = 0.1 * flow_scale(plant, place)
-        shares = [(k / 4, 1 / 4) for k in range(4)] + [(k / 8, 1 / 2) for k in range(5)]
+        # Those that would end exactly at the last sample, which is a kink of the cost, go on beyond it.
+        shares = [(k / 4, 1 / 4) for k in range(3)] + [(k / 8, 1 / 2) for k in range(4)] + [(1 / 2, 1.0), (3 / 4, 1.0)]
         return [
             {
                 "flow": sign * flow,

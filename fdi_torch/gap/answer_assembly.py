@@ -148,7 +148,7 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
     plant, stds, causes = fitter.data.plant, standard_errors(fitter, fit), []
     placements = [p for p in fit.candidate.placements if p.cause in result.posterior.best.causes]
     for p in placements:
-        amounts = _amounts(fitter, fit, p, stds)
+        amounts = amounts_of(fitter, fit, p, stds)
         others = equivalence_class(p.cause, plant, fit.values) - {p.cause}
         causes.append(Cause(*p.cause, amounts, tuple(sorted(others)), _flow(fitter, fit, p, amounts)))
     if result.posterior.best.unknown_at:
@@ -159,7 +159,7 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
     return (*causes, *(Cause(*name, shown.get(name, {})) for name in result.from_readings))
 
 
-def _amounts(fitter: Fitter, fit: Fit, placement: Placement, stds: Mapping[str, float]) -> dict[str, Amount]:
+def amounts_of(fitter: Fitter, fit: Fit, placement: Placement, stds: Mapping[str, float]) -> dict[str, Amount]:
     """Fitted parameters of an effect. stds: standard errors of all parameters of the fit.
 
     A ramp that has not ended when the recording does shows a rate only, in which size and ramp cancel. It is told as
@@ -169,7 +169,7 @@ def _amounts(fitter: Fitter, fit: Fit, placement: Placement, stds: Mapping[str, 
     size, *_ = (placement.full_name(p.name) for p in placement.effect.parameters(placement.location, fitter.data.plant))
     onset, ramp = placement.full_name("onset"), placement.full_name("ramp")
     left = fitter.data.longest_duration - fitted.get(onset, 0.0)
-    if fitted.get(ramp, 0.0) >= left:
+    if 0.0 < left <= fitted.get(ramp, 0.0):
         growth = (fitted[size] - fit.space[size].nominal) / fitted[ramp]
         slopes = torch.zeros(2, len(fit.space), dtype=fit.theta.dtype)  # of size and ramp, by the fitted parameters
         slopes[0, fit.space.index(size)] = left / fitted[ramp]

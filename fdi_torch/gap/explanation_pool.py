@@ -82,14 +82,16 @@ class ExplanationPool:
         """Estimate noise and fit alternately until the evidence converges; keep the better explanation.
 
         Effects that were evaluated before are evaluated again only if this fit is likelier under the noise found then.
-        The evaluation stops early if the explanation cannot compete: with those of as many effects that will be
-        extended, or with one that has only some of its effects. At its end, improbable onsets and the like are dropped.
+        The evaluation stops early if the explanation cannot compete with the likeliest. At its end, improbable onsets
+        and the like are dropped. Its fits are given up if they cannot compete with those of as many effects that will
+        be extended, or with one that has only some of its effects.
         """
         before, candidate = self.explanations.get(fit.key), fit.candidate
         if before and evidence_under(before.fitter, fit, self.choices) < before.log_evidence + TOLERANCE:
             return before
         rivals = self.best_of(len(fit.key))[BEAM - 1 :] + [e for k, e in self.explanations.items() if k < fit.key]
         rival = max((e.log_evidence for e in rivals), default=-math.inf)
+        leader = max((e.log_evidence for e in self.explanations.values()), default=-math.inf)
         best: RankedExplanation | None = None
         climb = False
         while True:
@@ -103,7 +105,7 @@ class ExplanationPool:
             gain = likelier.log_evidence - best.log_evidence if best else math.inf
             if best is None or gain > 0.0:
                 best = likelier
-            behind = rival - best.log_evidence
+            behind = leader - best.log_evidence
             if behind > 0.5 * BEHIND and gain < SHARE * behind:
                 break
             if climb and not gain > TOLERANCE:
@@ -164,8 +166,15 @@ class ExplanationPool:
             undisturbed = self._fitted(self.fitter, self.null, candidates, (self.fitter.cost(f) for f in fits))
             costs = {parent.key: self.null.cost} | {f.key: f.cost for f in undisturbed}
             fits += [f for f in undisturbed if self._improves(f, costs)][:EVALUATED]
-        for fit in sorted(fits, key=lambda f: len(f.key)):
+        for fit in sorted(fits, key=lambda f: (len(f.key), -self._prospect(parent, f))):
             self.evaluate(fit, parent.noise)
+
+    def _prospect(self, parent: RankedExplanation, fit: Fit) -> float:
+        """Log evidence of a fit under the noise of the sensors alone or that of `parent`, whichever suits it better.
+
+        The likeliest fit is evaluated first, because the others then stop early.
+        """
+        return max(evidence_under(fitter, fit, self.choices) for fitter in (self.fitter, parent.fitter))
 
     def fits_beside(self, fitter: Fitter, base: Fit, options: Sequence[Option]) -> list[Fit]:
         """Fits of the most promising extensions of `base` under another noise, and beside a discrepancy.

@@ -100,9 +100,10 @@ def onset_grid(operating_range: OperatingRange) -> list[float]:
 
 
 def timed_starts(starts: Sequence[Mapping[str, float]], operating_range: OperatingRange) -> list[dict[str, float]]:
-    """These starts from the beginning of the recording, from each onset of the grid, and growing until its end."""
+    """These starts from the beginning of the recording, from each onset of the grid, and growing beyond its end."""
     duration = operating_range.duration
-    growing = {"onset": 0.3 * duration, "ramp": 0.7 * duration}
+    # A ramp that ended at the last sample would start the fit at a kink, where rounding decides on the slope.
+    growing = {"onset": 0.3 * duration, "ramp": 0.75 * duration}
     times = [{}, *({"onset": instant} for instant in onset_grid(operating_range)), growing]
     return [{**start, **time} for time in times for start in starts]
 
