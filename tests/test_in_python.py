@@ -177,14 +177,15 @@ def test_every_job_takes_a_run_as_a_mapping_or_a_file(tmp_path: Path) -> None:
         fdi_torch.predict(RIG)
 
 
-def test_a_rig_in_code_from_simulation_to_report(tmp_path: Path) -> None:
+def test_a_rig_in_code_from_simulation_to_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recording = simulated(**{"A.leak": 0.3})
     again = simulated(**{"A.leak": 0.3})
     assert torch.equal(recording.outputs, again.outputs)
     assert "301 samples, 300 s" in repr(recording) and "<table>" in recording._repr_html_()
-    estimate = {"parameters": ["A.leak"]}
-    run = {"plant": RIG, "recordings": [recording], "estimate": estimate, "output": {"folder": str(tmp_path)}}
-    found = fdi_torch.train(run)
+    monkeypatch.chdir(tmp_path)
+    found = fdi_torch.train(RIG, recording, ["A.leak"])
+    run = {"plant": RIG, "recordings": [recording], "estimate": {"parameters": ["A.leak"]}}
+    assert torch.equal(fdi_torch.train(run).estimate.value, found.estimate.value)
     row = found.table().columns["parameter"].index("A.leak.size")
     estimate_of, error_of = (found.table().columns[name][row] for name in ("estimate", "std error"))
     assert abs(estimate_of - 0.3) < 4.0 * error_of < 0.2
@@ -222,9 +223,9 @@ def test_a_monitor_runs_along_a_recording_in_memory(tmp_path: Path) -> None:
     faults = {"A.leak": 0.3, "A.leak.onset": "400 s"}
     noise = {"std": {"h": "1 mm"}}
     recording = fdi_torch.simulate(RIG, inputs={"Q": "3 l/min"}, duration="700 s", noise=noise, faults=faults)
-    wanted = {"plant": RIG, "recording": recording, "fault_free": ["0 s", "300 s"], "faults": ["A.leak"]}
-    wanted["output"] = {"folder": str(tmp_path)}
-    found = fdi_torch.monitor(wanted)
+    keys = {"fault_free": ["0 s", "300 s"], "faults": ["A.leak"], "output": {"folder": str(tmp_path)}}
+    found = fdi_torch.monitor(RIG, recording, **keys)
+    assert fdi_torch.monitor({"plant": RIG, "recording": recording, **keys}).headline == found.headline
     headline = r"1 alarm in 700 s; leak at A \(size (.*) ± (.*), (.*) l/min now\)"
     size, error, flow = map(float, re.fullmatch(headline, found.headline).groups())  # type: ignore[union-attr]
     assert abs(size - 0.3) < 3.0 * error < 0.01
@@ -320,6 +321,12 @@ def test_arguments_of_another_kind_are_named() -> None:
             function(RIG, frame)  # type: ignore[operator]
     with pytest.raises(fdi_torch.ConfigError, match=r"train: recordings.0: expected a file name, .* got a set"):
         fdi_torch.train({"plant": RIG, "recordings": [frame], "estimate": {"parameters": ["A.leak"]}})
+    with pytest.raises(fdi_torch.ConfigError, match=r"fault_free: expected a value, .* \(interval"):
+        fdi_torch.monitor(RIG, simulated())
+    with pytest.raises(TypeError, match="monitor: expected a recording beside fault_free, got none"):
+        fdi_torch.monitor(RIG, fault_free=["0 s", "300 s"])
+    with pytest.raises(TypeError, match="train: expected recordings beside the parameters, got none"):
+        fdi_torch.train(RIG, parameters=["A.leak"])
     with pytest.raises(TypeError, match="predict: expected one recording, got a list of 2"):
         fdi_torch.predict(RIG, [simulated(), simulated()])  # type: ignore[arg-type]
     with pytest.raises(

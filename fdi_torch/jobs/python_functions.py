@@ -105,18 +105,28 @@ def simulate(
 
 
 def train(
-    run: AnyRun | None = None,
+    plant: AnyPlant | AnyRun | None = None,
+    recordings: AnyRecording | Sequence[AnyRecording] | None = None,
+    parameters: Sequence[str] | None = None,
+    *,
     tell: Tell | None = None,
     resume: bool = False,
     listener: Any = None,
 ) -> train_job.TrainResult:
     """Estimate fault sizes and their uncertainty from recordings, as `fdi train` does, with a log and pictures.
 
-    run: a run file, or a mapping such as {"plant": plant, "recordings": [recording],
-    "estimate": {"parameters": ["T1.leak"]}}; None: the built-in example. resume: continue a killed run of the same
-    file. listener: receives every log message. tell(share, text): receives the progress, from 0 to 1, and a line about
-    it; by default nothing is shown, and tell=print prints it.
+    plant, recordings, parameters: the latter as of `estimate:` in a run file, ["T1.leak"]. Without recordings, plant is
+    a run: its file, or its keys such as {"plant": plant, "recordings": [recording], "estimate": {"parameters":
+    ["T1.leak"]}}; None: the built-in example. resume: continue a killed run of the same file. listener: receives every
+    log message. tell(share, text): receives the progress, from 0 to 1, and a line about it; by default nothing is
+    shown, and tell=print prints it. Raises ConfigError, which names the wrong key and the expected value.
     """
+    run: Any = plant
+    if recordings is not None:
+        listed = recordings if isinstance(recordings, list | tuple) else [recordings]
+        run = {"plant": plant, "recordings": listed, "estimate": {"parameters": parameters or ()}}
+    elif parameters is not None:
+        raise TypeError("train: expected recordings beside the parameters, got none; name them, or give a run alone")
     return train_job.train(_run_of(run, "train"), tell, resume, listener)
 
 
@@ -153,14 +163,24 @@ def gap(
 
 
 def monitor(
-    run: MonitorRun | Mapping[str, Any] | str | Path, *, tell: Callable[[float | None, str], None] = silent
+    plant: AnyPlant | MonitorRun | Mapping[str, Any],
+    recording: AnyRecording | None = None,
+    *,
+    tell: Callable[[float | None, str], None] = silent,
+    **keys: Any,
 ) -> MonitorResult:
     """Run a monitor along a recording, as `fdi monitor` does.
 
-    run: a monitor file, or a mapping such as {"plant": plant, "recording": recording, "fault_free": ["0 s", "300 s"]}.
+    plant, recording, keys: the latter as in a monitor file, fault_free=["0 s", "300 s"]. Without a recording, plant is
+    a monitor file, or its keys such as {"plant": plant, "recording": recording, "fault_free": ["0 s", "300 s"]}.
     tell(share, text): receives the progress, from 0 to 1 (None along a live source), and a line about it; by default
-    nothing is shown, and tell=print prints it.
+    nothing is shown, and tell=print prints it. Raises ConfigError, which names the wrong key and the expected value.
     """
+    run: Any = plant
+    if recording is not None:
+        run = {"plant": plant, "recording": recording, **keys}
+    elif keys:
+        raise TypeError(f"monitor: expected a recording beside {', '.join(keys)}, got none; name it")
     if isinstance(run, str | Path):
         run = load_monitor(run)
     elif not isinstance(run, MonitorRun):
