@@ -58,20 +58,18 @@ def fine_onsets(options: Sequence[Option], fitter: Fitter) -> list[Option]:
 
 def likeliest_intervals(options: Sequence[Option], fitter: Fitter, fit: Fit) -> list[Option]:
     """The intervals in which these options explain most in addition to a fit, for effects that begin and end."""
-    count = max(_count(fitter), FEWEST)
-    times = torch.arange(count, dtype=torch.float64) * fitter.data.longest_duration / count
+    count, duration = max(_count(fitter), FEWEST), fitter.data.longest_duration
+    times = torch.arange(count, dtype=torch.float64) * duration / count
     further: list[Option] = []
     for option in {o.cause: o for o in options}.values():
         if len(option.instants) == 2:
             begin, lasting = option.instants
-            ends = float(times[-1]) + float(times[1])
-            steps = [
-                replace(option, start={**option.start, begin: time, lasting: ends - time}) for time in times.tolist()
-            ]
+            steps = [replace(option, start={**option.start, begin: t, lasting: duration}) for t in times.tolist()]
             size = next(iter(option.start))
             for first, beyond, sign in _best_pairs(*products(fitter, fit, steps)):
-                end = float(times[beyond]) if beyond < count else ends
-                start = {begin: float(times[first]), lasting: end - float(times[first])}
+                # An end exactly at the last sample would be a kink of the cost.
+                lasts = float(times[beyond] - times[first]) if beyond < count else duration
+                start = {begin: float(times[first]), lasting: lasts}
                 further.append(replace(option, start={**option.start, **start, size: sign * option.start[size]}))
     return further
 
