@@ -54,6 +54,7 @@ def test_a_leak_that_grows_is_named() -> None:
     ("cause", "values"),
     [
         (("pump_gain", "Q1"), {"factor": 0.85, "onset": 300.0, "ramp": 400.0}),
+        (("sensor_gain", "h1"), {"factor": 1.1, "onset": 400.0}),
         (("sensor_bias", "h2"), {"bias": 0.02, "onset": 350.0, "ramp": 300.0}),
     ],
 )
