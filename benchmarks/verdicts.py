@@ -29,9 +29,10 @@ from fdi_torch.blind.sizes import COMPARABLE
 from fdi_torch.blind.statistics import clopper_pearson
 from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.diagnose import diagnose, recalibrate
-from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
+from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.library import STANDARD as LIBRARY
 from fdi_torch.gap.problem import Settings, problem_of
+from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.screening import Option, options_of
 from fdi_torch.gap.structure_search import search
 from fdi_torch.logbook.provenance import git_state

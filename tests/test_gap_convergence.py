@@ -16,9 +16,10 @@ from fdi_torch.estimate.fitting import set_up
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.diagnose import recalibrate
-from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
+from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.marginal_likelihood import log_evidence
 from fdi_torch.gap.problem import PLAIN, problem_of
+from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Placement
 from fdi_torch.recording import Recording

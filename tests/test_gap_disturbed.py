@@ -20,12 +20,13 @@ from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
-from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
+from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.library import possible_places
 from fdi_torch.gap.localization.localize import localize
 from fdi_torch.gap.marginal_likelihood import evidence_under, with_disturbances, with_estimated_noise
 from fdi_torch.gap.onsets import fine_onsets
 from fdi_torch.gap.problem import problem_of
+from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.screening import Option, options_of, screen
 from fdi_torch.gap.structure_search import search
 from fdi_torch.plant.effect import Placement

@@ -16,11 +16,12 @@ from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.cause_hypothesis import CauseHypothesis, causes_in_order
 from fdi_torch.gap.diagnose import recalibrate
-from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
+from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.hypothesis_weights import HypothesisWeights
 from fdi_torch.gap.localization.localized_discrepancy import Estimate, LocalizedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import log_evidence
 from fdi_torch.gap.problem import PLAIN, problem_of
+from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.plant.effect import Placement
 from tests.rigs import random_steps
 from tests.test_gap_convergence import recorded

@@ -18,8 +18,8 @@ from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import UNKNOWN, CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.explanation_pool import RankedExplanation
 from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy, unexplained_norm
+from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.start_choice import vector_of
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 
@@ -28,6 +28,7 @@ from fdi_torch.gap.marginal_likelihood import (
     with_likeliest_parameters,
 )
 from fdi_torch.gap.onsets import with_fine_onsets
+from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.screening import Option, ScreeningResult, pairs_of, screen
 from fdi_torch.gap.trajectory_problem import BEHIND, SHARE
 
@@ -38,31 +39,6 @@ FITTED = 8  # effects fitted about each explanation and noise, by first-order ga
 STARTS = 8  # initial values of one effect, by first-order gain
 EVALUATED = 3  # of these fits, the best whose evidence is computed
 PAIRS = 3  # pairs of effects fitted together
-
-
-@dataclass(frozen=True)
-class RankedExplanation:
-    """A set of effects: its fit, the fitter with its own noise, that noise, and its log evidence with prior odds."""
-
-    fit: Fit
-    fitter: Fitter
-    noise: StateNoise
-    log_evidence: float
-
-    @property
-    def key(self) -> Key:
-        return self.fit.key
-
-    @property
-    def negative_log_posterior(self) -> float:
-        """-ln of the posterior of the fitted parameters under this noise, up to a constant; infinite if undefined."""
-        value = 0.5 * (self.fit.cost + self.fitter.log_det)
-        return value if math.isfinite(value) else math.inf
-
-    @property
-    def log_weight(self) -> float:
-        """Log posterior weight if nothing is unknown: random flows are then of one order of magnitude in all tanks."""
-        return self.log_evidence + self.noise.log_prior()
 
 
 class ExplanationPool:

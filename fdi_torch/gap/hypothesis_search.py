@@ -21,7 +21,7 @@ from fdi_torch.gap.cause_hypothesis import (
     causes_in_order,
     likeliest,
 )
-from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
+from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.hypothesis_weights import HypothesisWeights
 from fdi_torch.gap.localization.localize import localize, localize_beside
 from fdi_torch.gap.localization.localized_discrepancy import (
@@ -29,6 +29,7 @@ from fdi_torch.gap.localization.localized_discrepancy import (
     log_likelihood,
 )
 from fdi_torch.gap.marginal_likelihood import log_prior, with_disturbances
+from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.screening import Option
 from fdi_torch.gap.structure_search import Report, SearchResult
 

@@ -16,10 +16,11 @@ import torch
 from fdi_torch.estimate.evidence import ODDS, log_law_error, log_odds_of_law
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.cause_hypothesis import CauseHypothesis, causes_in_order, influence, relative_size
-from fdi_torch.gap.explanation_pool import ExplanationPool, RankedExplanation
+from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.library import tanks_of
 from fdi_torch.gap.localization.localized_discrepancy import LocalizedDiscrepancy, unexplained_norm
 from fdi_torch.gap.marginal_likelihood import log_prior, log_width, occam
+from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.screening import Option
 from fdi_torch.plant.description import PlantDescription
 

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 
 from fdi_torch.estimate.evidence import RARE
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.explanation_pool import BEAM, ExplanationPool, RankedExplanation
+from fdi_torch.gap.explanation_pool import BEAM, ExplanationPool
+from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, pairs_of, screen, screen_under_each
 
 Report = Callable[[Collection[CauseName]], None]  # told the causes that are the likeliest so far
