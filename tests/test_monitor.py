@@ -485,7 +485,7 @@ def test_the_report_prints_the_inseparable_pair(capsys: pytest.CaptureFixture[st
     words = ["diagnosability", "--plant", "three_tank", "--input", "50 cm^3/s,50 cm^3/s", "--duration", "200"]
     assert main([*words, "--faults", "T2.leak,OUT2.plugging.size,T1.leak.size"]) == 0
     shown = capsys.readouterr().out
-    assert "the same sqrt(2 g h) of T2" in shown
+    assert "both are flows in proportion to sqrt(2 g h) of T2" in shown
     # A tolerance of 3 % of an outlet's coefficient hides smaller leaks: some 3 % of its flow times both quantiles.
     least = next(line.split()[4] for line in shown.splitlines() if line.startswith("T2.leak.size"))
     assert 0.03 * (3.29 + 1.64) * 0.9 < float(least) < 0.2 and "uncertain within their tolerances: P13." in shown

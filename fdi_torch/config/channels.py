@@ -151,8 +151,11 @@ def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()
         quality = f", quality: {tags.quality}" if tags.quality else ""
         lines = [f"tags: {{tag: {tags.tag}, value: {tags.value}{quality}}}    # one row per value", "columns:"]
         return [*lines, *(f"  {name}: {{column: TAG, unit: ...}}" for name in missing)]
-    found = {column: si_unit_of(pair[1]) for column in header if (pair := header_unit(column)) and pair[0] not in kinds}
-    without_unit = [column for column in header if header_unit(column) is None]
+    legible = [column for column in header if column == shortened(column)]
+    found = {
+        column: si_unit_of(pair[1]) for column in legible if (pair := header_unit(column)) and pair[0] not in kinds
+    }
+    without_unit = [column for column in legible if header_unit(column) is None]
     lines = ["columns:    # units only where the header has none"]
     for name in missing:
         own = next((c for c in without_unit if re.match(rf"{re.escape(name)}(?![^\W_])", c)), None)
