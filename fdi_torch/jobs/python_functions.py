@@ -115,11 +115,11 @@ def train(
 ) -> train_job.TrainResult:
     """Estimate fault sizes and their uncertainty from recordings, as `fdi train` does, with a log and pictures.
 
-    plant, recordings, parameters: the latter as of `estimate:` in a run file, ["T1.leak"]. Without recordings, plant is
-    a run: its file, or its keys such as {"plant": plant, "recordings": [recording], "estimate": {"parameters":
-    ["T1.leak"]}}; None: the built-in example. resume: continue a killed run of the same file. listener: receives every
-    log message. tell(share, text): receives the progress, from 0 to 1, and a line about it; by default nothing is
-    shown, and tell=print prints it. Raises ConfigError, which names the wrong key and the expected value.
+    parameters: to be estimated, such as ["T1.leak"]. plant: without recordings, a run: its file, or its keys such as
+    {"plant": plant, "recordings": [recording], "estimate": {"parameters": ["T1.leak"]}}; None: the built-in example.
+    resume: continue a killed run of the same file. listener: receives every log message. tell(share, text): receives
+    the progress, from 0 to 1, and a line about it; by default nothing is shown, and tell=print prints it. Raises
+    ConfigError, which names the wrong key and the expected value.
     """
     run: Any = plant
     if recordings is not None:
@@ -171,8 +171,8 @@ def monitor(
 ) -> MonitorResult:
     """Run a monitor along a recording, as `fdi monitor` does.
 
-    plant, recording, keys: the latter as in a monitor file, fault_free=["0 s", "300 s"]. Without a recording, plant is
-    a monitor file, or its keys such as {"plant": plant, "recording": recording, "fault_free": ["0 s", "300 s"]}.
+    keys: those of a monitor file, such as fault_free=["0 s", "300 s"]. plant: without a recording, a monitor file or
+    its keys, such as {"plant": plant, "recording": recording, "fault_free": ["0 s", "300 s"]}.
     tell(share, text): receives the progress, from 0 to 1 (None along a live source), and a line about it; by default
     nothing is shown, and tell=print prints it. Raises ConfigError, which names the wrong key and the expected value.
     """
