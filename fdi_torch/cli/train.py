@@ -151,7 +151,7 @@ def in_words(done: TrainResult) -> list[str]:
 
 
 def not_counted(recordings: Sequence[Recording]) -> list[str]:
-    """Notes on the rows of each file: what was changed, missing or masked readings, unknown inputs."""
+    """Notes on the rows of each file: changed rows, missing or masked readings, unknown inputs."""
     lines = list(dict.fromkeys(note for r in recordings for note in r.notes))
     for source in dict.fromkeys(r.source for r in recordings):
         masks = [r.mask for r in recordings if r.source == source]

@@ -118,7 +118,7 @@ def align(
     """One field of all runs on a common axis: axis (K,), values (runs, K), NaN for missing events.
 
     The axis is the generation, the iteration, the trial, or plant time in s; never wall time. where: only messages with
-    these numbers, such as {"problem": 0}. Of several messages at one point the last one counts.
+    these numbers, such as {"problem": 0}. If several messages have the same axis value, the last one counts.
     """
     axis_field, where = AXES.get(topic, "t"), where or {}
     columns = []

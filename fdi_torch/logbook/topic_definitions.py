@@ -44,11 +44,11 @@ class Topic:
 _EVENT: dict[str, tuple[Kind, str, str]] = {"problem": ("integer", "", "which of the batched problems")}
 
 TOPICS: dict[str, Topic] = {
-    "/plant/input": Topic("fdi_torch.plant_input", "what was commanded"),
+    "/plant/input": Topic("fdi_torch.plant_input", "commands to the plant"),
     "/plant/output": Topic(
         "fdi_torch.plant_output",
-        "what was read",
-        {"masked": ("texts", "", "readings that do not count")},
+        "readings of the sensors",
+        {"masked": ("texts", "", "readings that are not used")},
     ),
     "/plant/truth": Topic("fdi_torch.plant_truth", "true states and faults of a simulated plant"),
     "/source/clock": Topic(
@@ -161,8 +161,8 @@ TOPICS: dict[str, Topic] = {
             "ambiguity_set": ("texts", "", "explanations that hold 95 % together"),
             "explanations": ("texts", "", "explanations compared"),
             "probabilities": ("numbers", "1", "posterior of each explanation"),
-            "unexamined": ("number", "1", "posterior of what was not examined"),
-            "certain": ("texts", "", "effect@location, there with 95 % whatever else is"),
+            "unexamined": ("number", "1", "posterior of all explanations that were not examined"),
+            "certain": ("texts", "", "effect@location, present with 95 % in all explanations together"),
             "answer": ("text", "", "the whole answer as JSON text"),
         },
     ),
@@ -178,17 +178,17 @@ TOPICS: dict[str, Topic] = {
     ),
     "/study/summary": Topic(
         "fdi_torch.summary",
-        "a setting of a study, summed up",
+        "summary of a setting of a study",
         {"group": ("text", "", "setting"), "trials": ("integer", "", "how many")},
     ),
     "/log": Topic(
         "foxglove.Log",
-        "what was said during the run",
+        "log messages",
         {
             "timestamp": ("time", "", "plant time since 2000-01-01"),
             "level": ("integer", "", "1 debug, 2 info, 3 warning, 4 error, 5 fatal"),
             "message": ("text", "", "one sentence"),
-            "name": ("text", "", "who said it"),
+            "name": ("text", "", "sender"),
             "file": ("text", "", "unused"),
             "line": ("integer", "", "unused"),
         },

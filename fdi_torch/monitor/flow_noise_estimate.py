@@ -141,11 +141,11 @@ def _usual_flow(linear: Linear, reading_std: Tensor, start_std: Tensor) -> Tenso
 
 
 def learning_from(flows: FlowFilter, residual: Tensor, number: int) -> tuple[FlowFilter, float]:
-    """The filter for the noise that is most likely with what it was learnt from and further residuals, and the log
-    of that likelihood over the one of the present noise.
+    """The filter with the most likely noise, given its earlier data and further residuals, and the logarithm of the
+    likelihood ratio to the present noise.
 
-    residual (S, sensors): scaled to the steady variance, of the observer's samples from `number` on, where the
-    filter starts anew: the state of one with other noise would not be known to the precision that its gain assumes.
+    residual (S, sensors): scaled to the steady variance, of the observer's samples from `number` on. The filter
+    restarts there, because the covariance of its state under the present noise does not hold for other noise.
     """
     further = free_residual(flows.linear, flows.observer, residual, number)
     likeliest, at = _likeliest(replace(flows, begins=number), [flows.learnt, further])

@@ -150,12 +150,13 @@ def _law_error(track: FaultTrack) -> float:
 def possible_ends(
     observer: ObserverBank, state: MonitorState, change: DetectedChange, lookback: float
 ) -> tuple[float, float] | None:
-    """First and last time at which the faults that a change ended may have ended, s; None if the fit's onset and its
-    standard deviation say it.
+    """Interval in which the faults of a change may have ended, s; None if the standard deviation of the fitted onset
+    describes it.
 
-    In a dry tank the readings determine no onset. And where the fit leaves more than noise, its onset may be where the
-    fault's law is wrong, as in a tank that runs dry. Another onset is possible if its misfit is at most that of three
-    standard deviations larger, or if what it moves in the white innovations is within the error of the fault's law.
+    In a dry tank the readings determine no onset. Where the fit leaves more than noise, the fitted onset may be the
+    time from which the fault's law is wrong, as in a tank that runs dry. Another onset is possible if its misfit is at
+    most that of three standard deviations larger, or if it changes the white innovations by less than the error of the
+    fault's law.
     """
     best = change.best
     if not change.ended or best.hypothesis.incipient:

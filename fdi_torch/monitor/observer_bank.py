@@ -87,7 +87,7 @@ class ObserverBank:
     (prediction-error method; Ljung 1999, ch. 7). In all methods believed (P,) are the values of `space` before the
     change.
 
-    constants: what is not known about the calibrated ones. effects: groups of columns of `space` that belong to one
+    constants: the errors of the calibrated constants. effects: groups of columns of `space` that belong to one
     effect, such as amplitude, period and phase of an oscillation. An effect with a memory and an onset parameter (a
     stuck sensor keeps its reading at the onset) gets the onset of the change.
     """

@@ -230,7 +230,7 @@ def _with_units(
     return heading, joined(remaining if first is None else chain([first], remaining), heading)
 
 
-# A cell with a date in a workbook has a time, too.
+# A workbook writes a date with the time of day 00:00:00.
 _DATE = re.compile(r"(\d{1,4}[./-]\d{1,2}[./-]\d{1,4})(?:[T ]00:00:00)?", re.ASCII)
 _TIME_OF_DAY = re.compile(r"\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d+)?)?(?: ?[AaPp][Mm])?", re.ASCII)
 

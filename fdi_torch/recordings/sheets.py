@@ -32,7 +32,7 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Ordered:
-    """Rows in order of time, one per instant, and notes on what was changed."""
+    """Rows in order of time, one per instant, and notes on changes."""
 
     seconds: np.ndarray
     values: np.ndarray
@@ -168,14 +168,14 @@ def informative_rows(inputs: np.ndarray, outputs: np.ndarray, hold: Hold) -> np.
 
 
 def without_missing_rows(seconds: np.ndarray, inputs: np.ndarray, hold_times: Sequence[float]) -> np.ndarray:
-    """Inputs (R, M) with NaN in a row after which no row comes for longer than an input is held, s (0: for ever)."""
+    """Inputs (R, M), NaN in rows whose next row is later than the hold time of the input, s (0: unlimited)."""
     wait = np.diff(seconds, append=seconds[-1:])
     most = np.array([time * (1.0 + HELD_MARGIN) if time > 0.0 else np.inf for time in hold_times])
     return np.where(wait[:, None] > most, np.nan, inputs)
 
 
 def fill_held(seconds: np.ndarray, column: np.ndarray, hold_time: float, hold: Hold) -> np.ndarray:
-    """An input (R,) with empty cells filled by the last value, for at most `most` s.
+    """An input (R,) with empty cells filled by the last value, for at most `hold_time` s.
 
     Under a linear hold they are interpolated, if the next value is no further away. A bad value is NaN and ends the
     hold.

@@ -38,18 +38,18 @@ SCALE = DEVIATION / math.tan(0.375 * math.pi)
 """Scale of the Cauchy distribution that has three quarters within DEVIATION. It has half within 0.03, 90 % within 0.18
 and 95 % within 0.37; of these coefficients it is 0.03, 0.21 and 0.45."""
 HALF_OF_DIGITS = math.sqrt(torch.finfo(torch.float64).eps)
-"""Share of a number below which what is left of a sum counts as rounding."""
+"""Relative tolerance, half of the digits of float64: a smaller share of the largest term counts as rounding."""
 UNRELATED = 0.1
 """Probability that a tank's readings do not depend on its flows: swapped channels, a stuck sensor."""
 
 
 @dataclass(frozen=True)
 class TankBalance:
-    """How the level of a tank changes, by its sensor and by its flows: GROUPS SUMS sums of equally many successive
-    intervals in which all are known, m.
+    """Changes of a tank's level in m, by its sensor and by its F flows, as GROUPS SUMS sums.
 
-    measured: (GROUPS, SUMS), exact to `digits`, m, whatever the correction. by_flow: (GROUPS, SUMS, F). metered: which
-    of the F flows are (F,). intervals: in each sum; none if too few are known.
+    Each sum is over equally many successive intervals in which sensor and flows are known. measured: by the sensor
+    (GROUPS, SUMS), exact to `digits`, m. by_flow: (GROUPS, SUMS, F). metered: whether each flow is metered (F,).
+    intervals: number in each sum, 0 if too few are known.
     """
 
     measured: Tensor

@@ -86,8 +86,8 @@ class Chart:
     zero: date of time 0, s since 1970; None if the axis is not time or the recording has no dates. after: words behind
     the label of the axis, as in ' after 2026-11-01 08:00:00'.
 
-    Values that differ only in digits beyond the fifth, and by more than rounding, are replaced by what they are above
-    their lowest, since no label of an axis could tell them apart.
+    If values differ only beyond their fifth digit, and by more than rounding, the chart shows their difference from the
+    lowest one, because the labels of the axis would all be the same.
     """
 
     title: str

@@ -76,5 +76,5 @@ def bullets(items: Iterable[Any], **attributes: str) -> list[Markup]:
 
 
 def folded(summary: str, *content: Any, printed: bool = True) -> Markup:
-    """Content that opens on a click. printed: whether it appears (opened) on paper."""
+    """Content that opens on a click. printed: whether print-outs contain it, unfolded."""
     return tag("details", tag("summary", summary), *content, **({} if printed else {"class_": "raw"}))

@@ -211,7 +211,7 @@ def bar_panel(
 
 
 def _in_two_lines(name: str) -> str:
-    """A long name of a parameter with its place on a line of its own."""
+    """The name of a parameter, with a line break after its place if it is long."""
     place, _, rest = name.partition(".")
     return short(name, ONE_LINE) if len(name) <= ONE_LINE else f"{short(place, ONE_LINE)}.\n{short(rest, ONE_LINE)}"
 

@@ -230,7 +230,7 @@ class IsolationResult:
 
 
 def isolate_run(monitor: Monitor, samples: Samples, believed: Tensor, levels: Tensor, onset: float) -> IsolationResult:
-    """Run the monitor along one run. believed (P,), levels (tanks,) m: at the first sample; onset: of the fault, s."""
+    """Monitor one simulated run. believed (P,), levels (tanks,) m: at the first sample; onset: of the fault, s."""
     state = monitor.start(samples, believed, levels)
     _, events = monitor.advance(state, samples.segment(1, len(samples)))
     alarms = [e.time for e in events if e.kind == "alarm"]
