@@ -12,10 +12,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from fdi_torch.cli import DONE, MISUSE, NOT_EXPLAINED, main
+from fdi_torch.cli import DONE, MISUSE, NOT_CONVERGED, NOT_EXPLAINED, main
 from fdi_torch.config.run_file import Run, load_run
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.logbook import content_hash, read_run
+from fdi_torch.report.material import gather
+from fdi_torch.report.verdict import headline
 
 QUICK = ("simulate.duration=400 s", "estimate.search.evaluations=1500", "estimate.step.refine=0.5 s")
 
@@ -230,6 +232,23 @@ def test_a_recording_with_an_unknown_input_is_cut_there(own_recording: list[str]
     assert len(done.fitting.recordings) == 2 and "T1.start_level@1" in done.fitting.space
     leak = done.result.diagnosis.faults[0]
     assert leak.present and leak.flow is not None and leak.value == pytest.approx(0.3, abs=0.05)
+
+
+def test_a_fit_that_has_not_converged_says_so_first_and_then_which_rows_do_not_count(
+    own_recording: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cells = [row.split(",") for row in own_recording]
+    cells[30][1], cells[100][3] = "", "NaN"
+    (tmp_path / "default.csv").write_text("\n".join(map(",".join, cells)))
+    (tmp_path / "own.yaml").write_text(OWN)
+    words = ["--config", str(tmp_path / "own.yaml"), "--out", str(tmp_path), "--set", "estimate.refine.iterations=1"]
+    assert main(["train", "--quiet", *words]) == NOT_CONVERGED
+    shown, file = capsys.readouterr().out, tmp_path / "default.csv"
+    warning = "Not converged (max iterations): sizes may be off by more than their standard errors"
+    assert f"{warning}.\n- next: estimate fewer parameters" in shown.partition("parameter ")[0]
+    assert f"{file}: 1 of 600 readings are missing or masked and do not count" in shown
+    assert f"{file}: an input is sometimes unknown; fitted as 2 segments with known inputs" in shown
+    assert headline(gather(read_run(tmp_path / "own.mcap"))).startswith(warning)
 
 
 def test_a_sensor_that_stands_still_is_named(own_recording: list[str], tmp_path: Path) -> None:
