@@ -1,4 +1,4 @@
-"""Draw of each named effect at a hidden rig: law, numbers and usual strength.
+"""Random draws of each named effect for a hidden rig: its law, its parameters and its usual strength.
 
 The size of an effect is drawn relative to the flows and levels of the sound rig under the inputs of the recording, its
 nominal run, so that thresholds are crossed. Each function draws one effect: s is the run of the sound rig, with the

@@ -58,7 +58,7 @@ def effect_places(plant: PlantDescription) -> tuple[Cause, ...]:
 
 
 def canonical(cause: Cause, plant: PlantDescription) -> Cause:
-    """The canonical name of a cause: a leak at the floor and a wider outlet of a drained tank are both the leak."""
+    """The canonical name of a cause: a leak at the floor and a wider outlet of the same tank are both called leak."""
     effect, location = cause
     if effect == "plugging":
         for pipe in plant.pipes:

@@ -1,8 +1,8 @@
 """Random disturbances of the flows into a hidden rig's tanks: white, held for some seconds, or varying slowly.
 
-A disturbance is a value a second for each tank, held over that second (m^3/s once it is scaled):
-    white   each value new;
-    held    each value held for 15 or 60 s;
+A disturbance is one flow for each tank and second, constant over that second (m^3/s once it is scaled):
+    white   a new value every second;
+    held    a new value every 15 or 60 s;
     slow    Ornstein-Uhlenbeck, d_{i+1} = a d_i + sqrt(1 - a^2) w_i with a = exp(-1 s / tau), tau of 100 to 600 s.
 """
 

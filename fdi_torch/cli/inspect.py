@@ -111,7 +111,7 @@ def show(inspection: Inspection, screen: Screen) -> None:
 
 
 def estimate_tables(result: Mapping[str, str]) -> list[ShownTable]:
-    """The estimates and, of a few, their correlations, and the draws; none if a record is unreadable."""
+    """Tables of the estimates, of their correlations if they are few, and of the draws; none if one is unreadable."""
     try:
         names, units, values, std, covariance = (orjson.loads(result.get(key, "[]")) for key in ESTIMATE[:5])
         drawn = [orjson.loads(result.get(key, "[]")) for key in DRAWS]

@@ -90,7 +90,7 @@ class EstimationConfig(Strict):
     confidence: Share = Field(0.95, gt=0, lt=1, description="confidence level of intervals and of the diagnosis")
     profile: list[str] = Field(
         default_factory=list,
-        description="parameters whose likelihood is profiled: intervals right at bounds and ridges",
+        description="parameters whose likelihood is profiled, for intervals that are right at bounds and on ridges",
     )
     draws: int = Field(
         0, ge=0, le=1_000_000, description="draws from the posterior by an ensemble sampler (extra draws)"

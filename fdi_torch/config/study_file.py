@@ -61,7 +61,9 @@ class StudyConfig(Strict):
     data_step: ScaledSeconds = Field(0.01, gt=0, description="integration step of the noise-free readings, s")
     population: int = Field(40, ge=4, description="population of the search")
     evaluations: int = Field(2000, ge=4, description="cost evaluations of each search")
-    tolerance: float = Field(1e-5, gt=0, description="without noise: error, relative to the range, that is a failure")
+    tolerance: float = Field(
+        1e-5, gt=0, description="without noise: smallest error, relative to the range, that counts as a failure"
+    )
 
 
 class StudyFile(RunConfig):

@@ -211,8 +211,8 @@ def _runs(flags: Tensor) -> list[tuple[int, int]]:
 
 FROZEN_SAMPLES = 20
 ODD_SHARE, FEWEST_STEPS, ALIKE, IRREGULAR, FINER = 0.1, 40, 2.0, 3.0, 5.0
-"""Logged on change: all steps but a tenth are at least one that is not far below the usual one and far above the
-resolution, and the times between them differ by more than a factor of three.
+"""A channel is logged on change if nine in ten of its steps exceed a least step, and the times between them differ by
+more than a factor of three. The least step is close to the usual one and far above the resolution.
 """
 CLIPPED_SAMPLES = 5
 CLIPPED_PILE = 5.0

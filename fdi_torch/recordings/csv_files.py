@@ -107,7 +107,7 @@ def read_csv_files(
 
 
 def _assign_to_files(files: Sequence[FileSource], names: Sequence[str]) -> list[list[str]]:
-    """The channels to take from each file; those that none has are for the first, whose reader reports them."""
+    """The channels to read from each file. One that no file has is left to the first, whose reader reports it."""
     names_by_file: list[list[str]] = [[] for _ in files]
     headers = [names_in(read_header(file.path, file.header, file.sheet)) if len(files) > 1 else set() for file in files]
     for name in names:

@@ -38,7 +38,9 @@ class GrowingCsv:
             heading, _ = heading_of(path, handle)
             self._encoding = handle.encoding
         if self._encoding == "utf-16":
-            raise ValueError(f"{path}: expected a file that is followed in UTF-8, got UTF-16; let it be written so")
+            raise ValueError(
+                f"{path}: expected UTF-8 in a file that is still being written, got UTF-16; write it in UTF-8"
+            )
         clock = clock_in(mapping)
         self._clock = bind_clock(path, heading.names, clock)
         self._inputs = [bind(path, heading.names, name, mapping.get(name)) for name in inputs]

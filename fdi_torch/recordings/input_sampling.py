@@ -5,8 +5,9 @@ next. Whether it is held follows from the level of its tank, which cannot depend
 
     A (h[k+1] - h[k]) / d = a + b[-2] u[k-2] + b[-1] u[k-1] + b[0] u[k] + b[1] u[k+1] + error
 
-A held command has b[1] = 0, whatever its gain, delay or lag. A command that switches between the samples k and k + 1
-flows with both values, so that b[1] > 0. A controller gives b[1] < 0, since it acts against a rise of the level.
+A held command has b[1] = 0, whatever its gain, delay or lag. If a command switches between the samples k and k + 1,
+the flow of that interval depends on both values, so that b[1] > 0. A controller gives b[1] < 0, because it acts against
+a rise of the level.
 """
 
 from __future__ import annotations

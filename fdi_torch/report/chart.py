@@ -58,7 +58,8 @@ def corner_points(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.
 
 MOST_SAMPLES = 6000  # of a line; longer ones keep the extremes of half as many segments
 MOST_EVENTS = 50
-TIME, PLANNED = "time, s", "next"  # label of an axis of time; clock of an experiment to come
+TIME = "time, s"  # label of a time axis
+PLANNED = "next"  # name of the clock of charts that show the proposed experiment
 LATE_DIGITS, ROUNDING = 1e-5, 1e-15  # differences relative to the values: beyond the fifth digit; of rounding
 ONE_ROW = 44  # letters of title and names of lines that fit one row above the picture
 

@@ -42,7 +42,7 @@ def compared_models(material: Material) -> tuple[str, ...]:
 
 
 def predicted(material: Material, k: int) -> np.ndarray | None:
-    """Readings of recording k (from 0) that the run predicts, at its estimate or with its cause; None without any."""
+    """Predicted readings of recording k (from 0), at the estimate or with the cause of the run; None without any."""
     arrays, group, shape = material.arrays, material.groups[k], material.recordings[k].outputs.shape
     alone = ("predicted",) if len(material.groups) == 1 else ()
     for name in (f"predicted_{k + 1}", *alone, f"{group}_augmented" if group else "augmented"):
