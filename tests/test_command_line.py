@@ -132,9 +132,8 @@ def test_check_says_first_that_readings_lie_beyond_a_tank(tmp_path: Path, capsys
 
 
 def test_a_file_with_other_names_is_refused_with_the_lines_that_map_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     Path("rig.csv").write_text(CSV.replace("Q1_cm3_s", "FIC-1 (cm^3/s)").replace("h2_cm", "LT-2"))
     assert cli.main(["check", "rig.csv", "--plant", "three_tank"]) == cli.MISUSE
     refused = capsys.readouterr().err

@@ -47,13 +47,10 @@ def test_the_true_cause_is_found_although_the_rim_in_the_plant_file_is_wrong(tmp
     assert found.adopted().tanks == LOW.tanks, "the plant file is the user's to correct"
 
 
-def test_gap_and_predict_say_it_before_what_to_do_next(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_gap_and_predict_say_it_before_what_to_do_next(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     leaking = recorded(**{"A.leak": 0.2})
-    (tmp_path / "low.yaml").write_text(fdi_torch.dump_plant(LOW))
-    fdi_torch.write_csv(leaking, tmp_path / "run.csv")
+    (here / "low.yaml").write_text(fdi_torch.dump_plant(LOW))
+    fdi_torch.write_csv(leaking, here / "run.csv")
     for command, code in (("gap", 0), ("predict", 4)):
         assert main([command, "--plant", "low.yaml", "--recording", "run.csv"]) == code
         told = capsys.readouterr().out.splitlines()

@@ -146,8 +146,7 @@ def test_every_effect_and_public_name_is_in_the_reference() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", ["tutorial.md", "how-to/weir-and-transfer.md", "how-to/historian.md"])
-def test_a_session_works_as_printed(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_session_works_as_printed(page: str, here: Path) -> None:
     run_page(PAGES[f"docs/{page}"], check)
 
 

@@ -12,8 +12,7 @@ PAGE = (Path(__file__).parent.parent / "docs" / "how-to" / "python.md").read_tex
 
 
 @pytest.mark.slow
-def test_the_page_runs_as_printed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_page_runs_as_printed(here: Path) -> None:
     names: dict[str, object] = {"__name__": "page"}
     for code in re.findall(r"```python\n(.*?)```", PAGE, flags=re.S):
         exec(compile(code, "docs/how-to/python.md", "exec"), names)

@@ -177,12 +177,11 @@ def test_every_job_takes_a_run_as_a_mapping_or_a_file(tmp_path: Path) -> None:
         fdi_torch.predict(RIG)
 
 
-def test_a_rig_in_code_from_simulation_to_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rig_in_code_from_simulation_to_report(here: Path) -> None:
     recording = simulated(**{"A.leak": 0.3})
     again = simulated(**{"A.leak": 0.3})
     assert torch.equal(recording.outputs, again.outputs)
     assert "301 samples, 300 s" in repr(recording) and "<table>" in recording._repr_html_()
-    monkeypatch.chdir(tmp_path)
     found = fdi_torch.train(RIG, recording, ["A.leak"])
     run = {"plant": RIG, "recordings": [recording], "estimate": {"parameters": ["A.leak"]}}
     assert torch.equal(fdi_torch.train(run).estimate.value, found.estimate.value)
@@ -375,11 +374,8 @@ def refused_calls() -> dict[str, Callable[[], Any]]:
         "a log",
     ],
 )
-def test_the_traceback_of_a_mistake_shows_its_message_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
-) -> None:
+def test_the_traceback_of_a_mistake_shows_its_message_alone(here: Path, what: str) -> None:
     """Not the errors of YAML, pydantic and pint from which the message was made."""
-    monkeypatch.chdir(tmp_path)
     with pytest.raises((ValueError, OSError)) as refused:
         refused_calls()[what]()
     shown = "".join(traceback.format_exception(refused.value))
@@ -448,8 +444,7 @@ def test_the_catalogue_takes_the_name_of_a_plant() -> None:
     assert len(fdi_torch.effects()) > len(fdi_torch.effects("three_tank"))
 
 
-def test_every_function_takes_a_plant_or_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_every_function_takes_a_plant_or_its_name(here: Path) -> None:
     Path("rig.yaml").write_text(fdi_torch.dump_plant(RIG))
     fdi_torch.write_csv(simulated(), Path("run.csv"))
     named = fdi_torch.set_up("rig.yaml", "run.csv", ["A.leak"])
@@ -460,6 +455,8 @@ def test_every_function_takes_a_plant_or_its_name(tmp_path: Path, monkeypatch: p
     constants = fdi_torch.build_network("three_tank").constants.names
     assert constants == fdi_torch.build_network(fdi_torch.load_plant("three_tank")).constants.names
     assert fdi_torch.dump_plant("three_tank") == fdi_torch.dump_plant(fdi_torch.load_plant("three_tank"))
+    by_name, by_path, by_plant = (fdi_torch.read_recording("run.csv", x) for x in ("rig.yaml", Path("rig.yaml"), RIG))
+    assert torch.equal(by_name.outputs, by_plant.outputs) and torch.equal(by_path.outputs, by_plant.outputs)
     wrong: Any = 3
     for call in (
         lambda: fdi_torch.set_up(wrong, simulated(), []),
@@ -513,20 +510,11 @@ def test_a_recording_comes_back_from_its_data_frame() -> None:
 def test_a_recording_comes_back_from_its_csv_file(tmp_path: Path) -> None:
     recording = simulated()
     missing = replace(recording, mask=recording.mask & (torch.arange(len(recording)) != 2).unsqueeze(1))
-    again = fdi_torch.read_recording(str(fdi_torch.write_csv(missing, str(tmp_path / "run.csv"))), RIG)
+    again = fdi_torch.read_recording(str(fdi_torch.write_csv(missing, str(tmp_path / "new" / "run.csv"))), RIG)
     for name in ("time", "inputs", "outputs", "mask"):
         then, now = getattr(missing, name), getattr(again, name)
         torch.testing.assert_close(now[again.mask[:, 0]], then[missing.mask[:, 0]], rtol=1e-11, atol=0.0)
-    assert torch.equal(again.mask, missing.mask)
-
-
-def test_a_recording_is_read_for_a_plant_of_any_name(tmp_path: Path) -> None:
-    """The functions of the commands take the name of a plant file, so those that read recordings do too."""
-    file = str(fdi_torch.write_csv(simulated(), str(tmp_path / "run.csv")))
-    (tmp_path / "rig.yaml").write_text(fdi_torch.dump_plant(RIG))
-    for plant in (tmp_path / "rig.yaml", str(tmp_path / "rig.yaml")):
-        found, expected = (fdi_torch.read_recording(file, each) for each in (plant, RIG))
-        assert torch.equal(found.outputs, expected.outputs)
+    assert torch.equal(again.mask, missing.mask) and again.output_units == ("m",)
 
 
 def test_a_data_frame_follows_the_rules_of_files() -> None:

@@ -255,11 +255,8 @@ def first_own_constant(plant: PlantDescription, kind: type[FlowComponent]) -> st
 
 
 @kinds
-def test_training_recovers_one_of_its_constants(
-    kind: type[FlowComponent], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_training_recovers_one_of_its_constants(kind: type[FlowComponent], here: Path) -> None:
     """From readings with a noise of 1 mm, to within four standard errors."""
-    monkeypatch.chdir(tmp_path)
     plant = plant_with(kind)
     name = first_own_constant(plant, kind)
     space = ParameterSpace([build_network(plant).constants[name]])

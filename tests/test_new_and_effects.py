@@ -36,10 +36,7 @@ def fdi(*words: str) -> None:
     assert cli.main([*words]) == cli.DONE
 
 
-def test_from_nothing_to_a_diagnosis_with_new_files_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_from_nothing_to_a_diagnosis_with_new_files_alone(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fdi("new", "plant", "--out", "rig.yaml")
     assert cli.main(["check", "--plant", "rig.yaml"]) == cli.NOT_EXPLAINED
     said = capsys.readouterr().out
@@ -187,10 +184,9 @@ def test_what_is_commented_out_in_a_new_file_holds_too(tmp_path: Path) -> None:
 
 
 def test_the_fault_free_part_of_a_new_monitor_fits_the_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """It begins where the recording does, and lasts until white noise at its sampling determines the false alarms."""
-    monkeypatch.chdir(tmp_path)
     for interval, lasts, start in ((1, 1000, 0), (10, 20000, 50000)):
         noise = "{std: {h1: 1 mm, h2: 1 mm, h3: 1 mm}}"
         changes = {"sample_time": f"{interval} s", "duration": f"{lasts} s", "faults": "{}", "noise": noise}
@@ -209,9 +205,8 @@ def test_the_fault_free_part_of_a_new_monitor_fits_the_recording(
 
 
 def test_a_new_monitor_of_a_live_source_has_a_tag_of_every_channel(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     fdi("new", "monitor", "--recording", "mqtt://localhost/rig")
     assert "next: complete the tags, then fdi monitor" in capsys.readouterr().out
     source = load_monitor("monitor.yaml").config.source
@@ -223,16 +218,13 @@ def test_a_new_monitor_of_a_live_source_has_a_tag_of_every_channel(
     assert "--recording: expected a file for a run, got mqtt://localhost/rig" in capsys.readouterr().err
 
 
-def test_a_file_that_is_there_is_never_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_file_that_is_there_is_never_replaced(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Path("run.yaml").write_text("mine")
     assert cli.main(["new", "run"]) == cli.MISUSE
     assert "run.yaml: expected a new file, but it exists" in capsys.readouterr().err
     assert cli.main(["new", "run", "--out", "run.txt"]) == cli.MISUSE
     assert "expected a file that ends in .yaml, got run.txt" in capsys.readouterr().err
-    assert Path("run.yaml").read_text() == "mine" and [p.name for p in tmp_path.iterdir()] == ["run.yaml"]
+    assert Path("run.yaml").read_text() == "mine" and [p.name for p in here.iterdir()] == ["run.yaml"]
 
 
 def test_the_catalogue_holds_every_effect_with_a_meaning_and_units() -> None:
@@ -276,9 +268,8 @@ def test_effects_of_a_plant_are_told_with_places_and_in_full(capsys: pytest.Capt
 
 
 def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     rows = [f"{k},{3 + k % 2},{40 + k / 10},{1 + k / 100},2,{4 + k / 50},0.{k}" for k in range(10)]
     header = "time_s,FIC-101 PV (l/min),LT-101 (%),PT 7 [kPa],operator,level_mA,valve (%)"
     Path("trend.csv").write_text("\n".join([header, *rows]) + "\n")
@@ -327,10 +318,7 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
     assert cli.main(["new", "run", "--recording", "trend.csv"]) != cli.DONE
 
 
-def test_a_recording_with_a_row_per_value_is_mapped_by_tags(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_recording_with_a_row_per_value_is_mapped_by_tags(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fdi("new", "plant", "--out", "rig.yaml", "--quiet")
     levels = {"FIC1": 20, "LI101": 155, "LI102": 153}
     rows = [f"{tag};{k};{value + k % 3};Good" for k in range(60) for tag, value in levels.items()]
@@ -366,9 +354,8 @@ def test_columns_of_historians_are_recognised_by_their_usual_names(header: str, 
 
 
 def test_columns_of_the_right_names_without_units_are_mapped_to_themselves(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     fdi("new", "plant", "--out", "rig.yaml", "--quiet")
     Path("run.csv").write_text(
         "t_s;Q;hA_inch.;hB_mm\n" + "".join(f"{k};3,1;{20 + k % 2};{155 + k % 3}\n" for k in range(60))
@@ -387,18 +374,14 @@ def test_columns_of_the_right_names_without_units_are_mapped_to_themselves(
     assert "run.yaml; next: complete the columns, then fdi train" in capsys.readouterr().out
 
 
-def test_the_output_of_a_controller_is_a_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_output_of_a_controller_is_a_command(here: Path) -> None:
     Path("loop.csv").write_text("t_s,LIC-101.PV (%),LIC-101.OUT (%),PC 7 OP [%]\n0,40,36,10\n1,41,35,10\n")
     fdi("new", "plant", "--recording", "loop.csv", "--out", "loop.yaml")
     plant = load_plant(Path("loop.yaml"))
     assert [s.column for s in plant.sensors] == ["LIC-101.PV"] and list(plant.channels()) == ["LIC-101.OUT", "PC 7 OP"]
 
 
-def test_a_recording_without_a_header_is_mapped_by_numbers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_recording_without_a_header_is_mapped_by_numbers(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fdi("new", "plant", "--out", "rig.yaml", "--quiet")
     rows = [f"{k},0E+0\t3,{k % 2}\t20,1\t{15 + k % 3},5" for k in range(60)]
     Path("lab.txt").write_text("\r\n".join(rows) + "\r\n")

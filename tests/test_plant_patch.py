@@ -144,9 +144,8 @@ def test_every_shipped_plant_can_be_changed_everywhere(name: str) -> None:
 
 
 def test_a_file_whose_components_share_a_value_is_written_anew_and_that_is_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     shared = TEXT.replace("  A: {area: 0.02 m^2", "  A: &wide {area: 0.02 m^2").replace(
         "  B:\n    area: 300 cm^2\n    height: 24 in   # rim\n", "  B: *wide\n"
     )
@@ -171,8 +170,7 @@ def test_values_of_a_file_with_anchors_have_the_digits_of_their_standard_errors(
     assert [tank.area for tank in read(text).tanks] == [0.02112, 0.02]
 
 
-def test_the_diff_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_diff_is_told(here: Path) -> None:
     Path("rig.yaml").write_text(TEXT)
     diff = write_adopted("rig.yaml", BEFORE, with_constants(BEFORE, {"B.height": 0.635}), Path("new.yaml"), Screen())
     told = "\n".join(diff)

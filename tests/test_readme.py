@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from fdi_torch import load_run
 from tests.sessions import check, run_page
 
@@ -16,8 +14,7 @@ def test_the_readme_is_short() -> None:
     assert len(README.splitlines()) <= 120
 
 
-def test_the_session_prints_what_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_session_prints_what_is_shown(here: Path) -> None:
     run_page(README, check)
     assert load_run("leak.yaml").plant.name == "three_tank"
     assert not load_run("leak.yaml").plant.effects

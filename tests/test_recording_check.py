@@ -55,10 +55,7 @@ def found(check: RecordingCheck, kind: str) -> tuple[str, str]:
     return check.findings[0].channel, check.findings[0].text
 
 
-def test_a_rig_without_pumps_is_checked_with_a_long_recording(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_rig_without_pumps_is_checked_with_a_long_recording(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Path("rig.yaml").write_text("tanks: {A: {area: 1 m^2, height: 1 m}}\nsensors: {h: {tank: A}}\n")
     Path("run.csv").write_text("t_s,h_cm\n" + "".join(f"{k},{50 + k % 7}\n" for k in range(2500)))
     assert cli.main(["check", "--plant", "rig.yaml", "--recording", "run.csv"]) == cli.DONE

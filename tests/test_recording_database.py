@@ -103,9 +103,8 @@ def test_errors_name_the_address(rig: Path, query: str, sentence: str) -> None:
     ],
 )
 def test_a_written_password_is_refused_and_not_repeated(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    address: str, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     Path("own.yaml").write_text(RUN.replace("sqlite:///plant.db?query=SELECT * FROM run ORDER BY t_s", address))
     for words in (
         ["train", "--config", "own.yaml"],
@@ -115,7 +114,7 @@ def test_a_written_password_is_refused_and_not_repeated(
         assert main(words) == MISUSE
         shown = "".join(capsys.readouterr())
         assert "s3cret" not in shown and "in an environment variable" in shown, words
-    assert not [path for path in tmp_path.rglob("*") if path.name != "own.yaml"]
+    assert not [path for path in here.rglob("*") if path.name != "own.yaml"]
 
 
 def test_the_value_of_the_variable_is_hidden_in_the_drivers_messages(

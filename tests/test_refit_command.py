@@ -34,15 +34,14 @@ def rig(tmp_path: Path) -> PlantDescription:
 
 
 def test_a_refit_adopts_the_effect_and_predicts_each_file_by_the_other(
-    tmp_path: Path, rig: PlantDescription, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    here: Path, rig: PlantDescription, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     words = ["refit", "--plant", "rig.yaml", "--recording", "runs.yaml", "--adopt", "better.yaml", "--json", "--quiet"]
     assert cli.main([*words, "--leave-one-file-out"]) == cli.DONE
     shown = json.loads(capsys.readouterr().out)
     fitted = shown["fitted"]["Q2.pump_gain.factor"]
     assert abs(fitted["value"] - GAIN["Q2.pump_gain.factor"]) < 4.0 * fitted["std"]
-    assert load_plant(tmp_path / "better.yaml").effects[0].parameters["factor"] == pytest.approx(
+    assert load_plant(here / "better.yaml").effects[0].parameters["factor"] == pytest.approx(
         fitted["value"], abs=0.05 * fitted["std"]
     )
     assert [Path(trial["source"]).name for trial in shown["leave_one_file_out"]] == ["day3.csv", "day5.csv"]
@@ -51,35 +50,31 @@ def test_a_refit_adopts_the_effect_and_predicts_each_file_by_the_other(
 
 
 def test_a_calibration_reports_how_far_constants_moved_and_writes_what_was_learnt_as_tolerances(
-    tmp_path: Path, rig: PlantDescription, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    here: Path, rig: PlantDescription, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
     gain = replace(next(p for p in rig.pumps if p.name == "Q2"), gain=0.085)  # its range ends at 0.85, below 0.9
     wrong = replace(rig, effects=(), pumps=(rig.pumps[0], gain), tolerances={"Q2.gain": 1.0, "T1.area": 1e-6})
-    (tmp_path / "wrong.yaml").write_text(dump_plant(wrong))
+    (here / "wrong.yaml").write_text(dump_plant(wrong))
     words = ["refit", "--plant", "wrong.yaml", "--recording", "runs.yaml", "--adopt", "out.yaml", "--quiet"]
     assert cli.main(words) == cli.NOT_EXPLAINED
     shown = capsys.readouterr().out
     assert re.match(r"Unreliable: the model does not explain the recording \(residuals \d\.\d times", shown)
     assert "Q2.gain lies at the high end of its range" in shown and "next: out.yaml keeps the tolerances" in shown
-    assert load_plant(tmp_path / "out.yaml").tolerances == wrong.tolerances
+    assert load_plant(here / "out.yaml").tolerances == wrong.tolerances
 
     right = replace(wrong, pumps=rig.pumps, tolerances={"Q2.gain": 0.03, "T1.area": 1e-6})
-    (tmp_path / "wrong.yaml").write_text(dump_plant(right))
+    (here / "wrong.yaml").write_text(dump_plant(right))
     assert cli.main([*words, "--narrow"]) == cli.DONE
     shown = capsys.readouterr().out
     assert "constants fitted  unit" in shown and "effects" not in shown
     assert re.search(r"- Q2\.gain lies 3\.\d tolerances from its value in the plant file", shown)
-    narrowed = load_plant(tmp_path / "out.yaml").tolerances
+    narrowed = load_plant(here / "out.yaml").tolerances
     assert 0.0 < narrowed["Q2.gain"] < 0.01 and narrowed["T1.area"] <= 1e-6
-    gain_found = next(p.gain for p in load_plant(tmp_path / "out.yaml").pumps if p.name == "Q2")
+    gain_found = next(p.gain for p in load_plant(here / "out.yaml").pumps if p.name == "Q2")
     assert abs(gain_found - 0.9) < 4.0 * 0.9 * narrowed["Q2.gain"]
 
 
-def test_held_values_stay(
-    tmp_path: Path, rig: PlantDescription, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_held_values_stay(here: Path, rig: PlantDescription, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["refit", "--plant", "rig.yaml", "--recording", "day3.csv", "--hold", "*.pump_gain.*", "--json", "--quiet"]
     assert cli.main(words) == cli.NOT_EXPLAINED
     shown = json.loads(capsys.readouterr().out)
