@@ -109,13 +109,6 @@ GAP_ANSWER: dict[str, Any] = {
             for k, closed in enumerate((0.99, None))
         ],
     },
-    "shape": {
-        "location": "Q1",
-        "tables": {
-            "free_delivery.command": {"at": [1e-5, 4e-5, 8e-5], "share": [-0.1, 0.1, 0.3], "scale": 2.7e-5},
-            "free_delivery.time": {"at": [0.0, 900.0, 1800.0], "share": [0.0, 0.1, 0.0], "scale": 2.7e-5},
-        },
-    },
     "next_input": {
         "separation": 60.0,
         "parted_after": 140.0,

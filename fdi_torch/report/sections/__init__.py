@@ -12,7 +12,6 @@ from fdi_torch.report.sections.gap_closure import (
     errors_section,
     limits_section,
     next_input_section,
-    shape_section,
 )
 from fdi_torch.report.sections.intervals import intervals_section
 from fdi_torch.report.sections.monitor import event_section, rehearsal_section, residual_section, statistic_section
@@ -34,7 +33,6 @@ SECTIONS: tuple[Maker, ...] = (
     closure_section,
     disturbances_section,
     curves_section,
-    shape_section,
     errors_section,
     holdout_section,
     constants_section,

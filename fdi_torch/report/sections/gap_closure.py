@@ -179,8 +179,6 @@ def _confusability_words(confusability: Mapping[str, Any]) -> list[str]:
 
 MOST_CURVES = 12
 QUANTITIES = {"flow": "flow added", "area": "cross-section added", "reading": "added to the reading"}
-# SI units of the variables that a free-form discrepancy may depend on.
-_VARIABLE_UNITS = {"level": "m", "head": "m", "difference": "m", "time": "s", "period": "s"}
 
 
 def curves_section(material: Material) -> Section | None:
@@ -218,21 +216,3 @@ def curve_panel(curve: Mapping[str, Any]) -> Figure:
         axes.plot(x, y_scale * as_vector(curve["effect"]), color=MARK, lw=1.4, ls="--", label="cause")
         label_lines(axes)
     return figure
-
-
-def shape_section(material: Material) -> Section | None:
-    """The free-form discrepancy as tables, for logs without curves."""
-    shape = material.answer.get("shape")
-    if material.answer.get("curves") or not isinstance(shape, dict) or not shape.get("tables"):
-        return None
-    pictures = []
-    for k, (name, curve) in enumerate(shape["tables"].items()):
-        variable = str(name).rpartition(".")[2]
-        unit, scale = shown_unit(_VARIABLE_UNITS.get(variable, "SI"))
-        x, y = scale * as_vector(curve["at"]), as_float(curve.get("scale", 1.0)) * as_vector(curve["share"])
-        title = f"{shape.get('location', '')}: by {variable}"
-        line = Line("discrepancy", x, y, MARK)
-        chart = Chart(title, axis(variable, unit), "discrepancy, SI", [line], level=0.0)
-        pictures.append(signals(f"gap_shape_{k + 1}", chart))
-    words = "What must be added at this location to explain the readings, whatever its cause."
-    return Section("The discrepancy", [words, pictures])
