@@ -317,8 +317,18 @@ def test_calibration_counts_how_often_what_was_given_so_much_is_true() -> None:
         ("single", [LAG], {"causes": [LAG, WIDER]}, False),
         ("messy", [LAG], {"causes": [LAG, WIDER]}, True),
         ("null", [], {"causes": []}, True),
-        ("unknown", [{"effect": "unknown", "location": "Q1"}], {"causes": [], "unknown_at": "Q1"}, True),
-        ("unknown", [{"effect": "unknown", "location": "Q1"}], {"causes": [], "unknown_at": "T1"}, False),
+        (
+            "unknown",
+            [{"effect": "unknown", "location": "Q1"}],
+            {"causes": [{"effect": "unknown", "location": "Q1"}]},
+            True,
+        ),
+        (
+            "unknown",
+            [{"effect": "unknown", "location": "Q1"}],
+            {"causes": [{"effect": "unknown", "location": "T1"}]},
+            False,
+        ),
     ],
 )
 def test_the_best_explanation_is_judged_beside_its_probability(

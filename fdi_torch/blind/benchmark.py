@@ -61,7 +61,7 @@ def blind_benchmark(
 ) -> list[Row]:
     """Let `diagnose` and competing methods answer `cases` recordings; an interrupted benchmark is resumed.
 
-    diagnose(plant, recording, holdout[, leave_out=(effect,)]) -> answer in the format `fdi_torch.gap/1` or `/2`. rig:
+    diagnose(plant, recording, holdout[, leave_out=(effect,)]) -> answer in the format `fdi_torch.gap/2`. rig:
     one rig, or random networks. kinds: of cases, by default the usual ones for the rig. library: effects that
     `diagnose` can name; they are not drawn as unknown laws. leave_out: effects to remove from its library, one per
     case. rivals: further diagnoses, in addition to two trivial ones. each: map over tasks, for example that of an

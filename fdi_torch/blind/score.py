@@ -97,8 +97,6 @@ def _stated(kind: str, true: list[Cause], answer: Answer, plant: PlantDescriptio
     if best is None:
         return {}
     causes = _causes(best["causes"], plant)
-    if best.get("unknown_at"):  # answers of format 1
-        causes.append(("unknown", best["unknown_at"]))
     expected = [("unknown", true[0][1])] if kind == "left_out" else true
     if kind == "messy":
         right = true[0] in causes and _with_names(causes) == causes
