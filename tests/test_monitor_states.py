@@ -78,17 +78,13 @@ def columns(traces: Sequence[ResidualTrace]) -> Tensor:
     return torch.cat([torch.cat([t.residual.nan_to_num(nan=-1e9), t.statistic[:, None]], dim=1) for t in traces])
 
 
-def windows(watch: Monitor) -> WindowMonitor:
-    return WindowMonitor(watch.observer, watch.detector, watch.watched, "least_squares", 150.0, 70.0)
-
-
 Run = tuple[Watch, Samples, list[Event], Tensor]
 
 
 @pytest.fixture(scope="module", params=["changes", "windows"])
 def whole(request: pytest.FixtureRequest) -> Run:
     watch, samples = monitor(incipient=True), troubled()
-    chosen = windows(watch) if request.param == "windows" else watch
+    chosen = WindowMonitor(watch, "least_squares", 150.0, 70.0) if request.param == "windows" else watch
     return chosen, samples, *in_pieces(chosen, samples, [])
 
 

@@ -93,19 +93,10 @@ class LoggedMonitor:
     def learn(self, whole: Recording) -> None:
         """Prepare the monitor from the fault-free part, and report what was learnt and any warnings."""
         prepared, config = _prepare(self.run, whole), self.run.config
-        inner = prepared.monitor
-        self.monitor, self.believed = inner, prepared.believed
+        self.monitor, self.believed = prepared.monitor, prepared.believed
         if config.mode != "changes":
             window = config.window
-            self.monitor = WindowMonitor(
-                inner.observer,
-                inner.detector,
-                inner.watched,
-                config.mode,
-                window.longest,
-                window.stride,
-                inner.noise.interval,
-            )
+            self.monitor = WindowMonitor(prepared.monitor, config.mode, window.longest, window.stride)
         self.callbacks.ready(prepared)
         self._now = config.fault_free[1]
         self._report(Event(self._now, "watching", prepared.false_alarm_text))

@@ -9,16 +9,12 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.fitting import Fitting, set_up
-from fdi_torch.monitor.detection import Detector
 from fdi_torch.monitor.events import Event, Explanation, Kind, size_of
-from fdi_torch.monitor.monitor import ResidualTrace
+from fdi_torch.monitor.monitor import Monitor, ResidualTrace
 from fdi_torch.monitor.monitor_state import MonitorState
-from fdi_torch.monitor.observer_bank import ObserverBank
 from fdi_torch.monitor.samples import Samples, split_at_gaps
 from fdi_torch.monitor.state_update import advance_observer, drop_old_samples, initial_state
 from fdi_torch.monitor.window_estimators import ESTIMATORS, WindowData, WindowEstimate
-from fdi_torch.parameters import ParameterSpace
-from fdi_torch.recording import Recording
 
 
 @dataclass(frozen=True)
@@ -32,40 +28,24 @@ class WindowState:
     alarmed: bool = False
     number: int = 0
 
-    @property
-    def believed(self) -> Tensor:
-        return self.observer.believed
-
 
 class WindowMonitor:
-    """Monitor of one plant with windows of `length` s, each starting `stride` s after the previous one.
+    """The faults and the detector of a monitor, with windows of `length` s, each `stride` s after the previous one.
 
     estimator: a key of `ESTIMATORS`; each window starts from the previous estimate. If a channel is constant, its
     correlation is undefined and the search maximizes the likelihood instead. Raises ValueError for invalid settings.
     """
 
-    def __init__(
-        self,
-        observer: ObserverBank,
-        detector: Detector,
-        watched: int,
-        estimator: str,
-        length: float,
-        stride: float | None = None,
-        interval: float = 1.0,
-    ) -> None:
+    def __init__(self, monitor: Monitor, estimator: str, length: float, stride: float | None = None) -> None:
         if estimator not in ESTIMATORS:
             raise ValueError(f"expected an estimator of {', '.join(ESTIMATORS)}, got '{estimator}'")
         if not length > 0 or (stride is not None and not 0 < stride <= length):
             raise ValueError(
                 f"expected a window longer than 0 s and a stride within it, got {length:g} s and {stride} s"
             )
-        self._observer, self.detector, self.watched, self._interval = observer, detector, watched, interval
+        self.space, self.detector, self.watched = monitor.space, monitor.detector, monitor.watched
+        self._observer, self._interval = monitor.observer, monitor.noise.interval
         self.estimator, self.length, self.stride = estimator, length, length if stride is None else stride
-
-    @property
-    def space(self) -> ParameterSpace:
-        return self._observer.space
 
     def start(self, samples: Samples, believed: Tensor | None = None, levels: Tensor | None = None) -> WindowState:
         """The state after the first sample."""
@@ -81,10 +61,8 @@ class WindowMonitor:
         segments, clock = split_at_gaps(state.observer.clock, samples, self._interval)
         for segment, notice in segments:
             if notice:
-                events.append(
-                    Event(float(segment.time[0]), "notice", notice, believed=self._off_nominal(state.believed))
-                )
-                state = replace(self.start(segment.segment(0, 1), state.believed), number=state.number)
+                events.append(self._event(state.observer, float(segment.time[0]), "notice", notice))
+                state = replace(self.start(segment.segment(0, 1), state.observer.believed), number=state.number)
                 segment = segment.segment(1, len(segment))
             while len(segment):
                 due = segment.time >= state.next_end
@@ -140,16 +118,7 @@ class WindowMonitor:
     def _fitting(self, window: Samples, believed: Tensor) -> Fitting:
         """Problem of one window: watched faults and initial levels are free, calibrated constants are fixed."""
         plant = self._observer.network.description
-        recording = Recording(
-            window.time,
-            window.inputs,
-            window.readings,
-            plant.channels(),
-            tuple(sensor.column for sensor in plant.sensors),
-            tuple(plant.channel_units().values()),
-            tuple(sensor.unit for sensor in plant.sensors),
-            hold=window.hold,
-        )
+        recording = plant.recording(window.time, window.inputs, window.readings, hold=window.hold)
         fitting = set_up(plant, [recording], self.space.parameters[: self.watched], "free")
         network = fitting.networks[0]
         for name, value in zip(self.space.names[self.watched :], believed[self.watched :].tolist(), strict=True):
