@@ -55,15 +55,8 @@ def sound(case: Case) -> Recording:
     pumps = {p.channel: p for p in reversed(plant.pumps)}
     factors = [FACTORS[command_unit(pumps[channel])] for channel in plant.channels()]
     readings = torch.from_numpy(case.readings[0] / SHOWN).round() * SHOWN
-    return Recording(
-        torch.arange(len(readings), dtype=torch.float64),
-        torch.from_numpy(case.commands[0] * np.array(factors)),
-        readings,
-        plant.channels(),
-        tuple(s.column for s in plant.sensors),
-        tuple(plant.channel_units().values()),
-        tuple(s.unit for s in plant.sensors),
-    )
+    time, commands = torch.arange(len(readings), dtype=torch.float64), case.commands[0] * np.array(factors)
+    return plant.recording(time, torch.from_numpy(commands), readings)
 
 
 Spoil = Callable[[Recording, int, PlantDescription, np.random.Generator], Recording]

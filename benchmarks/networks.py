@@ -37,10 +37,7 @@ def an_hour(plant: PlantDescription) -> Recording:
     time, tanks = torch.arange(3601, dtype=torch.float64), len(plant.tanks)
     flows = 2e-5 + 8e-5 * torch.rand(7, len(plant.pumps), generator=torch.Generator().manual_seed(0)).double()
     nothing = torch.full((len(time), tanks), torch.nan, dtype=torch.float64)
-    units = ("m^3/s",) * len(plant.pumps), ("m",) * tanks
-    return Recording(
-        time, flows[time.long() // 600], nothing, plant.channels(), tuple(s.column for s in plant.sensors), *units
-    )
+    return plant.recording(time, flows[time.long() // 600], nothing)
 
 
 def compiler_seconds(work: Callable[[], object]) -> float:

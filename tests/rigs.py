@@ -89,17 +89,8 @@ def blank_recording(
     plant: PlantDescription, inputs: torch.Tensor, time: torch.Tensor, hold: str = "zero_order"
 ) -> Recording:
     """Inputs (T, channels) without readings."""
-    sensors = tuple(s.column for s in plant.sensors)
-    return Recording(
-        time,
-        inputs,
-        torch.full((len(time), len(sensors)), float("nan"), dtype=torch.float64),
-        plant.channels(),
-        sensors,
-        ("m^3/s",) * inputs.shape[1],
-        tuple(s.unit for s in plant.sensors),
-        hold=hold,  # type: ignore[arg-type]
-    )
+    unread = torch.full((len(time), len(plant.sensors)), float("nan"), dtype=torch.float64)
+    return plant.recording(time, inputs, unread, hold=hold)  # type: ignore[arg-type]
 
 
 def constant_inputs(plant: PlantDescription, duration: float, sample: float = 1.0, flow: float = 50e-6) -> Recording:

@@ -34,7 +34,7 @@ def recording(samples: int = 21, interval: float = 10.0) -> Recording:
         [40e-6 + 30e-6 * (time % 100 < 50).double(), 50e-6 - 20e-6 * (time % 140 < 70).double()], dim=1
     )
     blank = torch.full((samples, 3), torch.nan, dtype=torch.float64)
-    return Recording(time, inputs, blank, ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3)
+    return load_plant("three_tank").recording(time, inputs, blank)
 
 
 def engine_of(kind: str, samples: int = 13) -> Engine:

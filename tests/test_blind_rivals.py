@@ -36,15 +36,8 @@ def recorded(*off: Deviation, noise: float = NOISE) -> Recording:
     commands = commanded(RIG, rng, 2401)
     drive = Drive(asked_of_pumps(RIG.plant, commands), levels_at_rest(RIG))
     levels = simulate(HiddenRigs([RIG.plant], [off]), [drive], 0.25)[0].levels
-    return Recording(
-        time=torch.arange(2401, dtype=torch.float64),
-        inputs=torch.tensor(commands * 1e-6),
-        outputs=torch.tensor(levels + noise * rng.normal(size=levels.shape)),
-        input_names=RIG.plant.channels(),
-        output_names=tuple(s.name for s in RIG.plant.sensors),
-        input_units=("m^3/s",) * commands.shape[1],
-        output_units=("m",) * levels.shape[1],
-    )
+    time, readings = torch.arange(2401, dtype=torch.float64), levels + noise * rng.normal(size=levels.shape)
+    return RIG.plant.recording(time, torch.tensor(commands * 1e-6), torch.tensor(readings))
 
 
 @pytest.fixture(scope="module")

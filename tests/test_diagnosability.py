@@ -26,7 +26,7 @@ TABLE_3 = dict(zip(PAPER, (0.3, 0.3, 0.5, 0.6, 1.0), strict=True))
 def steady(samples: int = 1001) -> Recording:
     time = torch.arange(samples, dtype=torch.float64)
     flows, readings = time.new_full((samples, 2), 50e-6), time.new_zeros(samples, 3)
-    return Recording(time, flows, readings, ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3)
+    return PLANT.recording(time, flows, readings)
 
 
 def millimetre() -> torch.Tensor:

@@ -58,10 +58,7 @@ def planned(plant: PlantDescription, duration: float, step: float) -> Recording:
     inputs = shares.repeat_interleave(20, dim=0)[: len(time)] * torch.tensor(
         [most.get(c, 1.0) for c in plant.channels()]
     )
-    sensors = plant.sensors
-    outputs = torch.full((len(time), len(sensors)), torch.nan, dtype=torch.float64)
-    units = tuple(plant.channel_units().values()), tuple(s.unit for s in sensors)
-    return Recording(time, inputs, outputs, plant.channels(), tuple(s.column for s in sensors), *units)
+    return plant.recording(time, inputs, torch.full((len(time), len(plant.sensors)), torch.nan, dtype=torch.float64))
 
 
 def by_fmpy(fmu: Path, recording: Recording, start_values: Mapping[str, float]) -> dict[str, np.ndarray]:

@@ -12,7 +12,6 @@ import torch
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network
 from fdi_torch.interruption import UNDISTURBED, SteadyLock, Terminated, catch_signals
-from fdi_torch.recording import Recording
 from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import lay_out
 
@@ -73,10 +72,8 @@ def test_a_long_compiled_loop_ends_at_a_signal(
     time_ = torch.tensor([0.0, 1e6], dtype=torch.float64)
     inputs = torch.full((2, 2), 5e-5, dtype=torch.float64)
     blank = torch.full((2, 3), 0.3, dtype=torch.float64)
-    names, units = tuple(plant.channels()), ("m^3/s",) * 2
-    recording = Recording(time_, inputs, blank, names, ("h1", "h2", "h3"), units, ("m",) * 3)
-    network = build_network(plant)
-    engine = make_engine(network, network.constants, lay_out(recording, names, 0.1), "compiled")
+    network, recording = build_network(plant), plant.recording(time_, inputs, blank)
+    engine = make_engine(network, network.constants, lay_out(recording, plant.channels(), 0.1), "compiled")
     theta = network.constants.nominal().expand(960, -1)
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
@@ -90,5 +87,5 @@ def test_a_long_compiled_loop_ends_at_a_signal(
         torch.set_num_threads(before)
         timer.join()
     assert time.monotonic() - started < 20.0, "a guard against a hang"
-    short = make_engine(network, network.constants, lay_out(recording, names, 1e5), "compiled")
+    short = make_engine(network, network.constants, lay_out(recording, plant.channels(), 1e5), "compiled")
     assert bool(torch.isfinite(short.levels(theta)).all())

@@ -39,7 +39,7 @@ def run(seed: int, samples: int, effects: dict[str, float], offset: float = 0.0)
     steps = torch.rand(samples // 20 + 1, 2, generator=generator, dtype=torch.float64)
     inputs = 80e-6 * steps.repeat_interleave(20, dim=0)[:samples]
     blank = torch.full((samples, 3), torch.nan, dtype=torch.float64)
-    recording = Recording(time, inputs, blank, ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3)
+    recording = plant().recording(time, inputs, blank)
     names = [name.split(".") for name in effects]
     placements = [place(effect, at) for at, effect, _ in names]
     data = data_set_of(plant(), [], recording, 2.0)

@@ -48,8 +48,7 @@ def planned(samples: int = 61, interval: float = 5.0) -> Recording:
     plant, time = branched(), interval * torch.arange(samples, dtype=torch.float64)
     flows = 2e-5 + 8e-5 * torch.rand(samples, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     held, nothing = flows[torch.arange(samples) // 12 * 12], torch.full((samples, TANKS), torch.nan).double()
-    units = ("m^3/s",) * 2, ("m",) * TANKS
-    return Recording(time, held, nothing, plant.channels(), tuple(s.column for s in plant.sensors), *units)
+    return plant.recording(time, held, nothing)
 
 
 def several(space: ParameterSpace, count: int = 50) -> Tensor:

@@ -17,7 +17,6 @@ from fdi_torch.monitor.hypothesis_fit import Prior
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor, usual_faults
 from fdi_torch.monitor.samples import samples_of_recording
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.recording import Recording
 from tests.test_monitor import NAMES, PLANT, recorded
 
 ONSET, END, LEARN = 700.0, 1200, 600.0
@@ -38,8 +37,7 @@ def events_with(fault: str, size: float, listed: tuple[str, ...] = tuple(NAMES))
     """What a monitor with these suspects says about a fault that occurs at ONSET."""
     truth = ALL.vector({fault: size})
     run = recorded(lambda t: truth if t >= ONSET else ALL.nominal(), END, RIG, ALL, seed=5, inputs=stairs())
-    units = ("m^3/s",) * 2, ("m",) * 3
-    recording = Recording(run.time, run.inputs, run.readings, ("Q1", "Q2"), ("h1", "h2", "h3"), *units)
+    recording = PLANT.recording(run.time, run.inputs, run.readings)
     prepared = prepare_monitor(PLANT, fault_free_part(recording, 0.0, LEARN), listed)
     samples, monitor = samples_of_recording(recording, PLANT), prepared.monitor
     state = monitor.start(samples, prepared.believed, learning_until=LEARN)

@@ -49,9 +49,7 @@ def test_the_stepper_is_the_reference_engine_sample_by_sample() -> None:
     network = build_network(
         replace(PLANT, tanks=tuple(replace(t, start_level=0.2 + 0.1 * i) for i, t in enumerate(PLANT.tanks)))
     )
-    recording = Recording(
-        time, inputs, inputs.new_zeros(30, 3), ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3
-    )
+    recording = PLANT.recording(time, inputs, inputs.new_zeros(30, 3))
     experiment = lay_out(recording, PLANT.channels(), 1.0)
     truth = ReferenceEngine(network, ParameterSpace(), experiment).levels(inputs.new_zeros(0))
     samples = samples_of_recording(replace(recording, outputs=truth), PLANT)

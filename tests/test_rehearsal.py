@@ -29,7 +29,6 @@ from fdi_torch.monitor.monte_carlo.simulated_runs import (
 from fdi_torch.monitor.noise_model import learn_noise
 from fdi_torch.monitor.state_update import advance_observer
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.recording import Recording
 from fdi_torch.simulate.equilibrium import equilibrium
 
 PLANT = load_plant("three_tank")
@@ -40,8 +39,7 @@ STD = torch.full((3,), 1e-3, dtype=torch.float64)
 def fitting(samples: int = 301):  # type: ignore[no-untyped-def]
     time = torch.arange(samples, dtype=torch.float64)
     unread = torch.full((samples, 3), torch.nan, dtype=torch.float64)
-    units = ("m^3/s",) * 2, ("m",) * 3
-    blank = Recording(time, INPUTS.expand(samples, 2), unread, ("Q1", "Q2"), ("h1", "h2", "h3"), *units)
+    blank = PLANT.recording(time, INPUTS.expand(samples, 2), unread)
     return set_up(PLANT, [blank], ["T1.leak.size", "T3.leak.size"], "equilibrium")
 
 

@@ -190,12 +190,11 @@ def monitored(metres: float, seconds: float) -> list[tuple[str, tuple[str, ...],
     quiet, faulty = (
         Samples(run.time * seconds, run.inputs * metres**3 / seconds, run.readings * metres, run.hold) for run in runs
     )
-    names = ("Q1", "Q2"), ("h1", "h2", "h3"), ("m^3/s",) * 2, ("m",) * 3
     # Windows end between two samples, so that rounding does not decide which samples they hold.
     lookback, confirm, longest = 119.5 * seconds, 39.5 * seconds, 399.5 * seconds
     settings = MonitorSettings(lookback, confirm, longest=longest, incipient=False, together=1)
-    learnt = Recording(quiet.time, quiet.inputs, quiet.readings, *names)
     plant = rescaled(load_plant("three_tank"), metres, seconds)
+    learnt = plant.recording(quiet.time, quiet.inputs, quiet.readings)
     every = 20000.0 * seconds
     watch = prepare_monitor(plant, learnt, NAMES, time_between_false_alarms=every, settings=settings).monitor
     _, events = followed(watch, faulty)

@@ -16,7 +16,6 @@ from fdi_torch.estimate.fitting import set_up
 from fdi_torch.estimate.refinement import HybridSettings, information_std, refine_to_convergence
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.recording import Recording
 from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.engine import Readings, gram_of
 from fdi_torch.simulate.experiment import Experiment, lay_out
@@ -31,9 +30,7 @@ def experiment(tolerance: float | None, step: float = 20.0, samples: int = 41) -
     time = 20.0 * torch.arange(samples, dtype=torch.float64)
     flows = 90e-6 * torch.rand(41, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     nothing = torch.zeros(samples, 3, dtype=torch.float64)
-    units = ("m^3/s", "m^3/s"), ("m", "m", "m")
-    held = flows[torch.arange(samples) // 5 * 5]
-    recording = Recording(time, held, nothing, ("Q1", "Q2"), ("h1", "h2", "h3"), *units)
+    recording = three_tank().recording(time, flows[torch.arange(samples) // 5 * 5], nothing)
     return lay_out(recording, ("Q1", "Q2"), step, None if tolerance is None else own_steps(tolerance))
 
 

@@ -198,9 +198,8 @@ def blank_recording(plant: PlantDescription, seconds: int) -> Recording:
     """A recording of the three tanks with constant inputs, one sample a second, without readings."""
     time = torch.arange(seconds + 1, dtype=torch.float64)
     unread = torch.full((seconds + 1, len(plant.sensors)), torch.nan, dtype=torch.float64)
-    columns, units = tuple(s.column for s in plant.sensors), tuple(s.unit for s in plant.sensors)
     inputs = torch.tensor(INPUTS, dtype=torch.float64).expand(seconds + 1, -1)
-    return Recording(time, inputs, unread, plant.channels(), columns, tuple(plant.channel_units().values()), units)
+    return plant.recording(time, inputs, unread)
 
 
 def main() -> None:

@@ -66,10 +66,7 @@ def _inputs(arguments: argparse.Namespace, plant: PlantDescription) -> tuple[Rec
     duration = 1000.0 * step if arguments.duration is None else arguments.duration
     time = torch.arange(0.0, duration + 0.5 * step, step, dtype=torch.float64)
     inputs = torch.tensor(values, dtype=torch.float64).expand(len(time), len(values))
-    columns = tuple(sensor.column for sensor in plant.sensors)
-    readings = time.new_zeros(len(time), len(columns))
-    sensor_units = tuple(sensor.unit for sensor in plant.sensors)
-    return Recording(time, inputs, readings, plant.channels(), columns, tuple(units.values()), sensor_units), True
+    return plant.recording(time, inputs, time.new_zeros(len(time), len(plant.sensors))), True
 
 
 def _show(report: Diagnosability, screen: Screen) -> None:
