@@ -29,6 +29,7 @@ from fdi_torch.monitor.fault_free_checks import residual_warnings
 from fdi_torch.monitor.hypothesis import Fault, Hypothesis, faults_of
 from fdi_torch.monitor.hypothesis_fit import Prior, fit
 from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.law_errors import ConstantErrors, prior_std
 from fdi_torch.monitor.level_forecast import DRAWS, limit_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
@@ -36,7 +37,7 @@ from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor, us
 from fdi_torch.monitor.monitor_state import MonitorState
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.observer import Observation
-from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow
+from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
 from fdi_torch.monitor.observer_gain import hand_gain
 from fdi_torch.monitor.samples import ClockState, Samples, samples_of_recording, split_at_gaps, usual_interval
 from fdi_torch.monitor.whitening import Whitening
@@ -336,6 +337,33 @@ def test_standard_errors_are_those_of_repeated_runs() -> None:
         best = isolate(run_monitor, from_rest(samples), SPACE.nominal(), FAULTS[1:2], deepest=1)[0]
         pulls.append((float(best.value[1]) - 0.05) / float(best.std[1]))
     assert 0.5 < float(torch.tensor(pulls).square().mean().sqrt()) < 1.7  # 8 runs: 95 % within 0.5 to 1.5
+
+
+def test_what_a_calibration_leaves_unknown_is_no_evidence_for_a_fault() -> None:
+    """Constants with errors from the covariance of their calibration leave innovations that are white all the same."""
+    names = ["P13.discharge_coefficient", "P32.discharge_coefficient", "OUT2.discharge_coefficient"]
+    network = build_network(PLANT, [place("leak", "T1")])
+    space = ParameterSpace([network.constants[n] for n in ("T1.leak.size", *names)])
+    errors = ConstantErrors((1, 2, 3), torch.diag(torch.tensor([0.3, 0.1, 0.2], dtype=torch.float64).square()))
+    learnt = learn_noise(
+        network, recorded(lambda t: space.nominal(), 600, network, space, seed=99), space, space.nominal()
+    )[0]
+    misfits = {}
+    for known in (ConstantErrors(), errors):
+        observer = ObserverBank(network, space, learnt.gain, learnt.whitening, constants=known)
+        total, readings = 0.0, 0
+        for seed in range(10):
+            drawn = torch.randn(3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+            theta = space.nominal()
+            theta[1:] += drawn * errors.covariance.diagonal().sqrt() * prior_std(space)[1:]
+            inputs = torch.tensor([50e-6, 50e-6], dtype=torch.float64).repeat(300, 1)
+            inputs[100:200, 0] = 70e-6
+            window = from_rest(recorded(lambda t, theta=theta: theta, 300, network, space, seed=seed, inputs=inputs))
+            white = observer.white_innovations(window, space.nominal(), no_change(space.nominal()))
+            total, readings = total + float(white.square().sum()), readings + window.readings
+        misfits[known.columns] = total / readings
+    assert misfits[()] > 1.5
+    assert misfits[errors.columns] == pytest.approx(1.0, abs=4.0 * (2.0 / readings) ** 0.5)
 
 
 def test_a_fault_free_run_has_no_events() -> None:

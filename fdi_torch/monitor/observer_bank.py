@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.uncertainty import end_reached
-from fdi_torch.monitor.law_errors import ConstantErrors
+from fdi_torch.monitor.law_errors import STEP, ConstantErrors, prior_std
 from fdi_torch.monitor.observer import ObserverRun, initial_levels, run_observers
 from fdi_torch.monitor.observer_gain import Gain
 from fdi_torch.monitor.samples import Samples
@@ -87,7 +87,9 @@ class ObserverBank:
     (prediction-error method; Ljung 1999, ch. 7). In all methods believed (P,) are the values of `space` before the
     change.
 
-    constants: the errors of the calibrated constants. effects: groups of columns of `space` that belong to one
+    constants: the errors of the calibrated constants. To first order, errors g ~ N(0, S) of these add A g to the
+    innovations. With A S^(1/2) = U D V', innovations e are therefore white as e - U (1 - (1 + D^2)^(-1/2)) U'e, which
+    is the marginal likelihood over the errors. effects: groups of columns of `space` that belong to one
     effect, such as amplitude, period and phase of an oscillation. An effect with a memory and an onset parameter (a
     stuck sensor keeps its reading at the onset) gets the onset of the change.
     """
@@ -112,13 +114,36 @@ class ObserverBank:
             groups.setdefault(ParameterName.parse(name).prefix, []).append(column)
         self.effects = tuple(tuple(columns) for columns in groups.values())
         self._columns = ParameterSpace(self.changing.constants[name] for name in names)
+        self._errors: tuple[ObserverWindow, Tensor, Tensor, Tensor] | None = None
 
     def white_innovations(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> Tensor:
         """White innovations (L, S, sensors); zero where a reading, or one that the whitening needs, is missing."""
+        white = self._as_if_exact(window, believed, changes)
+        if not self.constants.columns:
+            return white
+        directions, shares = self._of_constants(window, believed)
+        along = white.flatten(1) @ directions
+        return white - ((along * shares) @ directions.mT).reshape(white.shape)
+
+    def _as_if_exact(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> Tensor:
+        """The white innovations if all calibrated constants are exact. believed: (P,) or (L, P)."""
         residual = self.run(window, believed, changes)[1]
         white = self.whitening.of_innovations(self.whitening.innovations(residual, window.number, window.memory)[0])
         white[:, : self.whitening.order] = 0.0
         return torch.nan_to_num(white, nan=0.0)
+
+    def _of_constants(self, window: ObserverWindow, believed: Tensor) -> tuple[Tensor, Tensor]:
+        """Directions U (S sensors, P) of the errors of P constants, and the shares (P,) that they take."""
+        if self._errors is None or self._errors[0] is not window or not torch.equal(self._errors[1], believed):
+            moved = believed + STEP * torch.diag(prior_std(self.space))[list(self.constants.columns)]
+            lanes = torch.cat([believed[None], moved])
+            never = ChangeHypotheses(lanes, lanes.new_full((len(lanes),), NEVER), torch.zeros(len(lanes)).bool())
+            white = self._as_if_exact(window, lanes, never).flatten(1)
+            values, vectors = torch.linalg.eigh(self.constants.covariance)
+            root = vectors * values.clamp(min=0.0).sqrt()
+            directions, size, _ = torch.linalg.svd(((white[1:] - white[0]) / STEP).mT @ root, full_matrices=False)
+            self._errors = window, believed, directions, 1.0 - 1.0 / (1.0 + size.square()).sqrt()
+        return self._errors[2:]
 
     def learning_from(
         self, window: ObserverWindow, believed: Tensor, change: ChangeHypotheses
@@ -127,6 +152,7 @@ class ObserverBank:
         the log of the likelihood of these flows over that of the present ones.
         """
         bank, residual = copy(self), self.run(window, believed, change)[1][0]
+        bank._errors = None
         bank.whitening, gain = self.whitening.learning_from(residual, window.number)
         return bank, gain
 
