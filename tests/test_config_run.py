@@ -344,7 +344,9 @@ def test_shipped_runs_on_real_data_read_their_recordings(real_data: Path, monkey
         ("parameters: [T1.leak]", "got 'parameters'; there is estimate.parameters"),
         ("estimate: {seed: 3}", "got 'seed'.*; there is simulate.seed and seed"),
         ("recordings: [{file:run.csv}]", "got 'file:run.csv'.*; part key and value by a colon and a space"),
-        ("estimate: {step: 0,5 s}", "got '5 s'; a comma ends a value: write decimals with a point"),
+        ("estimate: {step: 0,5 s}", "got '5 s'; a comma ends a value: write 10.5 for decimals, and 10000 "),
+        ("simulate: {inputs: {Q1: 1,5 l/min}}", "inputs.5 l/min: .* got None; a comma ends a value: write 10.5"),
+        ("simulate: {inputs: {Q1: {steps: [[0 s, 1,5 l/min]]}}}", "steps.0: expected 2 values, got .*; a comma ends"),
         ("recordings: run.csv", r"recordings: expected a list, as in \[run.csv\]"),
         ("plant: {tanks: {T: {area: 1 m^2, height: 1 m}}, pipes: {P: {source: T, area: 1 cm^2, "
          "discharge_coefficient: 60}}}\nrecordings: [run.csv]", "discharge_coefficient: expected less than or equal"),

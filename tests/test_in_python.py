@@ -98,6 +98,10 @@ def test_every_shipped_plant_can_be_taken_apart_and_put_together_in_code(name: s
     ("wrong", "sentence"),
     [
         (lambda: Tank("A", area="200 cm", height=1.0), "tanks.A.area: expected a quantity in m^2, got '200 cm'"),
+        (
+            lambda: Tank("A", 0.02, 0.6, "70 cm"),
+            "tanks.A.start_level: expected a level from the floor to 60 cm, got 70 cm",
+        ),
         (lambda: Pump("Q", "A", max_flow=1e-4, gain="2 bar"), "pumps.Q.gain: expected a quantity in 1 or m^3/s/V or"),
         (lambda: Sensor("h", "A", gain="1 s"), "sensors.h.gain: expected a quantity in 1 or Pa/m or V/m"),
         (lambda: Sensor("h", "A", offset="1 V"), "sensors.h.offset: expected a quantity in m, got '1 V'"),

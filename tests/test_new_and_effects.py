@@ -127,6 +127,21 @@ def test_an_effect_of_the_catalogue_is_shown_with_its_parameters() -> None:
     assert shown.startswith("Entry: pump_lag, at a pump or a transfer: A pump ") and "time_constant" in shown
 
 
+def test_a_parameter_is_listed_in_the_unit_of_each_sensor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(
+        "tanks: {A: {area: 200 cm^2, height: 60 cm}}\n"
+        "sensors: {h: {tank: A}, p: {tank: A, gain: 98.1 mbar/m}, y: {tank: A, gain: 1 %/cm}, z: {tank: A}}\n"
+    )
+    assert cli.main(["effects", "sensor_bias", "--plant", str(path)]) == 0
+    listed = [line.split()[:8] for line in capsys.readouterr().out.splitlines() if line.startswith("bias at")]
+    assert listed == [
+        ["bias", "at", "h,", "z", "cm", "0", "-30", "to"],
+        ["bias", "at", "p", "mbar", "0", "-29.43", "to", "29.43"],
+        ["bias", "at", "y", "%", "0", "-30", "to", "30"],
+    ]
+
+
 def test_a_new_plant_file_does_not_wait_for_the_library_of_units(tmp_path: Path) -> None:
     words = ["-X", "importtime", "-m", "fdi_torch", "new", "plant", "--out", str(tmp_path / "rig.yaml")]
     imported = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True).stderr

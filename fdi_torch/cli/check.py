@@ -95,7 +95,7 @@ def _show_plant(plant: PlantDescription, screen: Screen) -> None:
     always = ("tank", "pipe", "pump", "sensor")
     counts = [(plant.tanks, "tank"), *flows, (plant.sensors, "sensor")]
     parts = ", ".join(counted(len(c), what) for c, what in counts if c or what in always)
-    screen.say(f"plant {plant.name}: {parts}, {counted(len(plant.tolerances), 'constant')} with a tolerance")
+    screen.say(f"{plant.title}: {parts}, {counted(len(plant.tolerances), 'constant')} with a tolerance")
     (area, per_area), (height, per_height) = display_unit("m^2"), display_unit("m")
     rows = []
     for tank in plant.tanks:

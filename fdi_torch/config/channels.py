@@ -90,7 +90,7 @@ def expect_units(source: str, names: Sequence[str], units: Sequence[str], plant:
         if unit != expected[name]:
             share = f" ({gains[name]})" if unit == "1" and name in gains else ""
             raise ValueError(
-                f"{source}: {name}: expected a unit of the kind {expected[name]} (plant {plant.name}), "
+                f"{source}: {name}: expected a unit of the kind {expected[name]} ({plant.title}), "
                 f"got one of the kind {unit}; correct the header, columns, or the gain in the plant file{share}"
             )
 

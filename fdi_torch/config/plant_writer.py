@@ -106,15 +106,15 @@ def _shares(values: dict[str, float]) -> dict[str, str | float]:
 
 
 def _text(value: float, unit: str, name: str = "") -> str | float:
-    """'160 cm^2': the unit for display, or else the first customary unit, in which the number is short and reads back
-    exactly. A number that is short in none has as many digits as it needs.
+    """'160 cm^2': the unit for display, or else the first customary unit, in which the number is short, needs
+    no exponent, and reads back exactly. A number that is short in none has as many digits as it needs.
     """
     if unit == "1":
         return value
     units = dict.fromkeys((display_unit(unit, name)[0], *_UNITS.get(unit, ()), unit))
     for digits in range(9, 18):
-        for shown in units:
-            text = f"{value / parse_quantity(f'1 {shown}', unit):.{digits}g} {shown}"
-            if parse_quantity(text, unit) == value:
-                return text
+        numbers = {u: f"{value / parse_quantity(f'1 {u}', unit):.{digits}g}" for u in units}
+        exact = [u for u in units if parse_quantity(f"{numbers[u]} {u}", unit) == value]
+        if (shown := min(exact, key=lambda u: "e" in numbers[u], default=None)) is not None:
+            return f"{numbers[shown]} {shown}"
     return f"{value!r} {unit}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,8 +34,8 @@ _ANY = PlantDescription(
 class Entry(Shown):
     """One effect of the catalogue.
 
-    meaning: one sentence. law: equation and source. kinds: kinds of component. at: the places of the plant. parameters:
-    size first, with unit, nominal value, range and meaning, in SI.
+    meaning: one sentence. law: equation and source. kinds: kinds of component. by_place: the parameters at each place of the
+    plant, size first, with unit, nominal value, range and meaning, in SI.
     """
 
     name: str
@@ -42,9 +43,17 @@ class Entry(Shown):
     law: str
     stage: str
     kinds: tuple[str, ...]
-    at: tuple[str, ...]
-    parameters: tuple[Parameter, ...]
+    by_place: Mapping[str, tuple[Parameter, ...]]
     mistaken_for: tuple[str, ...]
+
+    @property
+    def at(self) -> tuple[str, ...]:
+        return tuple(self.by_place)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The parameters at the first place."""
+        return self.by_place[self.at[0]]
 
     @property
     def headline(self) -> str:
@@ -84,7 +93,7 @@ class Entry(Shown):
             up, down = parameter.high - value, value - parameter.low
             reach = up if up >= down or value == 0.0 else -down
             value += 0.1 * (reach if abs(reach) < 1e6 else 1.0)
-        return quantity_text(value, parameter.unit, 3)
+        return quantity_text(value, parameter.unit, 3, f"{self.at[0]}.{self.name}.{parameter.name}")
 
     def table(self) -> Table:
         """One row per parameter, SI."""
@@ -146,8 +155,7 @@ def _entry(each: Effect, plant: PlantDescription) -> Entry | None:
         inspect.cleandoc(type(each).__doc__ or ""),
         each.stage.value,
         place_kinds_of(each),
-        at,
-        each.parameters(at[0], plant),
+        {place: each.parameters(place, plant) for place in at},
         each.mistaken_for,
     )
 
