@@ -34,8 +34,8 @@ _ANY = PlantDescription(
 class Entry(Shown):
     """One effect of the catalogue.
 
-    meaning: one sentence. law: equation and source. kinds: kinds of component. by_place: the parameters at each place of the
-    plant, size first, with unit, nominal value, range and meaning, in SI.
+    meaning: one sentence. law: equation and source. kinds: kinds of component. by_place: the parameters at each place
+    of the plant, size first, with unit, nominal value, range and meaning, in SI.
     """
 
     name: str
