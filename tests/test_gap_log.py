@@ -145,6 +145,15 @@ def test_planned_inputs_need_no_readings(tmp_path: Path, capsys: pytest.CaptureF
     planned, listing = tmp_path / "planned.csv", tmp_path / "runs.yaml"
     planned.write_text("t_s,Q1_cm3_s,Q2_cm3_s\n" + "\n".join(rows) + "\n")
     listing.write_text("recordings: [planned.csv]\n")
+    words = ["--plant", "three_tank", "--recording", str(planned), "--library", "pump_lag,pump_gain@Q1"]
+    assert cli.main(["plan", *words, "--noise", "5 mm", "--json"]) == cli.DONE
+    hidden = [
+        f"hidden: {name.replace('_', ' ')} at {place}" for name, place in json.loads(capsys.readouterr().out)["hidden"]
+    ]
+    assert cli.main(["plan", *words, "--noise", "5 mm"]) == cli.DONE
+    counted = f"of 3 effects at their typical size, {len(hidden)} would be hidden by a noise of 0.5 cm; pairs"
+    first, *others = capsys.readouterr().out.splitlines()
+    assert first.startswith(counted) and others[: len(hidden)] == hidden and hidden
     for source in map(str, (planned, listing)):
         words = ["--plant", "three_tank", "--recording", source, "--library", "leak@T1,pump_gain@Q1", "--json"]
         assert cli.main(["plan", *words]) == cli.DONE

@@ -142,6 +142,14 @@ def test_a_parameter_is_listed_in_the_unit_of_each_sensor(tmp_path: Path, capsys
     ]
 
 
+def test_the_columns_of_a_new_run_are_in_the_unit_of_the_sensor() -> None:
+    pressure = build_plant(
+        {"tanks": {"A": {"area": "1 m^2", "height": "2 m"}}, "sensors": {"p": {"tank": "A", "gain": "98.1 mbar/m"}}}, ""
+    )
+    for kind in ("run", "monitor"):
+        assert "p: {column: LT-101, unit: mbar}" in template(kind, pressure, "rig.yaml", "rig")
+
+
 def test_a_new_plant_file_does_not_wait_for_the_library_of_units(tmp_path: Path) -> None:
     words = ["-X", "importtime", "-m", "fdi_torch", "new", "plant", "--out", str(tmp_path / "rig.yaml")]
     imported = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True).stderr

@@ -100,6 +100,10 @@ def test_a_plant_that_does_not_explain_the_recording_is_said_first(
         shown.startswith(f"{warning}.\n- next: fdi gap distinguishes")
         and warning[:40] in (folder / "run.svg").read_text()
     )
+    assert "constants with a tolerance" not in shown
+    (folder / "uncertain.yaml").write_text((folder / "rig.yaml").read_text() + 'tolerances: {"*.area": 10 %}\n')
+    assert main([*words, "--plant", "uncertain.yaml"]) == NOT_EXPLAINED
+    assert "have the values of the plant file here; fdi refit --adopt fits them" in capsys.readouterr().out
     run = fdi_torch.predict("rig.yaml", "novalve.csv", start_samples=3)
     assert run.headline == f"{warning}; free run of rig along {folder / 'novalve.csv'}"
 
