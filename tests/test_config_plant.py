@@ -85,7 +85,10 @@ def test_a_number_that_is_short_in_no_unit_is_written_in_the_unit_of_the_plant()
 
 @pytest.mark.parametrize(
     ("tank_area", "pipe_area", "written"),
-    [("2 m^2", "0.5 cm^2", ("2 m^2", "0.5 cm^2")), ("2 m^2", 5e-7, ("2 m^2", "0.5 mm^2"))],
+    [
+        ("2 m^2", "3.2 cm^2", ("2 m^2", "3.2 cm^2")),
+        ("2 m^2", 5e-7, ("2 m^2", "0.5 mm^2")),
+    ],
 )
 def test_areas_are_written_in_units_of_their_size(tank_area: Any, pipe_area: Any, written: tuple[str, str]) -> None:
     plant = fdi_torch.Plant(

@@ -124,7 +124,7 @@ def test_overrides_reach_into_lists() -> None:
         ("plant=7", "plant: expected a shipped plant, a plant file or a plant, got 7"),
         ("estimate.calibrate=all", "estimate.calibrate: expected auto or a list of names, got 'all'"),
         ("estimate.step.search=1", "estimate.step.search: expected a quantity in s, got the bare number 1"),
-        ("simulate=null", "expected either recordings or simulate, got neither; keep one"),
+        ("simulate=null", "expected either recordings or simulate, got neither; add one"),
         ("recordings=[{file: x.csv}]", "expected either recordings or simulate, got both; keep one"),
         ("estimate.parameters.9.low=1", "--set .* estimate.parameters: expected an index below 5, got '9'"),
         ("seed.deep=1", "seed: expected a valid integer, got {'deep': 1}"),
@@ -172,7 +172,10 @@ def test_boxes_and_beliefs_can_be_changed_with_units() -> None:
         ),
         ({"parameters": ["T1.leak", "T1.leak.size"]}, "expected each parameter once, got T1.leak.size twice"),
         ({"parameters": [{"name": "T1.leak", "low": 2}]}, r"parameters.0 \(T1.leak\): .* expected low <= nominal"),
-        ({"parameters": [{"name": "T1.leak", "high": "2 cm"}]}, r"parameters.0 \(T1.leak\): expected a quantity in 1"),
+        (
+            {"parameters": [{"name": "T1.leak", "high": "2 cm"}]},
+            r"parameters.0 \(T1.leak\): expected a number or a share",
+        ),
         ({"parameters": ["T1.leak"], "calibrate": ["*.gian"]}, "estimate.calibrate: .* got '\\*.gian'"),
     ],
 )
@@ -196,7 +199,7 @@ def test_constants_to_calibrate_by_pattern() -> None:
 @pytest.mark.parametrize(
     ("faults", "sentence"),
     [
-        ({"T1.leak.size": "3 cm"}, "simulate.faults.T1.leak.size: expected a quantity in 1"),
+        ({"T1.leak.size": "3 cm"}, "simulate.faults.T1.leak.size: expected a number or a share"),
         ({"T1.leak.size": 1.5}, r"simulate.faults.T1.leak.size: expected a size from 0 to 1, got 1.5"),
         ({"T9.area": "3 cm^2"}, "simulate.faults: expected a parameter of the plant .* the nearest are 'T1.area', 'T2"),
     ],

@@ -187,7 +187,8 @@ def test_a_rig_in_code_from_simulation_to_report(tmp_path: Path, monkeypatch: py
     assert torch.equal(recording.outputs, again.outputs)
     assert "301 samples, 300 s" in repr(recording) and "<table>" in recording._repr_html_()
     monkeypatch.chdir(tmp_path)
-    found = fdi_torch.train(RIG, recording, ["A.leak"])
+    found = fdi_torch.train(RIG, recording, ["A.leak"], output={"folder": "results"})
+    assert found.log.parent.name == "results"
     run = {"plant": RIG, "recordings": [recording], "estimate": {"parameters": ["A.leak"]}}
     assert torch.equal(fdi_torch.train(run).estimate.value, found.estimate.value)
     row = found.table().columns["parameter"].index("A.leak.size")
@@ -329,8 +330,19 @@ def test_arguments_of_another_kind_are_named() -> None:
         fdi_torch.monitor(RIG, simulated())
     with pytest.raises(TypeError, match="monitor: expected a recording beside fault_free, got none"):
         fdi_torch.monitor(RIG, fault_free=["0 s", "300 s"])
-    with pytest.raises(TypeError, match="train: expected recordings beside the parameters, got none"):
-        fdi_torch.train(RIG, parameters=["A.leak"])
+    with pytest.raises(TypeError, match=r"train: expected recordings beside the parameters, seed, got none"):
+        fdi_torch.train(RIG, parameters=["A.leak"], seed=1)
+    with pytest.raises(TypeError, match=r"got a Plant; name its recordings as the next argument"):
+        fdi_torch.gap(RIG)
+    with pytest.raises(
+        fdi_torch.ConfigError, match=r"train: expected a known key .* got 'sede'; the nearest is 'seed'"
+    ):
+        fdi_torch.train(RIG, simulated(), ["A.leak"], sede=1)
+    with pytest.raises(fdi_torch.ConfigError, match=r"expected either recordings or simulate, got neither; add one"):
+        fdi_torch.train(RIG, [])
+    for function in (fdi_torch.gap, fdi_torch.refit):
+        with pytest.raises(ValueError, match=r"(gap|refit): expected a recording with at least two samples, got none"):
+            function(RIG, [])  # type: ignore[operator]
     with pytest.raises(TypeError, match="predict: expected one recording, got a list of 2"):
         fdi_torch.predict(RIG, [simulated(), simulated()])  # type: ignore[arg-type]
     with pytest.raises(
