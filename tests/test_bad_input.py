@@ -74,7 +74,7 @@ WRONG_DATA = {
     "repeated time": ("\n21,", "\n20,", "row 23, column t_s", "expected time that increases, got 20 s after 20 s"),
     "backward time": ("\n21,", "\n2,", "row 23, column t_s", "expected time that increases, got 2 s after 20 s"),
     "missing column": (",h3_cm", ",x3_cm", "expected a column for h3", "map it under columns"),
-    "unit": ("Q1_cm3_s", "Q1_cm", "Q1", "expected a unit of the kind m^3/s"),
+    "unit": ("Q1_cm3_s", "Q1_cm", "Q1", "expected a unit of flow such as l/min"),
     "per cent of a level": ("h1_cm", "h1_pct", "h1", "(a level in %: gain: 100 %/m)"),
     "per cent of a pump": ("Q1_cm3_s", "Q1_pct", "Q1", "(a command in %: gain: "),
     "no number": ("\n5,50,50,45,", "\n5,50,50,five,", "row 7, column h1_cm", "got 'five'"),

@@ -307,7 +307,7 @@ def test_columns_by_mapping_constants_and_missing_sensors(tmp_path: Path) -> Non
     [
         ({"columns": {"h4": {"column": "x"}}}, "rig.csv: columns.h4: expected a channel of the plant or t"),
         ({"columns": {"Q1": {"constant": "5 V"}}}, "rig.csv: columns.Q1.constant: expected a quantity in m\\^3/s"),
-        ({"columns": {"Q1": {"column": "h1_cm"}}}, "Q1: expected a unit of the kind m\\^3/s .* got one of the kind m;"),
+        ({"columns": {"Q1": {"column": "h1_cm"}}}, "Q1: expected a unit of flow such as l/min .* got a unit of level;"),
         ({"start": "50 s"}, "expected at least two samples after start 50 s, got"),
         ({"start_levels": {"T9": "free"}}, "rig.csv: start_levels.T9: expected a tank .* got 'T9'"),
         (
