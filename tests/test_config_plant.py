@@ -217,6 +217,7 @@ def test_numbers_without_a_short_form_read_back_to_the_last_bit() -> None:
             [{"effect": "leak", "location": "Q1"}],
             "effects.0: Q1.leak: expected a place of kind tank .* got pump Q1",
         ),
+        ("effects", [{"effect": "leak", "location": "t1"}], "effects.0: plant p: .* got t1; the nearest is 'T1'"),
         ("effects", [{"effect": "leak", "location": "T9"}], "effects.0: plant p: expected one of .* got T9"),
     ],
 )

@@ -268,7 +268,7 @@ def test_a_fault_within_the_part_taken_for_fault_free_is_suspected(
     )
 
 
-@pytest.mark.parametrize("part", [["400 s", "500 s"], ["150 s", "0 s"], ["0 s", "20 s"]])
+@pytest.mark.parametrize("part", [["400 s", "500 s"], ["150 s", "0 s"], ["0 s", "20 s"], ["0 s", "9000 s"]])
 def test_a_fault_free_part_that_is_none_is_named(
     part: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from fdi_torch.names import nearest
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.components import COMMAND_UNITS, OUTSIDE, READING_UNITS, Component, Sensor, Tank
 from fdi_torch.plant.description_checks import check_names, check_numbers, check_references
@@ -138,7 +139,8 @@ class PlantDescription:
         for component in self.components():
             if component.name == name:
                 return component
-        raise ValueError(f"{self.title}: expected one of {', '.join(self.locations())}, got {name}")
+        near = nearest(name, (component.name for component in self.components()))
+        raise ValueError(f"{self.title}: expected one of {', '.join(self.locations())}, got {name}{near}")
 
     def tank(self, name: str) -> Tank:
         return self._of_kind(Tank, name)
