@@ -350,6 +350,7 @@ def test_shipped_runs_on_real_data_read_their_recordings(real_data: Path, monkey
         ("estimate: {step: 0,5 s}", "got '5 s'; a comma ends a value: write 10.5 for decimals, and 10000 "),
         ("simulate: {inputs: {Q1: 1,5 l/min}}", "inputs.5 l/min: .* got None; a comma ends a value: write 10.5"),
         ("simulate: {inputs: {Q1: {steps: [[0 s, 1,5 l/min]]}}}", "steps.0: expected 2 values, got .*; a comma ends"),
+        ("simulate: {noise: {std: 1 mm}}", "noise.std: expected keys with values, as in {NAME: 1 mm}, got '1 mm'"),
         ("recordings: run.csv", r"recordings: expected a list, as in \[run.csv\]"),
         ("plant: {tanks: {T: {area: 1 m^2, height: 1 m}}, pipes: {P: {source: T, area: 1 cm^2, "
          "discharge_coefficient: 60}}}\nrecordings: [run.csv]", "discharge_coefficient: expected less than or equal"),

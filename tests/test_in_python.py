@@ -328,6 +328,10 @@ def test_arguments_of_another_kind_are_named() -> None:
         fdi_torch.train({"plant": RIG, "recordings": [frame], "estimate": {"parameters": ["A.leak"]}})
     with pytest.raises(fdi_torch.ConfigError, match=r"fault_free: expected a value, .* \(interval"):
         fdi_torch.monitor(RIG, simulated())
+    with pytest.raises(
+        fdi_torch.ConfigError, match=r"fault_free: expected a list, got '300 s' .* as in \[0 s, 300 s\]"
+    ):
+        fdi_torch.monitor(RIG, simulated(), fault_free="300 s")
     with pytest.raises(TypeError, match="monitor: expected a recording beside fault_free, got none"):
         fdi_torch.monitor(RIG, fault_free=["0 s", "300 s"])
     with pytest.raises(TypeError, match=r"train: expected recordings beside the parameters, seed, got none"):

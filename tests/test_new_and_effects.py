@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+import fdi_torch
 from fdi_torch import cli
 from fdi_torch.config.channels import mapped
 from fdi_torch.config.estimation import parameter_values, placements_of
@@ -134,6 +135,12 @@ def test_a_parameter_is_listed_in_the_unit_of_each_sensor(tmp_path: Path, capsys
         "sensors: {h: {tank: A}, p: {tank: A, gain: 98.1 mbar/m}, y: {tank: A, gain: 1 %/cm}, z: {tank: A}}\n"
     )
     assert cli.main(["effects", "sensor_bias", "--plant", str(path)]) == 0
+    bias = fdi_torch.effects(path)["sensor_bias"].table().columns
+    assert bias["parameter"][:3] == ["bias at h, z", "bias at p", "bias at y"] and bias["unit"][:3] == [
+        "cm",
+        "mbar",
+        "%",
+    ]
     listed = [line.split()[:8] for line in capsys.readouterr().out.splitlines() if line.startswith("bias at")]
     assert listed == [
         ["bias", "at", "h,", "z", "cm", "0", "-30", "to"],

@@ -13,7 +13,6 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.effects.catalogue import Entry, effects
-from fdi_torch.quantities import display_unit
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -36,7 +35,7 @@ def _show(entry: Entry, of_plant: bool, screen: Screen) -> None:
     screen.say(f"{entry.name}: {entry.meaning}")
     screen.say(f"  location: {entry.where}" + (f": {', '.join(entry.at)}" if of_plant else ""))
     screen.say(f"  acts {entry.begins}")
-    screen.table("", ("parameter", "unit", "nominal", "range", "meaning"), _rows(entry), left=5)
+    screen.table("", ("parameter", "unit", "nominal", "range", "meaning"), [_row(*row) for row in entry.rows()], left=5)
     screen.say(f"  in simulate.faults:     {entry.in_a_run_file}")
     screen.say(f"  in estimate.parameters: {entry.at[0]}.{entry.name}")
     screen.say(f"  in a plant's effects:   {entry.in_a_plant_file}")
@@ -47,22 +46,10 @@ def _show(entry: Entry, of_plant: bool, screen: Screen) -> None:
     screen.say()
 
 
-def _rows(entry: Entry) -> list[list[str]]:
-    """A row per parameter; a row per unit, with its places, for one that has several, as readings of sensors have."""
-    rows = []
-    for k, first in enumerate(entry.parameters):
-        places: dict[str, list[str]] = {}
-        for place, parameters in entry.by_place.items():
-            unit, _ = display_unit(parameters[k].unit, f"{place}.{entry.name}.{first.name}")
-            places.setdefault(unit, []).append(place)
-        for unit, at in places.items():
-            p = entry.by_place[at[0]][k]
-            _, scale = display_unit(p.unit, f"{at[0]}.{entry.name}.{p.name}")
-            low, high = (f"{scale * v:.4g}" if math.isfinite(v) else "" for v in (p.low, p.high))
-            ends = f"{low} to {high}" if low and high else f"from {low}" if low else f"to {high}" if high else "any"
-            name = p.name if len(places) == 1 else f"{p.name} at {', '.join(at)}"
-            rows.append([name, unit or "1", f"{scale * p.nominal:.4g}", ends, p.meaning])
-    return rows
+def _row(name: str, unit: str, nominal: float, low: float, high: float, meaning: str) -> list[str]:
+    first, last = (f"{v:.4g}" if math.isfinite(v) else "" for v in (low, high))
+    ends = f"{first} to {last}" if first and last else f"from {first}" if first else f"to {last}" if last else "any"
+    return [name, unit, f"{nominal:.4g}", ends, meaning]
 
 
 def _as_json(entry: Entry) -> dict[str, Any]:

@@ -66,9 +66,13 @@ def _sentence(finding: Any, known: Mapping[str, str]) -> str:
     if finding["type"] in ("list_type", "tuple_type"):
         given = finding["input"]
         values = ", ".join(map(str, given.values())) if isinstance(given, dict) else str(given).partition("\n")[0]
-        return f"expected a list, as in [{values}], got {_shown(given)}"
+        meaning = known.get(".".join(map(str, finding["loc"])), "")
+        example = "" if "as in [" in meaning else f", as in [{values}]"
+        return f"expected a list{example}, got {_shown(given)}" + (f" ({meaning})" if meaning else "")
     if finding["type"] in ("dict_type", "model_type"):
-        return f"expected keys with values, got {_shown(finding['input'])}"
+        given = finding["input"]
+        example = f", as in {{NAME: {given}}}" if finding["type"] == "dict_type" and isinstance(given, str) else ""
+        return f"expected keys with values{example}, got {_shown(given)}"
     if finding["type"] == "too_long":
         return (
             f"expected {finding['ctx']['max_length']} values, got {_shown(finding['input'])}{_comma(finding['input'])}"
