@@ -277,7 +277,7 @@ def test_a_file_is_predicted_by_what_the_others_say() -> None:
 
 
 def test_a_sensor_that_hardly_moves_does_not_bend_the_initial_levels_of_the_others() -> None:
-    """The basin's level barely changes and is off by an error of its outlet. A settles within the first samples, so that
+    """The level of the basin barely changes, and is off by an error of its outlet. A settles within the first samples:
     a wrong level of A at first could make up for a part of that error."""
     text = """{tanks: {A: {area: 0.1 m^2, height: 1 m}, basin: {area: 1 m^2, height: 1 m}},
         pipes: {fall: {source: A, target: basin, area: 3 cm^2, discharge_coefficient: 0.6, free_fall: true},
