@@ -121,6 +121,16 @@ def test_of_several_recordings_the_one_that_is_not_explained_is_named(
     assert "the worst" not in capsys.readouterr().out
 
 
+def test_a_recording_that_only_determines_its_initial_levels_is_said_to(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for samples, words in (("39", "the first 39 samples"), ("40", "all samples: a longer recording would test the")):
+        rows = [f"{100 + 0.5 * k},0.05,{k}\n" for k in range(40)]
+        (folder / "short.csv").write_text("h_mm,Q_lps,t_s\n" + "".join(rows))
+        main(["predict", "--plant", "rig.yaml", "--start-samples", samples, "short.csv"])
+        assert f"initial levels from {words}" in capsys.readouterr().out
+
+
 def test_no_recording_is_misuse(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["predict", "--plant", "rig.yaml"]) == 2
     assert "expected a recording" in capsys.readouterr().err
