@@ -12,6 +12,7 @@ from fdi_torch.parameters import common_name
 from fdi_torch.units import UnitError, factor, in_unit, number_and_unit, same_kind
 
 SI_UNITS = ("m", "s", "V", "Pa", "A", "1/s", "m^2", "m^3", "m^3/s", "m/s", "1")
+NO_COMMAS = "write 10.5 for decimals, and 10000 without a separator of thousands"
 
 
 @lru_cache(maxsize=4096)
@@ -23,7 +24,9 @@ def parse_quantity(text: str, unit: str) -> float:
     try:
         return in_unit(*number_and_unit(text), unit)
     except UnitError:
-        raise ValueError(f"expected a quantity in {unit} such as '1 {unit}', got '{shortened(text)}'") from None
+        expected = "a number or a share such as '30 %'" if unit == "1" else f"a quantity in {unit} such as '1 {unit}'"
+        hint = f"; {NO_COMMAS}" if "," in text else ""
+        raise ValueError(f"expected {expected}, got '{shortened(text)}'{hint}") from None
 
 
 def parse_level_deviation(text: str, name: str) -> float:

@@ -173,6 +173,12 @@ def test_a_file_without_its_option_is_told_the_option(capsys: pytest.CaptureFixt
             "unrecognized argument: --recordng; the nearest is '--recording'",
         ),
         ("train --confg=a.yaml", "unrecognized argument: --confg; the nearest is '--config'"),
+        ("train --plant a.yaml", "--plant; name it in the file for --config, which fdi new run --plant ... writes"),
+        (
+            "monitor --recording a.csv",
+            "--recording; name it in the file for --config, which fdi new monitor --recording",
+        ),
+        ("gap --config a.yaml", "--config; name --plant and --recording, whose YAML file may list several"),
         ("train --seed one", "argument --seed: expected a whole number, got 'one'"),
     ],
 )

@@ -36,6 +36,12 @@ def changed(path: str, value: Any) -> dict[str, Any]:
     return data
 
 
+@pytest.mark.parametrize(("name", "title"), [("", "plant"), ("plant", "plant"), ("bench", "plant bench")])
+def test_a_plant_without_a_name_is_called_the_plant(name: str, title: str) -> None:
+    with pytest.raises(ConfigError, match=f"^p.yaml: {title}: tanks.T1.area: expected a positive number"):
+        build_plant({"name": name, **changed("tanks.T1.area", "0 m^2")}, "p.yaml")
+
+
 def test_three_tank_is_table_1() -> None:
     plant = load_plant("three_tank")
     assert [t.name for t in plant.tanks] == ["T1", "T2", "T3"]
@@ -75,6 +81,24 @@ def test_a_number_that_is_short_in_no_unit_is_written_in_the_unit_of_the_plant()
     number, unit = written["pipes"]["out"]["area"].split()
     assert unit == "dm^2" and float(number) == pytest.approx(100.0 * bore, rel=1e-15)
     assert build_plant(written, "again").pipes == plant.pipes
+
+
+@pytest.mark.parametrize(
+    ("tank_area", "pipe_area", "written"),
+    [
+        ("2 m^2", "3.2 cm^2", ("2 m^2", "3.2 cm^2")),
+        ("2 m^2", 5e-7, ("2 m^2", "0.5 mm^2")),
+    ],
+)
+def test_areas_are_written_in_units_of_their_size(tank_area: Any, pipe_area: Any, written: tuple[str, str]) -> None:
+    plant = fdi_torch.Plant(
+        tanks=[fdi_torch.Tank("A", area=tank_area, height="3 m")],
+        pipes=[fdi_torch.Pipe("out", "A", "outside", area=pipe_area, discharge_coefficient=0.6)],
+        sensors=[fdi_torch.Sensor("h", "A")],
+    )
+    data = yaml.safe_load(dump_plant(plant))
+    assert (data["tanks"]["A"]["area"], data["pipes"]["out"]["area"]) == written
+    assert build_plant(data, "again") == plant
 
 
 @pytest.mark.parametrize(
@@ -147,6 +171,18 @@ def test_numbers_without_a_short_form_read_back_to_the_last_bit() -> None:
             "p.yaml: tanks.T1.area: expected a quantity in m\\^2 such as '1 m\\^2', got 'nan m",
         ),
         ("tanks.T1.area", "-160 cm^2", "p.yaml: plant p: tanks.T1.area: expected a positive number, got -0.016 m\\^2"),
+        ("tanks.T1.area", "10,000 cm^2", "got '10,000 cm\\^2'; write 10.5 for decimals, and 10000 without a separator"),
+        (
+            "pipes.P12.discharge_coefficient",
+            "0,6",
+            "expected a number or a share such as '30 %', got '0,6'; write 10.5",
+        ),
+        (
+            "tanks.T1.start_level",
+            "101 cm",
+            "tanks.T1.start_level: expected a level from the floor to 100 cm, got 101 cm",
+        ),
+        ("tanks.T1.start_level", "-1 cm", "tanks.T1.start_level: expected a level from the floor to 100 cm, got -1 cm"),
         ("tanks.T3", {"area": "1 m^2"}, "p.yaml: tanks.T3.height: expected a value, got nothing; add it"),
         ("tanks", [], "p.yaml: tanks: expected keys with values, got \\[\\]"),
         ("tanks", {}, "expected at least one tank, got none"),
@@ -181,6 +217,7 @@ def test_numbers_without_a_short_form_read_back_to_the_last_bit() -> None:
             [{"effect": "leak", "location": "Q1"}],
             "effects.0: Q1.leak: expected a place of kind tank .* got pump Q1",
         ),
+        ("effects", [{"effect": "leak", "location": "t1"}], "effects.0: plant p: .* got t1; the nearest is 'T1'"),
         ("effects", [{"effect": "leak", "location": "T9"}], "effects.0: plant p: expected one of .* got T9"),
     ],
 )

@@ -124,7 +124,7 @@ def test_overrides_reach_into_lists() -> None:
         ("plant=7", "plant: expected a shipped plant, a plant file or a plant, got 7"),
         ("estimate.calibrate=all", "estimate.calibrate: expected auto or a list of names, got 'all'"),
         ("estimate.step.search=1", "estimate.step.search: expected a quantity in s, got the bare number 1"),
-        ("simulate=null", "expected either recordings or simulate, got neither; keep one"),
+        ("simulate=null", "expected either recordings or simulate, got neither; add one"),
         ("recordings=[{file: x.csv}]", "expected either recordings or simulate, got both; keep one"),
         ("estimate.parameters.9.low=1", "--set .* estimate.parameters: expected an index below 5, got '9'"),
         ("seed.deep=1", "seed: expected a valid integer, got {'deep': 1}"),
@@ -172,7 +172,10 @@ def test_boxes_and_beliefs_can_be_changed_with_units() -> None:
         ),
         ({"parameters": ["T1.leak", "T1.leak.size"]}, "expected each parameter once, got T1.leak.size twice"),
         ({"parameters": [{"name": "T1.leak", "low": 2}]}, r"parameters.0 \(T1.leak\): .* expected low <= nominal"),
-        ({"parameters": [{"name": "T1.leak", "high": "2 cm"}]}, r"parameters.0 \(T1.leak\): expected a quantity in 1"),
+        (
+            {"parameters": [{"name": "T1.leak", "high": "2 cm"}]},
+            r"parameters.0 \(T1.leak\): expected a number or a share",
+        ),
         ({"parameters": ["T1.leak"], "calibrate": ["*.gian"]}, "estimate.calibrate: .* got '\\*.gian'"),
     ],
 )
@@ -196,7 +199,7 @@ def test_constants_to_calibrate_by_pattern() -> None:
 @pytest.mark.parametrize(
     ("faults", "sentence"),
     [
-        ({"T1.leak.size": "3 cm"}, "simulate.faults.T1.leak.size: expected a quantity in 1"),
+        ({"T1.leak.size": "3 cm"}, "simulate.faults.T1.leak.size: expected a number or a share"),
         ({"T1.leak.size": 1.5}, r"simulate.faults.T1.leak.size: expected a size from 0 to 1, got 1.5"),
         ({"T9.area": "3 cm^2"}, "simulate.faults: expected a parameter of the plant .* the nearest are 'T1.area', 'T2"),
     ],
@@ -304,7 +307,7 @@ def test_columns_by_mapping_constants_and_missing_sensors(tmp_path: Path) -> Non
     [
         ({"columns": {"h4": {"column": "x"}}}, "rig.csv: columns.h4: expected a channel of the plant or t"),
         ({"columns": {"Q1": {"constant": "5 V"}}}, "rig.csv: columns.Q1.constant: expected a quantity in m\\^3/s"),
-        ({"columns": {"Q1": {"column": "h1_cm"}}}, "Q1: expected a unit of the kind m\\^3/s .* got one of the kind m;"),
+        ({"columns": {"Q1": {"column": "h1_cm"}}}, "Q1: expected a unit of flow such as l/min .* got a unit of level;"),
         ({"columns": {"Q1": {"column": "Q1_cm3_s", "unit": "%"}}}, r"\(a command in %: gain: 90 cm\^3/s"),
         ({"columns": {"h1": {"column": "h1_cm", "unit": "%"}}}, r"\(a level in %: gain: 100 %/m\)"),
         ({"start": "50 s"}, "expected at least two samples after start 50 s, got"),
@@ -346,7 +349,10 @@ def test_shipped_runs_on_real_data_read_their_recordings(real_data: Path, monkey
         ("parameters: [T1.leak]", "got 'parameters'; there is estimate.parameters"),
         ("estimate: {seed: 3}", "got 'seed'.*; there is simulate.seed and seed"),
         ("recordings: [{file:run.csv}]", "got 'file:run.csv'.*; part key and value by a colon and a space"),
-        ("estimate: {step: 0,5 s}", "got '5 s'; a comma ends a value: write decimals with a point"),
+        ("estimate: {step: 0,5 s}", "got '5 s'; a comma ends a value: write 10.5 for decimals, and 10000 "),
+        ("simulate: {inputs: {Q1: 1,5 l/min}}", "inputs.5 l/min: .* got None; a comma ends a value: write 10.5"),
+        ("simulate: {inputs: {Q1: {steps: [[0 s, 1,5 l/min]]}}}", "steps.0: expected 2 values, got .*; a comma ends"),
+        ("simulate: {noise: {std: 1 mm}}", "noise.std: expected keys with values, as in {NAME: 1 mm}, got '1 mm'"),
         ("recordings: run.csv", r"recordings: expected a list, as in \[run.csv\]"),
         ("plant: {tanks: {T: {area: 1 m^2, height: 1 m}}, pipes: {P: {source: T, area: 1 cm^2, "
          "discharge_coefficient: 60}}}\nrecordings: [run.csv]", "discharge_coefficient: expected less than or equal"),

@@ -34,6 +34,8 @@ def read(folder: Path, text: str | bytes, encoding: str = "utf-8", **mapping: Ch
         (PLAIN.replace(",", ";").replace(".", ","), "utf-8"),
         ("sep=;\n" + PLAIN.replace(",", ";"), "utf-8"),
         (PLAIN.replace("t_s,Q1_cm3_s,h1_cm", "t,Q1,h1\ns,cm3/s,cm"), "utf-8"),
+        (PLAIN.replace("t_s,Q1_cm3_s,h1_cm", "Zeit in s,Q1 in cm3/s,h1 / cm"), "utf-8"),
+        (PLAIN.replace("t_s,Q1_cm3_s,h1_cm", "t / s,Q1 / cm³/s,h1 in cm"), "utf-8"),
         ("Logger 7\nRun 12 of 2026,,\n\n" + PLAIN, "utf-8"),
         (PLAIN.replace("t_s,Q1_cm3_s,h1_cm", "n,Time [s],Q1 (cm3/s),h1 [cm]").replace("\n", "\n1,")[:-2], "utf-8"),
         ("time_ms,Q1_cm3_s,h1_cm\n1790000000500,50.5,10\n1790000005500,50.5,11\n1790000010500,20,12.5\n", "utf-8"),

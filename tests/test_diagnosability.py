@@ -49,6 +49,15 @@ def test_a_correlation_sees_neither_bias_nor_gain_of_a_sensor() -> None:
     assert found.std_by_correlation[1:] == (math.inf, math.inf)
 
 
+def test_a_stuck_sensor_at_a_constant_level_shows_at_no_size() -> None:
+    """Its signature is rounding: it would need a size of ten million, and hides no other fault."""
+    alone = diagnosability(PLANT, ["T1.leak.size"], steady(), millimetre())
+    found = diagnosability(PLANT, ["T1.leak.size", "h1.sensor_stuck.size"], steady(), millimetre())
+    assert (found.std[1], found.smallest_detectable[1], found.smallest_isolable[1]) == (math.inf,) * 3
+    assert found.rank == 1 and found.smallest_isolable[0] == pytest.approx(alone.smallest_isolable[0])
+    assert found.remarks[0] == "h1.sensor_stuck.size does not show in any reading at any size of its range"
+
+
 def test_plugging_of_the_outlet_and_a_leak_of_its_tank_are_one_and_the_reason_is_told() -> None:
     found = diagnosability(PLANT, SINGLES, steady(), millimetre())
     assert found.groups == (

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from fdi_torch.config.simulation import reading_noise
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.misfit import EXACT
 from fdi_torch.gap.answer import adopted
@@ -286,9 +287,11 @@ def test_a_recording_without_a_sensor_is_refused() -> None:
 def test_planned_inputs_show_which_effects_are_hidden() -> None:
     library = ("pump_gain", "pump_dead_zone@Q1", "sensor_bias@h2", "sensor_saturation@h1")
     steady = constant_inputs(nominal_plant(), 600.0)
-    at_rest = planned_identifiability(nominal_plant(), steady, 1e-3, library)
+    at_rest = planned_identifiability(nominal_plant(), steady, [1e-3] * 3, library)
     assert ("pump_gain", "Q1") in at_rest.hidden  # three constants with 3 % tolerance take it all
-    lively = planned_identifiability(nominal_plant(), recorded({"P13.discharge_coefficient": 0.6}, 61), 1e-3, library)
+    lively = planned_identifiability(
+        nominal_plant(), recorded({"P13.discharge_coefficient": 0.6}, 61), [1e-3] * 3, library
+    )
     assert ("pump_gain", "Q1") not in lively.hidden
     assert ("sensor_saturation", "h1") in at_rest.hidden
 
@@ -299,7 +302,9 @@ def test_planned_noise_is_that_of_the_level_whatever_unit_a_sensor_has() -> None
         plant, sensors=tuple(replace(s, unit="A", gain=0.016 / 0.6, offset=0.004) for s in plant.sensors)
     )
     inputs = recorded({"P13.discharge_coefficient": 0.6}, 61, samples=300)
-    one, other = (planned_identifiability(p, inputs, 1e-3, library) for p in (plant, in_milliamperes))
+    one, other = (
+        planned_identifiability(p, inputs, reading_noise("1 mm", p), library) for p in (plant, in_milliamperes)
+    )
     assert other.hidden == one.hidden
     assert other.shown == pytest.approx(one.shown)
 

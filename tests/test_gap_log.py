@@ -137,7 +137,7 @@ def test_an_ambiguous_answer_writes_the_next_input(tmp_path: Path, capsys: pytes
     limits = json.loads(capsys.readouterr().out)
     assert set(limits["shown"]) == {f"{q}.{e}" for q in ("Q1", "Q2") for e in ("pump_lag", "pump_delay")}
     assert cli.main(["plan", *planned_words, "--noise", "0 mm"]) == cli.MISUSE
-    assert "--noise: expected a positive standard deviation such as '1 mm', got '0 mm'" in capsys.readouterr().err
+    assert "noise of h1: expected a positive standard deviation, got '0 mm'" in capsys.readouterr().err
 
 
 def test_planned_inputs_need_no_readings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -145,6 +145,15 @@ def test_planned_inputs_need_no_readings(tmp_path: Path, capsys: pytest.CaptureF
     planned, listing = tmp_path / "planned.csv", tmp_path / "runs.yaml"
     planned.write_text("t_s,Q1_cm3_s,Q2_cm3_s\n" + "\n".join(rows) + "\n")
     listing.write_text("recordings: [planned.csv]\n")
+    words = ["--plant", "three_tank", "--recording", str(planned), "--library", "pump_lag,pump_gain@Q1"]
+    assert cli.main(["plan", *words, "--noise", "5 mm", "--json"]) == cli.DONE
+    hidden = [
+        f"hidden: {name.replace('_', ' ')} at {place}" for name, place in json.loads(capsys.readouterr().out)["hidden"]
+    ]
+    assert cli.main(["plan", *words, "--noise", "5 mm"]) == cli.DONE
+    counted = f"of 3 effects at their typical size, {len(hidden)} would be hidden by a noise of 5 mm; pairs"
+    first, *others = capsys.readouterr().out.splitlines()
+    assert first.startswith(counted) and others[: len(hidden)] == hidden and hidden
     for source in map(str, (planned, listing)):
         words = ["--plant", "three_tank", "--recording", source, "--library", "leak@T1,pump_gain@Q1", "--json"]
         assert cli.main(["plan", *words]) == cli.DONE

@@ -98,6 +98,10 @@ def test_every_shipped_plant_can_be_taken_apart_and_put_together_in_code(name: s
     ("wrong", "sentence"),
     [
         (lambda: Tank("A", area="200 cm", height=1.0), "tanks.A.area: expected a quantity in m^2, got '200 cm'"),
+        (
+            lambda: Tank("A", 0.02, 0.6, "70 cm"),
+            "tanks.A.start_level: expected a level from the floor to 60 cm, got 70 cm",
+        ),
         (lambda: Pump("Q", "A", max_flow=1e-4, gain="2 bar"), "pumps.Q.gain: expected a quantity in 1 or m^3/s/V or"),
         (lambda: Sensor("h", "A", gain="1 s"), "sensors.h.gain: expected a quantity in 1 or Pa/m or V/m"),
         (lambda: Sensor("h", "A", offset="1 V"), "sensors.h.offset: expected a quantity in m, got '1 V'"),
@@ -182,7 +186,8 @@ def test_a_rig_in_code_from_simulation_to_report(here: Path) -> None:
     again = simulated(**{"A.leak": 0.3})
     assert torch.equal(recording.outputs, again.outputs)
     assert "301 samples, 300 s" in repr(recording) and "<table>" in recording._repr_html_()
-    found = fdi_torch.train(RIG, recording, ["A.leak"])
+    found = fdi_torch.train(RIG, recording, ["A.leak"], output={"folder": "results"})
+    assert found.log.parent.name == "results"
     run = {"plant": RIG, "recordings": [recording], "estimate": {"parameters": ["A.leak"]}}
     assert torch.equal(fdi_torch.train(run).estimate.value, found.estimate.value)
     row = found.table().columns["parameter"].index("A.leak.size")
@@ -322,10 +327,25 @@ def test_arguments_of_another_kind_are_named() -> None:
         fdi_torch.train({"plant": RIG, "recordings": [frame], "estimate": {"parameters": ["A.leak"]}})
     with pytest.raises(fdi_torch.ConfigError, match=r"fault_free: expected a value, .* \(interval"):
         fdi_torch.monitor(RIG, simulated())
+    with pytest.raises(
+        fdi_torch.ConfigError, match=r"fault_free: expected a list, got '300 s' .* as in \[0 s, 300 s\]"
+    ):
+        fdi_torch.monitor(RIG, simulated(), fault_free="300 s")
     with pytest.raises(TypeError, match="monitor: expected a recording beside fault_free, got none"):
         fdi_torch.monitor(RIG, fault_free=["0 s", "300 s"])
-    with pytest.raises(TypeError, match="train: expected recordings beside the parameters, got none"):
-        fdi_torch.train(RIG, parameters=["A.leak"])
+    with pytest.raises(TypeError, match=r"train: expected recordings beside the parameters, seed, got none"):
+        fdi_torch.train(RIG, parameters=["A.leak"], seed=1)
+    with pytest.raises(TypeError, match=r"got a Plant; name its recordings as the next argument"):
+        fdi_torch.gap(RIG)
+    with pytest.raises(
+        fdi_torch.ConfigError, match=r"train: expected a known key .* got 'sede'; the nearest is 'seed'"
+    ):
+        fdi_torch.train(RIG, simulated(), ["A.leak"], sede=1)
+    with pytest.raises(fdi_torch.ConfigError, match=r"expected either recordings or simulate, got neither; add one"):
+        fdi_torch.train(RIG, [])
+    for function in (fdi_torch.gap, fdi_torch.refit):
+        with pytest.raises(ValueError, match=r"(gap|refit): expected a recording with at least two samples, got none"):
+            function(RIG, [])  # type: ignore[operator]
     with pytest.raises(TypeError, match="predict: expected one recording, got a list of 2"):
         fdi_torch.predict(RIG, [simulated(), simulated()])  # type: ignore[arg-type]
     with pytest.raises(

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+import fdi_torch
 from fdi_torch import cli
 from fdi_torch.config.channels import mapped
 from fdi_torch.config.estimation import parameter_values, placements_of
@@ -122,6 +123,35 @@ def test_a_spreadsheet_in_place_of_a_yaml_file_is_no_text(tmp_path: Path) -> Non
 def test_an_effect_of_the_catalogue_is_shown_with_its_parameters() -> None:
     shown = repr(effects()["pump_lag"])
     assert shown.startswith("Entry: pump_lag, at a pump or a transfer: A pump ") and "time_constant" in shown
+
+
+def test_a_parameter_is_listed_in_the_unit_of_each_sensor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(
+        "tanks: {A: {area: 200 cm^2, height: 60 cm}}\n"
+        "sensors: {h: {tank: A}, p: {tank: A, gain: 98.1 mbar/m}, y: {tank: A, gain: 1 %/cm}, z: {tank: A}}\n"
+    )
+    assert cli.main(["effects", "sensor_bias", "--plant", str(path)]) == 0
+    bias = fdi_torch.effects(path)["sensor_bias"].table().columns
+    assert bias["parameter"][:3] == ["bias at h, z", "bias at p", "bias at y"] and bias["unit"][:3] == [
+        "cm",
+        "mbar",
+        "%",
+    ]
+    listed = [line.split()[:8] for line in capsys.readouterr().out.splitlines() if line.startswith("bias at")]
+    assert listed == [
+        ["bias", "at", "h,", "z", "cm", "0", "-30", "to"],
+        ["bias", "at", "p", "mbar", "0", "-29.43", "to", "29.43"],
+        ["bias", "at", "y", "%", "0", "-30", "to", "30"],
+    ]
+
+
+def test_the_columns_of_a_new_run_are_in_the_unit_of_the_sensor() -> None:
+    pressure = build_plant(
+        {"tanks": {"A": {"area": "1 m^2", "height": "2 m"}}, "sensors": {"p": {"tank": "A", "gain": "98.1 mbar/m"}}}, ""
+    )
+    for kind in ("run", "monitor"):
+        assert "p: {column: LT-101, unit: mbar}" in template(kind, pressure, "rig.yaml", "rig")
 
 
 def test_a_new_plant_file_does_not_wait_for_the_library_of_units(tmp_path: Path) -> None:

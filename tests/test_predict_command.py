@@ -100,6 +100,10 @@ def test_a_plant_that_does_not_explain_the_recording_is_said_first(
         shown.startswith(f"{warning}.\n- next: fdi gap distinguishes")
         and warning[:40] in (folder / "run.svg").read_text()
     )
+    assert "constants with a tolerance" not in shown
+    (folder / "uncertain.yaml").write_text((folder / "rig.yaml").read_text() + 'tolerances: {"*.area": 10 %}\n')
+    assert main([*words, "--plant", "uncertain.yaml"]) == NOT_EXPLAINED
+    assert "have the values of the plant file here; fdi refit --adopt fits them" in capsys.readouterr().out
     run = fdi_torch.predict("rig.yaml", "novalve.csv", start_samples=3)
     assert run.headline == f"{warning}; free run of rig along {folder / 'novalve.csv'}"
 
@@ -115,6 +119,16 @@ def test_of_several_recordings_the_one_that_is_not_explained_is_named(
     assert lines[0].startswith("Unreliable") and lines[1] == "- of 2 free runs, that along fast.csv is the worst"
     assert main([*words, "fast.csv"]) == NOT_EXPLAINED
     assert "the worst" not in capsys.readouterr().out
+
+
+def test_a_recording_that_only_determines_its_initial_levels_is_said_to(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for samples, words in (("39", "the first 39 samples"), ("40", "all samples: a longer recording would test the")):
+        rows = [f"{100 + 0.5 * k},0.05,{k}\n" for k in range(40)]
+        (folder / "short.csv").write_text("h_mm,Q_lps,t_s\n" + "".join(rows))
+        main(["predict", "--plant", "rig.yaml", "--start-samples", samples, "short.csv"])
+        assert f"initial levels from {words}" in capsys.readouterr().out
 
 
 def test_no_recording_is_misuse(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

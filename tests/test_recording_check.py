@@ -13,6 +13,7 @@ from fdi_torch.config.plant_file import load_plant
 from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import RecordingCheck, check_recording
+from fdi_torch.recordings.csv_writing import write_csv
 from fdi_torch.recordings.input_sampling import inputs_not_held
 from tests.rigs import blank_recording
 from tests.test_gap_convergence import recorded
@@ -60,6 +61,48 @@ def test_a_rig_without_pumps_is_checked_with_a_long_recording(here: Path, capsys
     Path("run.csv").write_text("t_s,h_cm\n" + "".join(f"{k},{50 + k % 7}\n" for k in range(2500)))
     assert cli.main(["check", "--plant", "rig.yaml", "--recording", "run.csv"]) == cli.DONE
     assert "1 tank, 0 pipes, 0 pumps, 1 sensor, 0 constants with" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("pipes", "closed"),
+    [
+        ("", "A, B"),
+        ("pipes: {p: {source: A, target: B, area: 1 cm^2, discharge_coefficient: 0.6}}", "A, B"),
+        ("weirs: {w: {source: A, target: outside, crest: 30 cm, width: 2 cm}}", "B"),
+        (
+            "pipes: {p: {source: B, target: A, area: 1 cm^2, discharge_coefficient: 0.6}, "
+            "q: {source: B, target: outside, area: 1 cm^2, discharge_coefficient: 0.6}}",
+            "",
+        ),
+        (
+            "pipes: {p: {source: B, target: A, area: 1 cm^2, discharge_coefficient: 0.6, free_fall: true}, "
+            "q: {source: B, target: outside, area: 1 cm^2, discharge_coefficient: 0.6}}",
+            "A",
+        ),
+    ],
+)
+def test_tanks_from_which_nothing_leads_outside_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], pipes: str, closed: str
+) -> None:
+    path = tmp_path / "rig.yaml"
+    tanks = "tanks: {A: {area: 1 m^2, height: 1 m}, B: {area: 1 m^2, height: 1 m}}"
+    path.write_text(f"{tanks}\nsensors: {{h: {{tank: A}}}}\n{pipes}\n")
+    assert cli.main(["check", "--plant", str(path)]) == cli.DONE
+    said = [line for line in capsys.readouterr().out.splitlines() if "no water leaves" in line]
+    assert said == [f"- {closed}: no water leaves but over a rim; if there is an outlet, add it under pipes"] * bool(
+        closed
+    )
+
+
+def test_too_few_readings_for_a_diagnosis_are_said_before_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for samples in (59, 60):
+        path = write_csv(healthy(samples), tmp_path / f"{samples}.csv")
+        cli.main(["check", "--plant", "three_tank", "--recording", str(path)])
+        said = capsys.readouterr().out
+        few = "- h1: 59 readings: fdi gap and fdi refit expect at least 60, of all recordings together"
+        assert (few in said) is (samples == 59)
 
 
 def test_nothing_is_found_in_a_healthy_recording() -> None:

@@ -234,7 +234,7 @@ def exercised(plant: PlantDescription, scales: Scales = BENCH) -> Rig:
         rig = replace(rig, input_low=0.9 * rig.input_low, input_high=0.9 * rig.input_high)
         if rig.input_high < LEAST:
             raise ValueError(
-                f"plant {plant.name}: expected inputs at which no tank rests above half its height, got none above "
+                f"{plant.title}: expected inputs at which no tank rests above half its height, got none above "
                 f"{100 * LEAST:.0f} % of max_flow; check that every tank drains"
             )
     return replace(rig, noise_unit=NOISE * float(rest.mean()))

@@ -205,7 +205,7 @@ def draw_control(
     tanks, measured = [t.name for t in plant.tanks], {s.tank for s in plant.sensors}
     possible = [i for i, pump in enumerate(plant.pumps) if pump.target in measured]
     if not possible:
-        raise ValueError(f"plant {plant.name}: expected a pump into a measured tank, got none; add a sensor there")
+        raise ValueError(f"{plant.title}: expected a pump into a measured tank, got none; add a sensor there")
     pump = int(rng.choice(possible))
     tank, law = tanks.index(plant.pumps[pump].target), str(rng.choice(LAWS))
     height, (low, high) = plant.tanks[tank].height, limits[pump]

@@ -180,7 +180,7 @@ class _Parser(argparse.ArgumentParser):
         options = [word.partition("=")[0] for word in args if word.startswith("--") and len(word) > 2]
         for option in options:  # before an argument is missed that it was meant to be
             if option not in self._option_string_actions:
-                self.error(f"unrecognized argument: {option}{nearest(option, self._option_string_actions)}")
+                self.error(f"unrecognized argument: {option}{self._instead(option)}")
         known, others = super().parse_known_args(args, namespace)
         file = others[0] if others else ""
         option = "--config" if Path(file).suffix in (".yaml", ".yml") else "--recording"
@@ -189,6 +189,16 @@ class _Parser(argparse.ArgumentParser):
         if Path(file).suffix and "--config" in self._option_string_actions:
             self.error(f"unrecognized argument: {file}; name it in the file for --config (fdi new writes one)")
         return known, others
+
+    def _instead(self, option: str) -> str:
+        """What this command takes in place of an option that others have."""
+        known, kind = self._option_string_actions, self.prog.rpartition(" ")[2]
+        if option in ("--plant", "--recording") and "--config" in known:
+            kind = kind if kind in ("monitor", "study") else "rehearsal" if kind == "rehearse" else "run"
+            return f"; name it in the file for --config, which fdi new {kind} {option} ... writes"
+        if option == "--config" and "--plant" in known and "--recording" in known:
+            return "; name --plant and --recording, whose YAML file may list several"
+        return nearest(option, known)
 
 
 def _whole_number(text: str) -> int:

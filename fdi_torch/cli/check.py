@@ -17,7 +17,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant_file import chosen_plant, placeholders
 from fdi_torch.config.yaml_files import find_plant
 from fdi_torch.names import counted
-from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
+from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, PlantDescription
 from fdi_torch.plant.scales import emptying_time
 from fdi_torch.quantities import display_unit, significant
 from fdi_torch.recordings.csv_writing import header_of
@@ -95,7 +95,7 @@ def _show_plant(plant: PlantDescription, screen: Screen) -> None:
     always = ("tank", "pipe", "pump", "sensor")
     counts = [(plant.tanks, "tank"), *flows, (plant.sensors, "sensor")]
     parts = ", ".join(counted(len(c), what) for c, what in counts if c or what in always)
-    screen.say(f"plant {plant.name}: {parts}, {counted(len(plant.tolerances), 'constant')} with a tolerance")
+    screen.say(f"{plant.title}: {parts}, {counted(len(plant.tolerances), 'constant')} with a tolerance")
     (area, per_area), (height, per_height) = display_unit("m^2"), display_unit("m")
     rows = []
     for tank in plant.tanks:
@@ -110,6 +110,18 @@ def _show_plant(plant: PlantDescription, screen: Screen) -> None:
         )
     header = ("tank", f"area, {area}", f"height, {height}", "volume, l", "empties from full in, s")
     screen.table("", header, rows)
+    if closed := _without_outlet(plant):
+        screen.say(f"- {', '.join(closed)}: no water leaves but over a rim; if there is an outlet, add it under pipes")
+
+
+def _without_outlet(plant: PlantDescription) -> list[str]:
+    """The tanks from which no flow leads outside, by whatever way; a pipe leads both ways unless it falls freely."""
+    flows = [(c.source, c.target) for c in plant.flow_components()]
+    flows += [(p.target, p.source) for p in plant.pipes if not p.free_fall]
+    drained = {OUTSIDE}
+    for _ in plant.tanks:
+        drained |= {source for source, target in flows if target in drained}
+    return [tank.name for tank in plant.tanks if tank.name not in drained]
 
 
 def _show(check: RecordingCheck, screen: Screen) -> None:

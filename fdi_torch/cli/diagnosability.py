@@ -80,6 +80,7 @@ def _show(report: Diagnosability, screen: Screen) -> None:
     screen.table("", header, rows, left=2)
     screen.say()
     screen.say("std error: of all faults estimated together; by correlation: with the correlation as objective")
+    screen.say("-: not determined by these inputs, or not at any size within the fault's range")
     screen.say()
     shows = []
     for name, si_unit, row in zip(report.faults, report.units, report.shows, strict=True):

@@ -13,8 +13,6 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.effects.catalogue import Entry, effects
-from fdi_torch.parameters import Parameter
-from fdi_torch.quantities import display_unit
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -37,7 +35,7 @@ def _show(entry: Entry, of_plant: bool, screen: Screen) -> None:
     screen.say(f"{entry.name}: {entry.meaning}")
     screen.say(f"  location: {entry.where}" + (f": {', '.join(entry.at)}" if of_plant else ""))
     screen.say(f"  acts {entry.begins}")
-    screen.table("", ("parameter", "unit", "nominal", "range", "meaning"), [_row(p) for p in entry.parameters], left=5)
+    screen.table("", ("parameter", "unit", "nominal", "range", "meaning"), [_row(*row) for row in entry.rows()], left=5)
     screen.say(f"  in simulate.faults:     {entry.in_a_run_file}")
     screen.say(f"  in estimate.parameters: {entry.at[0]}.{entry.name}")
     screen.say(f"  in a plant's effects:   {entry.in_a_plant_file}")
@@ -48,11 +46,10 @@ def _show(entry: Entry, of_plant: bool, screen: Screen) -> None:
     screen.say()
 
 
-def _row(parameter: Parameter) -> list[str]:
-    unit, scale = display_unit(parameter.unit)
-    low, high = (f"{scale * v:.4g}" if math.isfinite(v) else "" for v in (parameter.low, parameter.high))
-    ends = f"{low} to {high}" if low and high else f"from {low}" if low else f"to {high}" if high else "any"
-    return [parameter.name, unit or "1", f"{scale * parameter.nominal:.4g}", ends, parameter.meaning]
+def _row(name: str, unit: str, nominal: float, low: float, high: float, meaning: str) -> list[str]:
+    first, last = (f"{v:.4g}" if math.isfinite(v) else "" for v in (low, high))
+    ends = f"{first} to {last}" if first and last else f"from {first}" if first else f"to {last}" if last else "any"
+    return [name, unit, f"{nominal:.4g}", ends, meaning]
 
 
 def _as_json(entry: Entry) -> dict[str, Any]:

@@ -14,20 +14,21 @@ from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import planned_recordings
 from fdi_torch.config.plant_file import chosen_plant
-from fdi_torch.gap.identifiability import Identifiability, planned_identifiability
+from fdi_torch.config.simulation import reading_noise
+from fdi_torch.gap.identifiability import PARTED, Identifiability, planned_identifiability
 from fdi_torch.jobs.gap import library_entries, one_thread
-from fdi_torch.quantities import parse_level_deviation
+from fdi_torch.names import counted
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
-    noise = parse_level_deviation(arguments.noise, "--noise")
     plant = chosen_plant(arguments.plant)
+    noise = reading_noise(arguments.noise, plant)
     planned = planned_recordings(arguments.recording, plant, Path.cwd())[0]
     for note in planned.notes:
         screen.note(note)
     with one_thread():
         limits = planned_identifiability(plant, planned, noise, library_entries(names(arguments.library)) or None)
-    _show(limits, screen)
+    _show(limits, arguments.noise, screen)
     shown = {f"{place}.{name}": residual for (name, place), residual in limits.shown.items()}
     screen.result(
         {"format": "fdi_torch.plan/1", "hidden": limits.hidden, "inseparable": limits.inseparable, "shown": shown}
@@ -35,11 +36,14 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     return DONE
 
 
-def _show(limits: Identifiability, screen: Screen) -> None:
+def _show(limits: Identifiability, noise: str, screen: Screen) -> None:
+    screen.say(
+        f"of {counted(len(limits.shown), 'effect')} at their typical size, {len(limits.hidden) or 'none'} would be "
+        f"hidden by a noise of {noise}; pairs that could not be distinguished: "
+        f"{len(limits.inseparable) or 'none'}"
+    )
     for name, place in limits.hidden:
-        screen.say(f"does not show at its typical size: {effect_words(name, place)}")
+        screen.say(f"hidden: {effect_words(name, place)}")
     for (a, at), (b, there), distance in limits.inseparable:
         both = f"{effect_words(a, at)} and {effect_words(b, there)}"
-        screen.say(f"cannot be distinguished: {both} (chi-square distance {distance:.1f})")
-    if not limits.hidden and not limits.inseparable:
-        screen.say("every effect of the library shows at its typical size and is distinguishable from every other")
+        screen.say(f"not distinguished: {both} (chi-square {distance:.1f}; {PARTED:g} would distinguish them)")

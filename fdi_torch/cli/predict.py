@@ -53,9 +53,16 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     name = Path(recordings[misfits.index(worst)].source).name
     which = [f"of {len(recordings)} free runs, that along {name} is the worst"] if len(recordings) > 1 else []
     doubts = [rim.text for rim in denied_by(plant, recordings)]
-    say_first(worst, screen, doubts=[*which, *doubts])
-    first = f"{arguments.start_samples} samples" if arguments.settle is None else f"{arguments.settle:g} s"
-    screen.say(f"free run of {plant.name}, initial levels from the first {first}")
+    calibrate = ["constants with a tolerance have the values of the plant file here; fdi refit --adopt fits them"]
+    say_first(worst, screen, *(calibrate if plant.tolerances else []), doubts=[*which, *doubts])
+    first = (
+        f"the first {arguments.start_samples} samples"
+        if arguments.settle is None
+        else f"the first {arguments.settle:g} s"
+    )
+    if arguments.settle is None and max(map(len, recordings)) <= arguments.start_samples:
+        first = "all samples: a longer recording would test the prediction"
+    screen.say(f"free run of {plant.name}, initial levels from {first}")
     before = [_predict(other, recording, arguments, vary="") for recording in recordings] if other else []
     own_name, other_name = _names(plant, other, arguments)
     rows = [[own_name, *_row(plant, recording, prediction)] for recording, prediction in predictions]

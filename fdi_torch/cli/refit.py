@@ -28,6 +28,7 @@ from fdi_torch.gap.free_runs.between_runs import between_run_spread
 from fdi_torch.gap.free_runs.prediction import LeftOutRun, leave_one_file_out
 from fdi_torch.gap.free_runs.refit import Refit, refit
 from fdi_torch.jobs.gap import one_thread
+from fdi_torch.names import counted
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_unit, parse_level_deviation
@@ -118,7 +119,7 @@ def _show(result: Refit, before: PlantDescription, screen: Screen) -> None:
         if far > MOVED:
             remarks.append(f"{name} lies {far:.2g} tolerances from its value in the plant file")
     screen.table("fitted to all recordings", ("parameter", "plant file", "fitted", "std error", "unit"), rows)
-    screen.say(f"{result.parameters} values fitted, including initial levels")
+    screen.say(f"{counted(result.parameters, 'value')} fitted, including initial levels")
     values = torch.tensor([value for value, _ in result.fitted.values()], dtype=torch.float64)
     ends = parameters_at_bounds(ParameterSpace([constants[name] for name in result.fitted]), values)
     for remark in [*remarks, *(f"{name} lies at the {end} end of its range" for name, end in ends.items())]:

@@ -16,6 +16,16 @@ from fdi_torch.recordings.csv_tags import tag_columns
 from fdi_torch.recordings.csv_text import HeaderlessError, header_unit, names_in
 from fdi_torch.recordings.source import ChannelSource, ClockSource
 
+KINDS = {
+    "m": "a unit of level such as cm",
+    "Pa": "a unit of pressure such as mbar",
+    "V": "a unit of voltage such as V",
+    "A": "a unit of current such as mA",
+    "1/s": "a unit of frequency such as Hz",
+    "m^3/s": "a unit of flow such as l/min",
+    "1": "a share or %",
+}
+"""SI unit of a channel -> its units in words."""
 ONLY_CLOCK = ("stamps", "zone", "shift", "sort", "period")  # keys that time alone may have
 
 
@@ -89,9 +99,10 @@ def expect_units(source: str, names: Sequence[str], units: Sequence[str], plant:
     for name, unit in zip(names, units, strict=True):
         if unit != expected[name]:
             share = f" ({gains[name]})" if unit == "1" and name in gains else ""
+            got = KINDS.get(unit, unit).partition(" such")[0]
             raise ValueError(
-                f"{source}: {name}: expected a unit of the kind {expected[name]} (plant {plant.name}), "
-                f"got one of the kind {unit}; correct the header, columns, or the gain in the plant file{share}"
+                f"{source}: {name}: expected {KINDS[expected[name]]} ({plant.title}), got {got}; correct the header, "
+                f"columns, or the gain in the plant file{share}"
             )
 
 

@@ -83,7 +83,7 @@ def _recording(kind: str, plant: PlantDescription, name: str, recording: str | N
     to_complete = [] if recording is None or is_query(recording) else mapped(find_data(recording, Path.cwd()), plant)
     columns = to_complete or [
         "# columns:                # for headers of other names",
-        f"#   {plant.sensors[0].column}: {{column: LT-101, unit: mm}}",
+        f"#   {(s := plant.sensors[0]).column}: {{column: LT-101, unit: {display_unit(s.unit, s.column)[0] or 1}}}",
     ]
     if kind == "run":
         crop = ["# start: 60 s             # the first time that is used; stop: the last"]

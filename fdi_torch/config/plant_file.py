@@ -193,8 +193,11 @@ def _plant(config: PlantConfig) -> Plant:
         kind.part(): [_flow_component(kind, name, keys) for name, keys in given.items()]
         for kind, given in flows.items()
     }
+    tanks = [Tank(name, **dict(tank)) for name, tank in config.tanks.items()]
+    for tank in tanks:
+        tank.check_level(tank.start_level, f"tanks.{tank.name}.start_level")
     plant = Plant(
-        tanks=[Tank(name, **dict(tank)) for name, tank in config.tanks.items()],
+        tanks=tanks,
         sensors=[_sensor(name, sensor) for name, sensor in config.sensors.items()],
         gravity=config.gravity,
         name=config.name,

@@ -27,6 +27,7 @@ _UNITS = {
     "1/m": ("1/m", "%/m", "%/cm"),
 }
 """SI unit -> customary units, the usual one first."""
+SMALLEST = 0.01  # number that is written in the unit for display; a smaller one is written in a smaller unit
 
 
 def dump_plant(plant: AnyPlant) -> str:
@@ -106,15 +107,18 @@ def _shares(values: dict[str, float]) -> dict[str, str | float]:
 
 
 def _text(value: float, unit: str, name: str = "") -> str | float:
-    """'160 cm^2': the unit for display, or else the first customary unit, in which the number is short and reads back
-    exactly. A number that is short in none has as many digits as it needs.
+    """'160 cm^2': the unit for display, or else the first customary unit, in which the number is short, at least
+    `SMALLEST`, and reads back exactly. A number that is short in none has as many digits as it needs.
     """
     if unit == "1":
         return value
-    units = dict.fromkeys((display_unit(unit, name)[0], *_UNITS.get(unit, ()), unit))
+    shown, _ = display_unit(unit, name)
+    units = dict.fromkeys((shown, *_UNITS.get(unit, ()), unit))
+    of_its_own = shown != display_unit(unit)[0]  # as of a gain per %, whose command has the unit too
     for digits in range(9, 18):
-        for shown in units:
-            text = f"{value / parse_quantity(f'1 {shown}', unit):.{digits}g} {shown}"
-            if parse_quantity(text, unit) == value:
-                return text
+        numbers = {u: f"{value / parse_quantity(f'1 {u}', unit):.{digits}g}" for u in units}
+        exact = [u for u in units if parse_quantity(f"{numbers[u]} {u}", unit) == value]
+        large = [u for u in exact if abs(float(numbers[u])) >= SMALLEST or of_its_own or digits > 9]
+        if best := [*large, *exact]:
+            return f"{numbers[best[0]]} {best[0]}"
     return f"{value!r} {unit}"

@@ -8,6 +8,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from fdi_torch.quantities import NO_COMMAS
+
 
 class ConfigError(ValueError):
     """A configuration that cannot be used. problems: one sentence each; the message has one sentence per line."""
@@ -59,13 +61,22 @@ def _sentence(finding: Any, known: Mapping[str, str]) -> str:
         meaning = known.get(".".join(map(str, finding["loc"])))
         return "expected a value, got nothing; add it" + (f" ({meaning})" if meaning else "")
     if "error" in finding.get("ctx", {}):
-        return f"{finding['ctx']['error']}{_elsewhere(finding['ctx']['error'], known)}"
+        hint = _comma(finding["loc"][-1:]) if finding["input"] is None else ""
+        return f"{finding['ctx']['error']}{hint}{_elsewhere(finding['ctx']['error'], known)}"
     if finding["type"] in ("list_type", "tuple_type"):
         given = finding["input"]
         values = ", ".join(map(str, given.values())) if isinstance(given, dict) else str(given).partition("\n")[0]
-        return f"expected a list, as in [{values}], got {_shown(given)}"
+        meaning = known.get(".".join(map(str, finding["loc"])), "")
+        example = "" if "as in [" in meaning else f", as in [{values}]"
+        return f"expected a list{example}, got {_shown(given)}" + (f" ({meaning})" if meaning else "")
     if finding["type"] in ("dict_type", "model_type"):
-        return f"expected keys with values, got {_shown(finding['input'])}"
+        given = finding["input"]
+        example = f", as in {{NAME: {given}}}" if finding["type"] == "dict_type" and isinstance(given, str) else ""
+        return f"expected keys with values{example}, got {_shown(given)}"
+    if finding["type"] == "too_long":
+        return (
+            f"expected {finding['ctx']['max_length']} values, got {_shown(finding['input'])}{_comma(finding['input'])}"
+        )
     expected = finding["msg"].replace("Input should be", "expected").replace("Input should have", "expected")
     return f"{expected}, got {_shown(finding['input'])}"
 
@@ -75,10 +86,16 @@ def _elsewhere(error: Exception, known: Mapping[str, str]) -> str:
         return ""
     if ":" in error.key:
         return "; part key and value by a colon and a space"
-    if error.key[:1].isdigit():
-        return "; a comma ends a value: write decimals with a point"
+    if comma := _comma([error.key]):
+        return comma
     places = [path for path in known if path.rpartition(".")[2] == error.key and "NAME." not in path]
     return f"; there is {' and '.join(places)}" if places else ""
+
+
+def _comma(parts: Sequence[Any]) -> str:
+    """A hint if the last of some parts of YAML, as '5 l/min' of '1,5 l/min', follows a comma within a number."""
+    last = parts[-1] if parts else ""
+    return f"; a comma ends a value: {NO_COMMAS}" if isinstance(last, str) and last[:1].isdigit() else ""
 
 
 def _shown(value: Any) -> str:

@@ -41,8 +41,8 @@ class RunConfig(Strict):
     @model_validator(mode="after")
     def _one_source(self) -> RunConfig:
         if bool(self.recordings) == (self.simulate is not None):
-            got = "both" if self.recordings else "neither"
-            raise ValueError(f"expected either recordings or simulate, got {got}; keep one")
+            got = "both; keep one" if self.recordings else "neither; add one"
+            raise ValueError(f"expected either recordings or simulate, got {got}")
         return self
 
 

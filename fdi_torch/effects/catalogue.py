@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,7 @@ from fdi_torch.parameters import Parameter
 from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Effect, fits, place_kinds_of
 from fdi_torch.quantities import quantity_text
-from fdi_torch.tables import Shown, Table, in_its_units
+from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
 
 # A rig with every kind of place, the default if no plant is given.
 _FURTHER: dict[str, Any] = {
@@ -33,8 +34,8 @@ _ANY = PlantDescription(
 class Entry(Shown):
     """One effect of the catalogue.
 
-    meaning: one sentence. law: equation and source. kinds: kinds of component. at: the places of the plant. parameters:
-    size first, with unit, nominal value, range and meaning, in SI.
+    meaning: one sentence. law: equation and source. kinds: kinds of component. by_place: the parameters at each place
+    of the plant, size first, with unit, nominal value, range and meaning, in SI.
     """
 
     name: str
@@ -42,9 +43,17 @@ class Entry(Shown):
     law: str
     stage: str
     kinds: tuple[str, ...]
-    at: tuple[str, ...]
-    parameters: tuple[Parameter, ...]
+    by_place: Mapping[str, tuple[Parameter, ...]]
     mistaken_for: tuple[str, ...]
+
+    @property
+    def at(self) -> tuple[str, ...]:
+        return tuple(self.by_place)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The parameters at the first place."""
+        return self.by_place[self.at[0]]
 
     @property
     def headline(self) -> str:
@@ -84,12 +93,26 @@ class Entry(Shown):
             up, down = parameter.high - value, value - parameter.low
             reach = up if up >= down or value == 0.0 else -down
             value += 0.1 * (reach if abs(reach) < 1e6 else 1.0)
-        return quantity_text(value, parameter.unit, 3)
+        return quantity_text(value, parameter.unit, 3, f"{self.at[0]}.{self.name}.{parameter.name}")
+
+    @in_its_units
+    def rows(self) -> list[tuple[str, str, float, float, float, str]]:
+        """Name, unit for display, nominal value, lowest, highest and meaning of each parameter; of one with several
+        units, as readings of sensors have, a row for each, with its places.
+        """
+        rows = []
+        for of_places in zip(*self.by_place.values(), strict=True):
+            by_unit: dict[str, tuple[list[str], tuple[float, ...]]] = {}
+            for place, p in zip(self.at, of_places, strict=True):
+                unit, *numbers = in_display_unit(f"{place}.{self.name}.{p.name}", p.unit, p.nominal, p.low, p.high)
+                by_unit.setdefault(unit, ([], tuple(numbers)))[0].append(place)
+            for unit, (places, (nominal, low, high)) in by_unit.items():
+                where = f" at {', '.join(places)}" if len(by_unit) > 1 else ""
+                rows.append((f"{of_places[0].name}{where}", unit, nominal, low, high, of_places[0].meaning))
+        return rows
 
     def table(self) -> Table:
-        """One row per parameter, SI."""
-        rows = [(p.name, p.unit, p.nominal, p.low, p.high, p.meaning) for p in self.parameters]
-        return Table.of_rows(("parameter", "unit", "nominal", "lowest", "highest", "meaning"), rows)
+        return Table.of_rows(("parameter", "unit", "nominal", "lowest", "highest", "meaning"), self.rows())
 
 
 @dataclass(frozen=True, repr=False)
@@ -146,8 +169,7 @@ def _entry(each: Effect, plant: PlantDescription) -> Entry | None:
         inspect.cleandoc(type(each).__doc__ or ""),
         each.stage.value,
         place_kinds_of(each),
-        at,
-        each.parameters(at[0], plant),
+        {place: each.parameters(place, plant) for place in at},
         each.mistaken_for,
     )
 

@@ -212,7 +212,7 @@ def start_levels(
     by_tank = start if isinstance(start, Mapping) else {tank.name: start for tank in plant.tanks}
     unknown = set(by_tank) - {tank.name for tank in plant.tanks}
     if unknown:
-        raise ValueError(f"start levels: expected tanks of plant {plant.name}, got {', '.join(sorted(unknown))}")
+        raise ValueError(f"start levels: expected tanks of {plant.title}, got {', '.join(sorted(unknown))}")
     rest_levels = first_levels = None
     levels, free = [], []
     for i, tank in enumerate(plant.tanks):
@@ -230,9 +230,7 @@ def start_levels(
             levels.append(float(rest_levels[i]))
         else:
             level = float(tank.start_level or 0.0) if isinstance(choice, str) else choice
-            if not 0.0 <= level <= tank.height:
-                rim, given = (quantity_text(each, "m") for each in (tank.height, level))
-                raise ValueError(f"start level of {tank.name}: expected a level from the floor to {rim}, got {given}")
+            tank.check_level(level, f"start level of {tank.name}")
             levels.append(level)
     return torch.tensor(levels, dtype=torch.float64), free
 

@@ -66,9 +66,9 @@ def identifiability(pairs: Pairs, plant: PlantDescription) -> Identifiability:
 
 
 def planned_identifiability(
-    plant: PlantDescription, recording: Recording, noise: float, library: Sequence[str] | None = None
+    plant: PlantDescription, recording: Recording, noise: Sequence[float], library: Sequence[str] | None = None
 ) -> Identifiability:
-    """Identifiability under planned inputs; readings are ignored. noise: standard deviation of a sensor's level, m."""
+    """Identifiability under planned inputs; readings are ignored. noise: standard deviation of each sensor, SI."""
     nominal_effects = effects_of(plant)
     step = float(torch.median(torch.diff(recording.time)))
     fitter = _noise_free(plant, nominal_effects, recording, step, noise)
@@ -80,15 +80,18 @@ def planned_identifiability(
 
 
 def _noise_free(
-    plant: PlantDescription, nominal_effects: Sequence[Placement], recording: Recording, step: float, noise: float
+    plant: PlantDescription,
+    nominal_effects: Sequence[Placement],
+    recording: Recording,
+    step: float,
+    noise: Sequence[float],
 ) -> Fitter:
     """A fitter whose readings are the plant file's prediction, from its initial levels or from rest."""
     blank = recording.time.new_zeros(len(recording), len(plant.sensors))
     names, units = plant.outputs(), tuple(plant.output_units().values())
     planned = replace(recording, outputs=blank, output_names=names, output_units=units, mask=torch.isfinite(blank))
     data = data_set_of(plant, nominal_effects, planned, step)
-    std = noise * torch.tensor([abs(s.gain) for s in plant.sensors], dtype=torch.float64)
-    white = Noise.white(std)
+    white = Noise.white(torch.tensor(noise, dtype=torch.float64))
     engine = Fitter(data, white).engine(Candidate(), ())
     theta = engine.space.nominal().unsqueeze(0)
     readings = engine.converge(theta).readings[0]

@@ -57,7 +57,7 @@ def _known(entry: str, place: str, plant: PlantDescription) -> str:
     turned = {f"{b}-{a}": f"{a}-{b}" for a, b in plant.tank_pairs()}
     if (name := turned.get(place, place)) in plant.locations():
         return name
-    raise ValueError(f"library: {entry}: {unknown(f'a place of plant {plant.name}', place, plant.locations())}")
+    raise ValueError(f"library: {entry}: {unknown(f'a place of {plant.title}', place, plant.locations())}")
 
 
 def possible_places(plant: PlantDescription) -> tuple[str, ...]:

@@ -45,12 +45,13 @@ def silent(share: float | None, text: str) -> None:
     """Ignore progress messages."""
 
 
-def _keys(run: Any) -> Mapping[str, Any]:
-    """The keys of a run, monitor or study file. Raises TypeError for anything but a mapping."""
+def _keys(run: Any, advice: str = "name its recordings as the next argument; ") -> Mapping[str, Any]:
+    """The keys of a run, monitor or study file. Raises TypeError for anything but a mapping. advice: for a plant."""
     if not isinstance(run, Mapping):
+        advice = advice if isinstance(run, PlantDescription) else ""
         raise TypeError(
             f"expected the name of a file, or its keys as in {{'plant': plant, ...}}, got a {type(run).__name__}; "
-            "help() of the function has an example"
+            f"{advice}help() of the function has an example"
         )
     return run
 
@@ -65,7 +66,10 @@ def _run_of(run: Any, job: str) -> Run:
 def _plant_and_recordings(plant: Any, recordings: Any, job: str) -> tuple[PlantDescription, list[Recording]]:
     """A plant and segments of its recordings, given apart or, without recordings, as a run."""
     if recordings is not None:
-        return (of := chosen_plant(plant)), recordings_of(recordings, of)
+        segments = recordings_of(recordings, of := chosen_plant(plant))
+        if not segments:
+            raise ValueError(f"{job}: expected a recording with at least two samples, got none")
+        return of, segments
     run = _run_of(plant, job)
     if run.config.simulate is not None:
         return run.plant, [simulate_recording(run)]
@@ -112,10 +116,12 @@ def train(
     tell: Tell | None = None,
     resume: bool = False,
     listener: Any = None,
+    **keys: Any,
 ) -> train_job.TrainResult:
     """Estimate fault sizes and their uncertainty from recordings, as `fdi train` does, with a log and pictures.
 
-    parameters: to be estimated, such as ["T1.leak"]. plant: without recordings, a run: its file, or its keys such as
+    parameters: to be estimated, such as ["T1.leak"]. keys: others of a run file, such as output={"folder": "results"};
+    estimate={"draws": 1000} beside the parameters. plant: without recordings, a run: its file, or its keys such as
     {"plant": plant, "recordings": [recording], "estimate": {"parameters": ["T1.leak"]}}; None: the built-in example.
     resume: continue a killed run of the same file. listener: receives every log message. tell(share, text): receives
     the progress, from 0 to 1, and a line about it; by default nothing is shown, and tell=print prints it. Raises
@@ -124,9 +130,11 @@ def train(
     run: Any = plant
     if recordings is not None:
         listed = recordings if isinstance(recordings, list | tuple) else [recordings]
-        run = {"plant": plant, "recordings": listed, "estimate": {"parameters": parameters or ()}}
-    elif parameters is not None:
-        raise TypeError("train: expected recordings beside the parameters, got none; name them, or give a run alone")
+        estimate = {**keys.pop("estimate", {}), **({} if parameters is None else {"parameters": parameters})}
+        run = {"plant": plant, "recordings": listed, "estimate": estimate, **keys}
+    elif parameters is not None or keys:
+        given = ", ".join(["the parameters"] * (parameters is not None) + [*keys])
+        raise TypeError(f"train: expected recordings beside {given}, got none; name them, or give a run alone")
     return train_job.train(_run_of(run, "train"), tell, resume, listener)
 
 
@@ -256,7 +264,7 @@ def study(
     if isinstance(study, str | Path):
         study = load_study(study)
     elif not isinstance(study, Study):
-        study = build_study(_keys(study), Path.cwd(), "study")
+        study = build_study(_keys(study, advice=""), Path.cwd(), "study")
     return study_job.run_study(study, resume, cluster, tell)
 
 

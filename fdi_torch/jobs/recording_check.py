@@ -8,6 +8,7 @@ from pathlib import Path
 from fdi_torch.config.loaded_recordings import known_segments_of, read_recording
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.gap.preprocess.acquisition import examined
+from fdi_torch.gap.problem import LEAST
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import RecordingCheck, check_recording
@@ -21,13 +22,18 @@ def checked(config: RecordingConfig, plant: PlantDescription, base: Path) -> tup
     examinations = [examined(plant, part, thorough=True) for part in whole.known_segments()]
     problems = []
     for fault in (e.fault for e in examinations if e.fault):
-        channels = ", ".join(fault.channels)
-        problems.append(ChannelFinding("slip", channels, fault.text.removeprefix(f"{channels}: ")))
+        channels, pair = ", ".join(fault.channels), " and ".join(fault.channels)
+        text = fault.text.removeprefix(f"{channels}: ").removeprefix(f"{pair} ")
+        problems.append(ChannelFinding("slip", channels, text))
     problems += [
         ChannelFinding("stuck", s.sensor.column, s.text, {"start": s.start, "stop": s.stop})
         for e in examinations
         for s in e.stuck
     ]
+    for name, count in zip(whole.output_names, whole.mask.sum(dim=0).tolist(), strict=True):
+        if count < LEAST:
+            text = f"{count} readings: fdi gap and fdi refit expect at least {LEAST}, of all recordings together"
+            problems.append(ChannelFinding("few", name, text, {"count": count}))
     refused = {channel for e in examinations if e.fault for channel in e.fault.channels}
     doubts = [f for f in check.findings if not (f.kind == "undersampled" and f.channel in refused)]
     beyond = [f for f in doubts if f.kind == "range"]

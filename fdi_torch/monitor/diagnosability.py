@@ -43,8 +43,9 @@ class Diagnosability:
     (F, F): sine of the angle between two signatures; 0: not separable. structurally_apart: structural isolability.
     rank: number of determined combinations of faults. std (F): Cramer-Rao bound if all are estimated together; infinite
     if not determined. std_by_correlation: the same if gain and offset of each channel are free, as for a correlation.
-    smallest_detectable (F): size detected with the given error rates if time and kind are known. smallest_isolable (F):
-    size that is distinguished from any other single fault. groups: faults that cannot be distinguished, and why.
+    smallest_detectable (F): size detected with the given error rates if time and kind are known; infinite beyond the
+    fault's range. smallest_isolable (F): size that is distinguished from any other single fault. groups: faults that
+    cannot be distinguished, and why.
     """
 
     faults: tuple[str, ...]
@@ -95,9 +96,16 @@ def diagnosability(
     signatures = without_constants(scaled, count, fitting.space.std(theta))
     apart = sines(signatures)
     length = torch.linalg.vector_norm(signatures, dim=0)
-    nearest = (apart + torch.eye(count, dtype=apart.dtype)).amin(dim=1) if count > 1 else torch.ones(1)
     structural = structure_of(plant, placements_for(faults)).isolable()
     prefixes = [ParameterName.parse(name).prefix for name in faults]
+    nominal, low, high = (
+        each(theta)[:count] for each in (fitting.space.nominal, fitting.space.low, fitting.space.high)
+    )
+    largest = torch.maximum(high - nominal, nominal - low)
+    detectable = _limits(length, length, largest)
+    shown = detectable < torch.inf
+    itself_or_hidden = torch.eye(count, dtype=torch.bool) | ~shown  # the direction of a hidden signature is rounding
+    nearest = torch.where(itself_or_hidden, 1.0, apart).amin(dim=1)
     return Diagnosability(
         faults=tuple(faults),
         units=tuple(p.unit for p in fitting.space)[:count],
@@ -105,14 +113,14 @@ def diagnosability(
         shows=_rows(torch.linalg.vector_norm(scaled[..., :count], dim=0).mT),
         apart=_rows(apart),
         structurally_apart=tuple(tuple(structural[f].get(g, False) for g in prefixes) for f in prefixes),
-        rank=int((torch.linalg.svdvals(signatures / length.clamp(min=1e-300)) > SAME).sum()),
-        std=tuple(joint.std[:count].tolist()),
-        std_by_correlation=tuple(correlation_certainty.std[:count].tolist()),
-        smallest_detectable=_limits(length, length),
-        smallest_isolable=_limits(length * nearest, length),
+        rank=int((torch.linalg.svdvals((signatures / length)[:, shown]) > SAME).sum()) if bool(shown.any()) else 0,
+        std=tuple(torch.where(shown, joint.std[:count], torch.inf).tolist()),
+        std_by_correlation=tuple(torch.where(shown, correlation_certainty.std[:count], torch.inf).tolist()),
+        smallest_detectable=tuple(detectable.tolist()),
+        smallest_isolable=tuple(_limits(length * nearest, length, largest).tolist()),
         groups=tuple(_groups(plant, faults, apart)),
         remarks=tuple(g.sentence for g in undetermined_groups(fitting.space, theta, joint))
-        + _remarks(readings, length, faults),
+        + _remarks(readings, shown, faults),
     )
 
 
@@ -186,19 +194,20 @@ def _reason(plant: PlantDescription, members: Sequence[str]) -> str:
     return "their signatures are the same under these inputs; other inputs or sensors may distinguish them"
 
 
-def _remarks(readings: Tensor, length: Tensor, faults: Sequence[str]) -> tuple[str, ...]:
-    invisible = [name for name, size in zip(faults, length.tolist(), strict=True) if not size > 0]
+def _remarks(readings: Tensor, shown: Tensor, faults: Sequence[str]) -> tuple[str, ...]:
+    invisible = [name for name, shows in zip(faults, shown.tolist(), strict=True) if not shows]
     constant = (readings.amax(0) - readings.amin(0) <= CONSTANT * readings.abs().amax(0)).nonzero().flatten().tolist()
-    remarks = [f"{name} does not show in any reading" for name in invisible]
+    remarks = [f"{name} does not show in any reading at any size of its range" for name in invisible]
     if constant:
         numbers = ", ".join(str(c + 1) for c in constant)
         remarks.append(f"without a fault reading {numbers} is constant: its correlation is undefined")
     return tuple(remarks)
 
 
-def _limits(length: Tensor, whole: Tensor) -> tuple[float, ...]:
-    nonzero = length > SAME * whole
-    return tuple(torch.where(nonzero, REACH / torch.where(nonzero, length, 1.0), torch.inf).tolist())
+def _limits(length: Tensor, whole: Tensor, largest: Tensor) -> Tensor:
+    """Sizes (F,) whose signature has the length REACH; infinite beyond the largest size of a fault."""
+    sizes = torch.where(length > SAME * whole, REACH / length, torch.inf)
+    return torch.where(sizes <= largest, sizes, torch.inf)
 
 
 def _rows(table: Tensor) -> tuple[tuple[float, ...], ...]:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.monitor.detection import DRIFT, Detector
-from fdi_torch.monitor.events import percent_text, size_of
+from fdi_torch.monitor.events import Explanation, percent_text, size_of
 from fdi_torch.monitor.hypothesis import Fault
 from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.noise_model import NoiseModel, operating_point
@@ -80,8 +80,9 @@ def fault_warnings(
     p, size, error = space.parameters[columns[0]], float(best.value[columns[0]]), float(best.std[columns[0]])
     if abs(size - p.nominal) < SIGNIFICANT * error:
         return []
-    fault = f"{size_of(p, size, error).shown} since {best.onset:.0f} s, probability {percent_text(best.probability)}"
-    return [f"{fault}, explains the part taken for fault-free: {QUESTION}"]
+    fault = Explanation(best.probability, (size_of(p, size, error),)).text
+    since = f"since {best.onset:.0f} s, probability {percent_text(best.probability)}"
+    return [f"{fault} {since}, explains the part taken for fault-free: {QUESTION}"]
 
 
 def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from fdi_torch.quantities import parse_quantity
+from fdi_torch.quantities import parse_quantity, quantity_text
 from fdi_torch.recording import LARGEST as LARGEST_QUANTITY
 
 OUTSIDE = "outside"
@@ -110,6 +110,17 @@ class Tank(Component):
     )
     overflow_to: str = word_field("the tank that receives the overflow", default=OUTSIDE)
     leak_reference: str | None = word_field("the pipe whose capacity is a leak of size 1", default=None)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if "start_level" in self.written:
+            self.check_level(self.start_level, f"tanks.{self.name}.start_level")
+
+    def check_level(self, level: float | None, place: str) -> None:
+        """Raise ValueError, naming `place`, for an initial level (m) below the floor or above the rim."""
+        if level is not None and not 0.0 <= level <= self.height:
+            rim, given = quantity_text(self.height, "m"), quantity_text(level, "m")
+            raise ValueError(f"{place}: expected a level from the floor to {rim}, got {given}")
 
 
 @dataclass(frozen=True)

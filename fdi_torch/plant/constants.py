@@ -50,9 +50,7 @@ def constant_parameters(plant: PlantDescription) -> Iterator[Parameter]:
         )
     yield Parameter("gravity", "m/s^2", plant.gravity, 0.0)
     if tolerances:
-        raise ValueError(
-            f"plant {plant.name}: tolerances: expected constants of the plant, got {', '.join(tolerances)}"
-        )
+        raise ValueError(f"{plant.title}: tolerances: expected constants of the plant, got {', '.join(tolerances)}")
 
 
 def _positive(component: str, field: str, unit: str, value: float, tolerances: dict[str, float]) -> Parameter:

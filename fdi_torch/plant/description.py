@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from fdi_torch.names import nearest
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.components import COMMAND_UNITS, OUTSIDE, READING_UNITS, Component, Sensor, Tank
 from fdi_torch.plant.description_checks import check_names, check_numbers, check_references
@@ -106,6 +107,11 @@ class PlantDescription:
         check_references(self)
         check_numbers(self)
 
+    @property
+    def title(self) -> str:
+        """'plant bench' in messages; 'plant' for a plant without a name."""
+        return "plant" if self.name in ("", "plant") else f"plant {self.name}"
+
     def components(self) -> Iterator[Tank | FlowComponent | Sensor]:
         yield from self.tanks
         yield from self.flow_components()
@@ -133,7 +139,8 @@ class PlantDescription:
         for component in self.components():
             if component.name == name:
                 return component
-        raise ValueError(f"plant {self.name}: expected one of {', '.join(self.locations())}, got {name}")
+        near = nearest(name, (component.name for component in self.components()))
+        raise ValueError(f"{self.title}: expected one of {', '.join(self.locations())}, got {name}{near}")
 
     def tank(self, name: str) -> Tank:
         return self._of_kind(Tank, name)
@@ -153,7 +160,7 @@ class PlantDescription:
     def _of_kind(self, kind: type[Kind], name: str) -> Kind:
         component = self.component(name)
         if not isinstance(component, kind):
-            raise ValueError(f"plant {self.name}: expected the name of a {kind.__name__}, got {name}")
+            raise ValueError(f"{self.title}: expected the name of a {kind.__name__}, got {name}")
         return component
 
     def tank_pairs(self) -> tuple[tuple[str, str], ...]:

@@ -17,11 +17,11 @@ SMALLEST, LARGEST = 1e-12, 1e9
 def check_names(plant: PlantDescription) -> None:
     """Raise ValueError for a plant without tanks, or with a name that is used twice."""
     if not plant.tanks:
-        raise ValueError(f"plant {plant.name}: expected at least one tank, got none; add one under tanks")
+        raise ValueError(f"{plant.title}: expected at least one tank, got none; add one under tanks")
     seen: set[str] = {OUTSIDE}
     for name in plant.locations():
         if name in seen:
-            raise ValueError(f"plant {plant.name}: expected each name once, got '{name}' twice; rename one")
+            raise ValueError(f"{plant.title}: expected each name once, got '{name}' twice; rename one")
         seen.add(name)
 
 
@@ -32,7 +32,7 @@ def check_references(plant: PlantDescription) -> None:
     def expect_tank(place: str, name: str, also: tuple[str, ...] = ()) -> None:
         if name not in (*tanks, *also):
             known = ", ".join((*tanks, *also))
-            raise ValueError(f"plant {plant.name}: {place}: expected one of the tanks {known}, got '{name}'")
+            raise ValueError(f"{plant.title}: {place}: expected one of the tanks {known}, got '{name}'")
 
     for component in plant.flow_components():
         place = f"{component.part()}.{component.name}"
@@ -40,7 +40,7 @@ def check_references(plant: PlantDescription) -> None:
             expect_tank(f"{place}.source", component.source)
         expect_tank(f"{place}.target", component.target, () if component.source == OUTSIDE else (OUTSIDE,))
         if component.source == component.target:
-            raise ValueError(f"plant {plant.name}: {place}: expected two different ends, got {component.source} twice")
+            raise ValueError(f"{plant.title}: {place}: expected two different ends, got {component.source} twice")
     for sensor in plant.sensors:
         expect_tank(f"sensors.{sensor.name}.tank", sensor.tank)
     for tank in plant.tanks:
@@ -49,7 +49,7 @@ def check_references(plant: PlantDescription) -> None:
         if tank.leak_reference is not None and tank.leak_reference not in pipes:
             known = ", ".join(pipes) or "(the plant has none)"
             raise ValueError(
-                f"plant {plant.name}: tanks.{tank.name}.leak_reference: expected one of the pipes {known}, "
+                f"{plant.title}: tanks.{tank.name}.leak_reference: expected one of the pipes {known}, "
                 f"got '{tank.leak_reference}'"
             )
 
@@ -65,19 +65,17 @@ def check_numbers(plant: PlantDescription) -> None:
     positive += [("gravity", plant.gravity, "m/s^2")]
     for field_name, value, unit in positive:
         if not value > 0:
-            raise ValueError(
-                f"plant {plant.name}: {field_name}: expected a positive number, got {value} {unit}".rstrip()
-            )
+            raise ValueError(f"{plant.title}: {field_name}: expected a positive number, got {value} {unit}".rstrip())
         if not SMALLEST <= value <= LARGEST:
             raise ValueError(
-                f"plant {plant.name}: {field_name}: expected {SMALLEST:g} to {LARGEST:g} {unit}, got {value:g}; "
+                f"{plant.title}: {field_name}: expected {SMALLEST:g} to {LARGEST:g} {unit}, got {value:g}; "
                 "is its unit right?"
             )
     for component in plant.flow_components():
         for problem in component.problems():
-            raise ValueError(f"plant {plant.name}: {component.part()}.{component.name}.{problem}")
+            raise ValueError(f"{plant.title}: {component.part()}.{component.name}.{problem}")
     for sensor in plant.sensors:
-        place = f"plant {plant.name}: sensors.{sensor.name}"
+        place = f"{plant.title}: sensors.{sensor.name}"
         if sensor.gain == 0:
             raise ValueError(f"{place}.gain: expected a number other than 0, got 0")
         if sensor.low is not None and sensor.high is not None and not sensor.low < sensor.high:

@@ -25,14 +25,17 @@ from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_LINE, MOST_UNPACKED, 
 
 @lru_cache(maxsize=1024)
 def header_unit(header: str) -> tuple[str, str] | None:
-    """Split a CSV header of the form name_unit, name [unit] or name (unit): 'Q1_cm3_s' -> ('Q1', 'cm3_s'); None without
-    a unit.
+    """Split a CSV header of the form name_unit, name [unit], name (unit), name in unit or name / unit:
+    'Q1_cm3_s' -> ('Q1', 'cm3_s'); None without a unit.
 
     The shortest name followed by a unit wins: `qL_cmd_lps` is (`qL_cmd`, `lps`), `Q1_cm3_s` is (`Q1`, `cm3_s`).
     `tank_A` is a name without unit: write amperes as mA, or in brackets.
     """
     cuts = [i for i in range(max(0, len(header) - MOST_CHARACTERS - 1), len(header)) if header[i] == "_"]
-    splits = [(header[:i], header[i + 1 :]) for i in cuts if header[i + 1 :] != "A"]
+    splits = [
+        (name.rstrip(), unit.strip()) for name, _, unit in (header.rpartition(s) for s in (" in ", " / ")) if name
+    ]
+    splits += [(header[:i], header[i + 1 :]) for i in cuts if header[i + 1 :] != "A"]
     for name, unit in [bracketed] if (bracketed := _bracketed(header)) else splits:
         try:
             si_unit_of(unit)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
+from fdi_torch.effects import EFFECTS
 from fdi_torch.logbook import Comparison, align
+from fdi_torch.names import listed
+from fdi_torch.parameters import ParameterName
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.comparison_headline import comparison_headline, left_out_words, setting_differences
 from fdi_torch.report.html import folded, short, table, tag
@@ -18,6 +22,7 @@ from fdi_torch.report.section import Picture, Section, signals
 from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT
 
 MOST_LETTERS = 160  # of a setting or result that differs; a longer one, such as a covariance, is cut
+PIPE_CAPACITY = re.compile(r"plant\.pipes\..*\.(area|discharge_coefficient)")
 COLOURS = (MODEL, MARK, OTHER, SOFT)
 CURVES = {
     "/estimator/de/generation": ("Search", "generation", "best_cost"),
@@ -58,9 +63,20 @@ def in_words(compared: Comparison) -> list[str]:
     apart = [result.name for result in compared.results if result.agree is False]
     if any(result.agree is not None for result in compared.results):
         words.append(f"At 95 % these differ: {', '.join(apart)}." if apart else "At 95 % the results agree.")
+    shares = [name for name in apart if _is_capacity_share(ParameterName.parse(name))]
+    pipes = [key for key in compared.differences.get("config", {}) if PIPE_CAPACITY.fullmatch(key)]
+    if shares and pipes:
+        words.append(
+            f"{listed(shares)}: relative to the capacity of a pipe in the plant file; {listed(pipes)} differs."
+        )
     if compared.same_data and words:
         words.append("All runs read the same data, so their errors are not independent.")
     return words
+
+
+def _is_capacity_share(name: ParameterName) -> bool:
+    """Whether a parameter is the size of an effect, such as a leak, that is relative to the capacity of a pipe."""
+    return name.field == "size" and any(e.capacity_share for e in EFFECTS if e.name == name.effect)
 
 
 def result_table(compared: Comparison) -> tuple[list[str], list[list[str]]]:

@@ -130,7 +130,8 @@ def label_lines(axes: Axes, columns: int = 4) -> None:
 
 def set_title(figure: Figure, title: str) -> None:
     """Set the title over all panels, broken into lines that fit the figure's width."""
-    figure.suptitle(fill(short(title, MOST_TITLE), int(LETTERS_AN_INCH * figure.get_figwidth())))
+    together = short(title, MOST_TITLE).replace(" ± ", "\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}")
+    figure.suptitle(fill(together, int(LETTERS_AN_INCH * figure.get_figwidth())))
 
 
 def save(figure: Figure, path: Path) -> Path:

@@ -53,6 +53,6 @@ def equilibrium(network: TankNetwork, inputs: Float[Tensor, " channels"]) -> Flo
     worst = int(rate.abs().argmax())
     name = plant.tanks[worst].name
     raise ValueError(
-        f"plant {plant.name}: expected a steady state under the first inputs, but the level of tank {name} keeps "
+        f"{plant.title}: expected a steady state under the first inputs, but the level of tank {name} keeps "
         "changing; give its start_level"
     )

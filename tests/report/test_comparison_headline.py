@@ -9,7 +9,9 @@ import pytest
 
 from fdi_torch import cli
 from fdi_torch.jobs.report import report
-from fdi_torch.logbook import RunLog, compare, read_run
+from fdi_torch.logbook import Comparison, RunLog, compare, read_run
+from fdi_torch.logbook.compare import Result
+from fdi_torch.report.comparison import in_words
 from fdi_torch.report.comparison_headline import comparison_headline, plain_text, setting_differences
 from fdi_torch.report.material import gather
 from fdi_torch.report.predictions import residual_size
@@ -210,3 +212,19 @@ def test_terminal_and_page_lead_with_the_headline(tmp_path: Path, capsys: pytest
     assert said.startswith("b explains the recording best") and "sha256" not in said
     page = report(logs).page.read_text()
     assert page.index("b explains the recording best") < page.index("<svg")
+
+
+@pytest.mark.parametrize(
+    ("setting", "name", "said"),
+    [
+        ("plant.pipes.P13.discharge_coefficient", "T1.leak.size", True),
+        ("plant.pipes.P13.elevation", "T1.leak.size", False),
+        ("plant.pipes.P13.discharge_coefficient", "P13.plugging.size", False),
+    ],
+)
+def test_leaks_relative_to_another_capacity_are_not_compared_unsaid(setting: str, name: str, said: bool) -> None:
+    result = Result(name, "1", (0.150, 0.155), (2e-4, 2e-4), 1e-9)
+    compared = Comparison(("a", "b"), {"config": {setting: ("0.6", "0.62")}}, (result,), False, True)
+    _, *others = in_words(compared)
+    explained = f"{name}: relative to the capacity of a pipe in the plant file; {setting} differs."
+    assert (explained in others) is said

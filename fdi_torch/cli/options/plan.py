@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_library(parser)
     parser.add_argument(
         "--noise",
-        metavar="STD",
+        metavar="AMOUNT",
         default=NOISE,
-        help=f"standard deviation of the sensors' noise, as a level ({NOISE})",
+        help=f"standard deviation of the readings: as a level ({NOISE}), or 'h1 = 1 mm, p2 = 2 mV'",
     )

@@ -30,6 +30,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.scales import length_scale
 from fdi_torch.recording import Recording
+from fdi_torch.sample_noise import sample_noise
 from fdi_torch.simulate.collocation import Collocation
 
 START_SAMPLES = 50  # for the initial levels
@@ -127,7 +128,9 @@ def _run(data: DataSet, start_samples: int, skipped: int) -> Prediction:
     if not bool(early.any()):
         source = data.recording.source
         raise ValueError(f"{source}: expected readings among the first {start_samples} samples, got none")
-    fitter = Fitter(replace(data, mask=early), Noise.rough(data.readings))
+    # A sensor whose readings hardly move is no more accurate for that: its noise must not dwarf that of the others.
+    noise = Noise.rough(data.readings).at_least(sample_noise(data.readings, data.mask.to(data.readings)))
+    fitter = Fitter(replace(data, mask=early), noise)
     engine, theta = _start_from_segment(fitter, skipped) if skipped else _start_from_samples(fitter)
     run = engine.converge(theta)
     readings = run.readings[0]

@@ -26,9 +26,8 @@ def wrong_unit(channel: str, decade: int) -> RecordingFault:
     """The values of a channel are 10^decade times the true ones."""
     times = f"{10 ** abs(decade)} times too {'large' if decade > 0 else 'small'}"
     fix = f"columns: {{{channel}: {{unit: ...}}}}"
-    return RecordingFault(
-        (channel,), f"{channel}: its unit seems wrong: its values are {times}; state the unit under {fix}"
-    )
+    text = f"its unit seems wrong: its values are {times}; state the unit under {fix}"
+    return RecordingFault((channel,), f"{channel}: {text}, or correct its gain in the plant file")
 
 
 def swapped(a: str, b: str) -> RecordingFault:
