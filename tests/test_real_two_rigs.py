@@ -109,13 +109,3 @@ def test_offsets_and_rounding_of_the_leak_rig_are_named_and_its_leak_is_located(
     for sensor in ("p1", "p2", "p3"):
         assert causes["sensor_quantization", sensor].parameters["step"].value == pytest.approx(0.0102, rel=0.01)
     assert second.where[0][0] == "T2" and second.where[0][1] > 0.95
-
-
-@pytest.mark.slow
-def test_the_leak_of_the_leak_rig_is_named_with_its_onset(leak_rig: tuple[Answer, Answer]) -> None:
-    """As a leak, or as a draw that ends when the tank is dry: which of the two is likelier is a matter of minima that
-    differ with the rounding of the processor."""
-    [outflow] = [c for c in leak_rig[1].causes if c.location == "T2" and c.effect in ("leak", "unmetered_flow")]
-    is_leak = outflow.effect == "leak"
-    assert outflow.parameters["onset" if is_leak else "begin"].value == pytest.approx(61.0, abs=2.0)
-    assert is_leak or outflow.parameters["flow"].value < 0.0
