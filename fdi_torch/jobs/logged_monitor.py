@@ -6,6 +6,7 @@ samples are processed at once.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -76,8 +77,9 @@ class LoggedMonitor:
         self._now = run.config.fault_free[0]
 
     def process_recording(self, whole: Recording) -> None:
-        """Learn from the fault-free part of a complete recording, and process all of it."""
-        self.learn(whole)
+        """Learn from the fault-free part of a complete recording, and process all of it. Raises ValueError if nothing
+        is left to watch."""
+        self.learn(whole, float(whole.time[-1]))
         samples = samples_of_recording(whole, self.run.plant)
         duration, window = float(whole.time[-1] - whole.time[0]), self.run.config.window.longest
         if window > duration and self.run.config.mode != "changes":
@@ -90,9 +92,12 @@ class LoggedMonitor:
             self.process(samples.segment(first, last))
             self.callbacks.tell(last / len(samples), f"{float(samples.time[last - 1]):g} s")
 
-    def learn(self, whole: Recording) -> None:
-        """Prepare the monitor from the fault-free part, and report what was learnt and any warnings."""
-        prepared, config = _prepare(self.run, whole), self.run.config
+    def learn(self, whole: Recording, end: float = math.inf) -> None:
+        """Prepare the monitor from the fault-free part, and report what was learnt and any warnings.
+
+        end: of all samples, s, if no further ones will come.
+        """
+        prepared, config = _prepare(self.run, whole, end), self.run.config
         self.monitor, self.believed = prepared.monitor, prepared.believed
         if config.mode != "changes":
             window = config.window
@@ -258,10 +263,15 @@ def _positions(clock: Sequence[float], times: Sequence[tuple[float, bool]]) -> l
     return positions
 
 
-def _prepare(run: MonitorRun, whole: Recording) -> PreparedMonitor:
+def _prepare(run: MonitorRun, whole: Recording, end: float) -> PreparedMonitor:
     c = run.config
     with naming("fault_free"):
         part = usable_part(run.plant, fault_free_part(whole, *c.fault_free))
+        if end <= c.fault_free[1]:
+            raise ValueError(
+                f"{whole.source}: expected an end before that of the recording ({end:g} s), got {c.fault_free[1]:g} s; "
+                "nothing would be watched: shorten it"
+            )
     # The configured initial levels are valid only if the fault-free part starts with the recording.
     at_start = float(part.time[0]) == float(whole.time[0])
     return prepare_monitor(

@@ -70,11 +70,6 @@ def run_monitor(
     if not follow:
         callbacks.tell(0.0, "reading")
     whole = None if follow else read_recording(run.config.recording, run.plant, run.base, run.given)
-    if whole is not None and (end := float(whole.time[-1])) <= (stop := run.config.fault_free[1]):
-        raise ValueError(
-            f"fault_free: {whole.source}: expected an end before that of the recording ({end:g} s), got {stop:g} s; "
-            "nothing would be watched: shorten it"
-        )
     kept = LearningItems(path) if run.config.source is not None else None
     earlier, origin = _earlier(run, unfinished, kept, resume) if follow else ([], None)
     messages = unfinished.messages([ALARM]) if unfinished is not None else ()
