@@ -126,19 +126,25 @@ class ObserverBank:
         return white - ((along * shares) @ directions.mT).reshape(white.shape)
 
     def _as_if_exact(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> Tensor:
-        """The white innovations if all calibrated constants are exact. believed: (P,) or (L, P)."""
-        residual = self.run(window, believed, changes)[1]
+        """The white innovations if all constants are exact."""
+        return self._white(window, self.run(window, believed, changes)[1])
+
+    def _white(self, window: ObserverWindow, residual: Tensor) -> Tensor:
         white = self.whitening.of_innovations(self.whitening.innovations(residual, window.number, window.memory)[0])
         white[:, : self.whitening.order] = 0.0
         return torch.nan_to_num(white, nan=0.0)
 
+    def _beside_errors(self, window: ObserverWindow, believed: Tensor) -> Tensor:
+        """Residuals (1 + P, S, sensors) without a change, and with each of P constants raised by STEP."""
+        raised = believed + STEP * torch.diag(prior_std(self.space))[list(self.constants.columns)]
+        lanes = torch.cat([believed[None], raised])
+        never = ChangeHypotheses(lanes, lanes.new_full((len(lanes),), NEVER), torch.zeros(len(lanes)).bool())
+        return self.run(window, lanes, never)[1]
+
     def _of_constants(self, window: ObserverWindow, believed: Tensor) -> tuple[Tensor, Tensor]:
         """Directions U (S sensors, P) of the errors of P constants, and the shares (P,) that they take."""
         if self._errors is None or self._errors[0] is not window or not torch.equal(self._errors[1], believed):
-            moved = believed + STEP * torch.diag(prior_std(self.space))[list(self.constants.columns)]
-            lanes = torch.cat([believed[None], moved])
-            never = ChangeHypotheses(lanes, lanes.new_full((len(lanes),), NEVER), torch.zeros(len(lanes)).bool())
-            white = self._as_if_exact(window, lanes, never).flatten(1)
+            white = self._white(window, self._beside_errors(window, believed)).flatten(1)
             values, vectors = torch.linalg.eigh(self.constants.covariance)
             root = vectors * values.clamp(min=0.0).sqrt()
             directions, size, _ = torch.linalg.svd(((white[1:] - white[0]) / STEP).mT @ root, full_matrices=False)
@@ -152,8 +158,9 @@ class ObserverBank:
         the log of the likelihood of these flows over that of the present ones.
         """
         bank, residual = copy(self), self.run(window, believed, change)[1][0]
+        beside = self._beside_errors(window, believed)
         bank._errors = None
-        bank.whitening, gain = self.whitening.learning_from(residual, window.number)
+        bank.whitening, gain = self.whitening.learning_from(residual, (beside[1:] - beside[0]) / STEP, window.number)
         return bank, gain
 
     def in_blocks(self, window: ObserverWindow, changes: ChangeHypotheses, even: int = 1) -> list[ChangeHypotheses]:
