@@ -152,10 +152,11 @@ def learning_from(flows: FlowFilter, residual: Tensor, effects: Tensor, number: 
     likelihood ratio to the present noise.
 
     residual (S, sensors): scaled to the steady variance, of the observer's samples from `number` on. effects (P, S,
-    sensors): of the errors of constants on it. The filter
+    sensors): of the errors of constants on it, last of those beside which the flows were learnt. The filter
     restarts there, because the covariance of its state under the present noise does not hold for other noise.
     """
-    further, by_constants = (free_residual(flows.linear, flows.observer, x, number) for x in (residual, effects))
+    own = effects[len(effects) - flows.by_constants.shape[-1] :]
+    further, by_constants = (free_residual(flows.linear, flows.observer, x, number) for x in (residual, own))
     segments = [(flows.learnt, flows.by_constants), (further, by_constants.nan_to_num().permute(1, 2, 0))]
     likeliest, at = _likeliest(replace(flows, begins=number), segments)
     return likeliest, at.log_likelihood - at.start_log_likelihood

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -18,7 +19,8 @@ from fdi_torch.monitor.fault_free_checks import false_alarm_rate_text, fault_war
 from fdi_torch.monitor.hypothesis import SHAPE, faults_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
-from fdi_torch.monitor.noise_model import learn_noise
+from fdi_torch.monitor.noise_model import effects_of_constants, learn_noise
+from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.samples import samples_of_recording, usual_interval
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.monitor.whitening import FEWEST_SAMPLES
@@ -90,9 +92,12 @@ def prepare_monitor(
         space = space.with_changes(name, low=low, high=high)
     believed = space.vector(values)
     samples = samples_of_recording(fault_free, plant)
-    constants = [space.index(name) for name in (*calibrate, *uncertain)]
-    noise, seen = learn_noise(learning, samples, space, believed, longest_step=step, uncertain=constants)
-    noise = replace(noise, constants=constant_errors(constants, len(calibrate), noise.whitening.flows))
+    calibrated, others = ([space.index(name) for name in names] for names in (calibrate, uncertain))
+    noise, seen = learn_noise(learning, samples, space, believed, longest_step=step, uncertain=others)
+    observed = partial(Observer, learning, noise.gain, longest_step=step)
+    effects = effects_of_constants(observed, samples, space, believed, calibrated)
+    constants = constant_errors([*calibrated, *others], effects, noise.whitening.flows)
+    noise = replace(noise, constants=constants)
     sampling = float(torch.diff(samples.time).median())
     generator = torch.Generator().manual_seed(seed)
     every = time_between_false_alarms
@@ -100,7 +105,7 @@ def prepare_monitor(
     monitor = Monitor(network, space, noise, detector, settings, step, len(watched), len(unlisted))
     warnings = (
         *residual_warnings(plant, noise, detector, seen),
-        *fault_warnings(learning, space, samples, believed, step, faults_of(watched)),
+        *fault_warnings(learning, space, samples, believed, step, faults_of(watched), constants),
     )
     text = false_alarm_rate_text(noise, detector, every)
     return PreparedMonitor(monitor, believed, values, warnings, text)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -65,7 +65,8 @@ def learn_noise(
     """Identify the noise by maximum likelihood over the ratio of process to measurement noise, and run its observer.
 
     fault_free: one recording. levels (tanks,): initial levels if known. uncertain: columns of `space` that are
-    constants with errors. All candidate ratios run in parallel.
+    constants with errors; the residuals of the run are without the most likely ones. All candidate ratios run in
+    parallel.
     """
     if fault_free.batch:
         raise ValueError(f"expected one fault-free recording, got a batch of {tuple(fault_free.batch)}")
@@ -82,14 +83,40 @@ def learn_noise(
     best = candidates([_minimizing_exponent(fine)])[0]
     gain = _gain(network, linear, network.nominal.new_tensor([best.exponent]))
     gain = Gain(gain.steady[0], gain.opening[:, 0], gain.inflation[:, 0])
-    effects = best.seen.steady_residual.new_zeros(0, *best.seen.steady_residual.shape)
+    seen, effects = best.seen, best.seen.residual.new_zeros(0, *best.seen.residual.shape)
     if uncertain and space is not None and theta is not None:
-        lanes = theta + STEP * torch.diag(prior_std(space))[list(uncertain)]
-        every = replace(fault_free, readings=fault_free.readings.expand(len(lanes), *fault_free.readings.shape))
-        moved = Observer(network, gain, space, lanes, longest_step).run(every, levels)
-        effects = (moved.steady_residual - best.seen.steady_residual) / STEP
-    noise = _noise(network, linear, gain, best, effects)
-    return replace(noise, interval=usual_interval(fault_free.time)), best.seen
+        observed = partial(Observer, network, gain, longest_step=longest_step)
+        effects = effects_of_constants(observed, fault_free, space, theta, uncertain, levels)
+    noise = replace(_noise(network, linear, gain, best, effects), interval=usual_interval(fault_free.time))
+    if flows := noise.whitening.flows:
+        explained = _likely_errors(flows, seen.steady_residual, effects)
+        seen = replace(seen, residual=seen.residual - seen.inflation * explained)
+    return noise, seen
+
+
+def effects_of_constants(
+    observed: Callable[..., Observer],
+    samples: Samples,
+    space: ParameterSpace,
+    theta: Tensor,
+    columns: Sequence[int],
+    levels: Tensor | None = None,
+) -> Tensor:
+    """Effects (P, S, sensors) of P constants of a space on the residuals of an observer, per standard deviation of
+    their priors. observed(space, theta): the observer with such values (*batch, P)."""
+    lanes = torch.cat([theta[None], theta + STEP * torch.diag(prior_std(space))[list(columns)]])
+    every = replace(samples, readings=samples.readings.expand(len(lanes), *samples.readings.shape))
+    residual = observed(space, lanes).run(every, levels).steady_residual
+    return (residual[1:] - residual[0]) / STEP
+
+
+def _likely_errors(flows: FlowFilter, residual: Tensor, effects: Tensor) -> Tensor:
+    """The most likely sum (S, sensors) of effects (P, S, sensors) with standard normal coefficients in residuals."""
+    std = flows.innovation_std
+    x, y = ((flows(values)[0] / std).nan_to_num() for values in (effects, residual))
+    x, y = x.flatten(1), y.flatten()
+    likely = torch.linalg.solve(x @ x.mT + torch.eye(len(x), dtype=x.dtype), x @ y)
+    return torch.tensordot(likely, effects.nan_to_num(), 1)
 
 
 @dataclass(frozen=True)
@@ -163,17 +190,9 @@ def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observati
 def _scored(flows: FlowFilter, log_likelihood: float, residual: Tensor, effects: Tensor) -> tuple[float, Whitening]:
     """-2 log-likelihood with the penalty for what whitens the innovations of a flow filter, without the most likely
     errors of constants, and that whitening."""
-    std = flows.innovation_std
-    fits = score_whitenings(_without(flows(effects)[0] / std, flows(residual)[0], std))
+    fits = score_whitenings(flows(residual - _likely_errors(flows, residual, effects))[0])
     without = next(score for score, whitening in fits if not whitening.order and not bool(whitening.mean.any()))
     return fits[0][0] - without - 2.0 * log_likelihood, replace(fits[0][1], flows=flows)
-
-
-def _without(columns: Tensor, innovations: Tensor, std: Tensor) -> Tensor:
-    """Innovations (S, C) without the most likely sum of columns (P, S, C) with standard normal coefficients."""
-    x, y = columns.nan_to_num().flatten(1), (innovations / std).nan_to_num().flatten()
-    likely = torch.linalg.solve(x @ x.mT + torch.eye(len(x), dtype=x.dtype), x @ y)
-    return innovations - std * (likely @ x).reshape(innovations.shape)
 
 
 def operating_point(
