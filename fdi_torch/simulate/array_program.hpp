@@ -88,79 +88,20 @@ extern "C" void run_on_arrays(int64_t lanes, int64_t steps, const Program* progr
     }
 }
 
-// L U of n x n matrices with the same nonzero elements, at all steps of a block side by side; by elimination without
-// pivots, which leaves out what is zero at every step.
-struct Elimination {
-    struct Pair {
-        int64_t row, column;
-    };
-    int64_t n;
-    std::vector<char> on;           // (n, n): elements of L and U that are not zero
-    std::vector<Pair> lower, upper; // in the order of the substitutions
-    std::vector<Register> m;        // (n, n): L below the diagonal, 1 / U on it, U above
-    std::vector<double> of_step;    // the same elements in the order of the substitutions, (BLOCK, lower + upper + n)
-
-    Elimination(int64_t n, int64_t count, const int64_t* rows, const int64_t* columns) : n(n), on(n * n), m(n * n) {
-        for (int64_t i = 0; i < n; ++i) on[i * n + i] = true;
-        for (int64_t e = 0; e < count; ++e) on[rows[e] * n + columns[e]] = true;
-        for (int64_t i = 0; i < n; ++i)
-            for (int64_t k = i + 1; k < n; ++k) {
-                if (!on[k * n + i]) continue;
-                lower.push_back({k, i});
-                for (int64_t j = i + 1; j < n; ++j) on[k * n + j] |= on[i * n + j];
-            }
-        for (int64_t i = n; i-- > 0;)
-            for (int64_t j = i + 1; j < n; ++j)
-                if (on[i * n + j]) upper.push_back({i, j});
-        of_step.resize(BLOCK * width());
-    }
-
-    int64_t width() const { return static_cast<int64_t>(lower.size() + upper.size()) + n; }
-
-    void set_to_identity() {
-        for (int64_t i = 0; i < n * n; ++i)
-            if (on[i]) std::fill(m[i].of_step, m[i].of_step + BLOCK, i % (n + 1) == 0);
-    }
-
-    void factorise(int64_t length) {
-        for (int64_t i = 0; i < n; ++i) {
-            double* pivot = m[i * n + i].of_step;
-            for (int64_t t = 0; t < length; ++t) pivot[t] = 1.0 / pivot[t];
-            for (int64_t k = i + 1; k < n; ++k) {
-                if (!on[k * n + i]) continue;
-                double* factor = m[k * n + i].of_step;
-                for (int64_t t = 0; t < length; ++t) factor[t] *= pivot[t];
-                for (int64_t j = i + 1; j < n; ++j) {
-                    if (!on[i * n + j]) continue;
-                    const double* from = m[i * n + j].of_step;
-                    double* to = m[k * n + j].of_step;
-                    for (int64_t t = 0; t < length; ++t) to[t] -= factor[t] * from[t];
-                }
-            }
+// m x = x in place, m (n, n), by elimination without pivots, which skips zeros.
+static void solve(int64_t n, double* m, double* x) {
+    for (int64_t i = 0; i < n; ++i)
+        for (int64_t k = i + 1; k < n; ++k) {
+            if (m[k * n + i] == 0.0) continue;
+            const double factor = m[k * n + i] / m[i * n + i];
+            for (int64_t j = i + 1; j < n; ++j) m[k * n + j] -= factor * m[i * n + j];
+            x[k] -= factor * x[i];
         }
-        int64_t place = 0;
-        const auto store = [&](int64_t row, int64_t column) {
-            const double* element = m[row * n + column].of_step;
-            for (int64_t t = 0; t < length; ++t) of_step[t * width() + place] = element[t];
-            ++place;
-        };
-        for (const Pair& at : lower) store(at.row, at.column);
-        for (const Pair& at : upper) store(at.row, at.column);
-        for (int64_t i = 0; i < n; ++i) store(i, i);
+    for (int64_t i = n; i-- > 0;) {
+        for (int64_t j = i + 1; j < n; ++j) x[i] -= m[i * n + j] * x[j];
+        x[i] /= m[i * n + i];
     }
-
-    // x (n), a right side, becomes the solution with the matrix of step t.
-    void solve(int64_t t, double* x) const {
-        const double* element = &of_step[t * width()];
-        for (const Pair& at : lower) x[at.row] -= *element++ * x[at.column];
-        const double* inverse = element + upper.size();
-        auto above = upper.begin();
-        for (int64_t i = n; i-- > 0;) {
-            for (; above != upper.end() && above->row == i; ++above) x[i] -= *element++ * x[above->column];
-            x[i] *= inverse[i];
-        }
-    }
-};
+}
 
 // States under the implicit midpoint rule. The program computes rates (n, steps) and then the slopes (count, steps) of
 // rate rows[e] by state columns[e] from the states `middle` (n, steps) in the middle of each step; all lanes share these.
@@ -172,37 +113,36 @@ struct Trajectory {
 };
 
 // One correction by Newton's method of the steps from `first` to `last`, of which a share is taken; returns the largest,
-// or NaN. With D = 1 - span slopes / 2, the correction c of a node follows from that of the node before, b, and from the
-// defect r of the step between them by D c = (2 - D) b + r, so that D (c + b) = 2 b + r.
+// or NaN.
 static double correct(const Program& program, const Trajectory& x, int64_t lane, int64_t first, int64_t last,
-                      double share, Register* registers, Elimination& matrices) {
-    const int64_t n = x.n, length = last - first;
+                      double share, Register* registers) {
+    const int64_t n = x.n;
     double* path = x.path + lane * n * (x.steps + 1);
     for (int64_t i = 0; i < n; ++i) {
         const double* levels = path + i * (x.steps + 1);
         for (int64_t t = first; t < last; ++t) x.middle[i * x.steps + t] = 0.5 * (levels[t] + levels[t + 1]);
     }
-    carry_out_block(program, lane, first, length, registers);
-    matrices.set_to_identity();
-    for (int64_t e = 0; e < x.count; ++e) {
-        double* element = matrices.m[x.rows[e] * n + x.columns[e]].of_step;
-        const double *slopes = x.slopes + e * x.steps + first, *span = x.span + first;
-        for (int64_t t = 0; t < length; ++t) element[t] -= 0.5 * span[t] * slopes[t];
-    }
-    matrices.factorise(length);
-    std::vector<double> defect(length * n), change(n), sum(n);
-    for (int64_t i = 0; i < n; ++i) {
-        const double *levels = path + i * (x.steps + 1) + first, *rates = x.rates + i * x.steps + first;
-        for (int64_t t = 0; t < length; ++t)
-            defect[t * n + i] = x.span[first + t] * rates[t] - (levels[t + 1] - levels[t]);
-    }
+    carry_out_block(program, lane, first, last - first, registers);
+    std::vector<double> matrix(n * n), right(n), change(n), before(n);
     double largest = 0.0;
-    for (int64_t t = 0; t < length; ++t) {
-        for (int64_t i = 0; i < n; ++i) sum[i] = 2.0 * change[i] + defect[t * n + i];
-        matrices.solve(t, sum.data());
+    for (int64_t i = 0; i < n; ++i) before[i] = path[i * (x.steps + 1) + first];
+    for (int64_t t = first; t < last; ++t) {
+        std::fill(matrix.begin(), matrix.end(), 0.0);
         for (int64_t i = 0; i < n; ++i) {
-            change[i] = sum[i] - change[i];
-            path[i * (x.steps + 1) + first + t + 1] += share * change[i];
+            const double level = path[i * (x.steps + 1) + t + 1];
+            matrix[i * n + i] = 1.0;
+            right[i] = change[i] + x.span[t] * x.rates[i * x.steps + t] - (level - before[i]);
+            before[i] = level;
+        }
+        for (int64_t e = 0; e < x.count; ++e) {
+            const double slope = 0.5 * x.span[t] * x.slopes[e * x.steps + t];
+            matrix[x.rows[e] * n + x.columns[e]] -= slope;
+            right[x.rows[e]] += slope * change[x.columns[e]];
+        }
+        solve(n, matrix.data(), right.data());
+        change.swap(right);
+        for (int64_t i = 0; i < n; ++i) {
+            path[i * (x.steps + 1) + t + 1] += share * change[i];
             if (!(std::fabs(change[i]) <= largest)) largest = std::fabs(change[i]);
             if (std::isnan(largest)) return largest;
         }
@@ -220,7 +160,6 @@ extern "C" void solve_trajectories(const Program* program, const Trajectory* tra
     const Trajectory& x = *trajectory;
     std::vector<Register> space(program->registers);
     Register* registers = space.data();
-    Elimination matrices(x.n, x.count, x.rows, x.columns);
     for (int64_t lane = 0; lane < x.lanes; ++lane) {
         carry_out_fixed(*program, lane, registers);
         bool constant = !guessed;
@@ -232,10 +171,10 @@ extern "C" void solve_trajectories(const Program* program, const Trajectory* tra
             }
             bool converged = false;
             for (int64_t round = 0; round < rounds && !converged; ++round)
-                converged = correct(*program, x, lane, first, last, 1.0, registers, matrices) < tolerance;
+                converged = correct(*program, x, lane, first, last, 1.0, registers) < tolerance;
             for (double share = 0.5; share > 1e-3 && !converged && last - first == 1; share *= 0.5)
                 for (int64_t round = 0; round < rounds && !converged; ++round)
-                    converged = correct(*program, x, lane, first, last, share, registers, matrices) < tolerance;
+                    converged = correct(*program, x, lane, first, last, share, registers) < tolerance;
             if (!converged && (!constant || last - first > 1)) {
                 if (constant) length = (last - first) / 2;
                 constant = true;
