@@ -23,7 +23,7 @@ def constant_errors(columns: Sequence[int], effects: Tensor, flows: FlowFilter |
     covariance[:count] = 0.0
     if count and flows is not None:
         covariance[:count, :count] = covariance_of_least_squares(flows, effects)
-    return ConstantErrors(tuple(columns), covariance)
+    return ConstantErrors(tuple(columns), covariance, count)
 
 
 def covariance_of_least_squares(flows: FlowFilter, effects: Tensor) -> Tensor:
