@@ -441,14 +441,15 @@ def test_a_resumed_source_goes_on_after_the_logged_rows_and_notices() -> None:
     assert list(resumed_items(logged, [])) == logged
 
 
+@pytest.mark.parametrize("size", [0.05, 0.0])
 def test_neither_log_nor_replay_depends_on_how_many_rows_come_at_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], size: float
 ) -> None:
-    """Among them unreadable rows, a repeated one, a hole, and a clock that jumps back.
+    """Among them unreadable rows, a repeated one, a hole, and a clock that jumps back, with and without a leak.
 
     All rows at once, each alone, and in two batches of which the first ends right after the part to learn from.
     """
-    rows = [row(k if k < 280 else k - 20, levels) for k, levels in enumerate(readings())]
+    rows = [row(k if k < 280 else k - 20, levels) for k, levels in enumerate(readings(size))]
     rows[210:225] = []
     rows[170:170] = ["50,oops,50,1,2,3\n", rows[169], rows[170]]
     (tmp_path / "rig.csv").write_text(HEADER + rows[0] + "50,oops,50,1,2,3\n" + "".join(rows[1:]))

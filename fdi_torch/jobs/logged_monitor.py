@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 from typing import Any
@@ -218,7 +218,7 @@ class LoggedMonitor:
         """Log samples, each followed by its residual and its events. The first after a restart has no residual."""
         clock = samples.time.tolist()
         tested = _positions(clock, [(t, True) for trace in traces for t in trace.time.tolist()])
-        raised = _positions(clock, [(event.time, event.kind == "notice") for event in events])
+        raised = _positions(clock, [(event.time, event.kind == "notice") for event in events], set(tested))
         residuals = samples.readings.new_full((len(clock), len(self.plant.sensors) + 2), torch.nan)
         if traces:
             residuals[tested] = torch.cat([self._residual_rows(trace) for trace in traces])
@@ -251,14 +251,14 @@ class LoggedMonitor:
         self.log.recording_blocks(signals, as_array(samples.time))
 
 
-def _positions(clock: Sequence[float], times: Sequence[tuple[float, bool]]) -> list[int]:
-    """Index on the clock of each of the times, which follow it in order; True: after that of the time before.
-
-    The clock may jump back, which causes a notice. No two notices belong to one sample.
-    """
+def _positions(clock: Sequence[float], times: Sequence[tuple[float, bool]], tested: Container[int] = ()) -> list[int]:
+    """Index on the clock of each of the times, which follow it in order; True: after that of the time before, and not
+    among `tested`. The clock may jump back, which causes a notice. No two notices belong to one sample."""
     positions, k = [], -1
     for time_of_item, is_later in times:
         k = clock.index(time_of_item, k + 1 if is_later else max(k, 0))
+        while is_later and k in tested:
+            k = clock.index(time_of_item, k + 1)
         positions.append(k)
     return positions
 
