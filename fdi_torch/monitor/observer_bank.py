@@ -114,16 +114,22 @@ class ObserverBank:
             groups.setdefault(ParameterName.parse(name).prefix, []).append(column)
         self.effects = tuple(tuple(columns) for columns in groups.values())
         self._columns = ParameterSpace(self.changing.constants[name] for name in names)
-        self._errors: tuple[ObserverWindow, Tensor, Tensor, Tensor] | None = None
+        self._errors: tuple[ObserverWindow, Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
 
     def white_innovations(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> Tensor:
         """White innovations (L, S, sensors); zero where a reading, or one that the whitening needs, is missing."""
         white = self._as_if_exact(window, believed, changes)
         if not self.constants.columns:
             return white
-        directions, shares = self._of_constants(window, believed)
-        along = white.flatten(1) @ directions
-        return white - ((along * shares) @ directions.mT).reshape(white.shape)
+        directions, shares, known = self._of_constants(window, believed)
+        rest = white.flatten(1) - known
+        return (rest - (rest @ directions * shares) @ directions.mT).reshape(white.shape)
+
+    def knowing(self, constants: ConstantErrors) -> ObserverBank:
+        """The same observers with other knowledge of the errors of constants."""
+        bank = copy(self)
+        bank.constants, bank._errors = constants, None
+        return bank
 
     def _as_if_exact(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> Tensor:
         """The white innovations if all constants are exact."""
@@ -141,15 +147,19 @@ class ObserverBank:
         never = ChangeHypotheses(lanes, lanes.new_full((len(lanes),), NEVER), torch.zeros(len(lanes)).bool())
         return self.run(window, lanes, never)[1]
 
-    def _of_constants(self, window: ObserverWindow, believed: Tensor) -> tuple[Tensor, Tensor]:
-        """Directions U (S sensors, P) of the errors of P constants, and the shares (P,) that they take."""
+    def _of_constants(self, window: ObserverWindow, believed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Directions U (S sensors, P) of the errors of P constants, the shares (P,) that they take, and what their mean
+        adds to the innovations (S sensors,)."""
         if self._errors is None or self._errors[0] is not window or not torch.equal(self._errors[1], believed):
             white = self._white(window, self._beside_errors(window, believed)).flatten(1)
+            effects = ((white[1:] - white[0]) / STEP).mT
             values, vectors = torch.linalg.eigh(self.constants.covariance)
             root = vectors * values.clamp(min=0.0).sqrt()
-            directions, size, _ = torch.linalg.svd(((white[1:] - white[0]) / STEP).mT @ root, full_matrices=False)
-            self._errors = window, believed, directions, 1.0 - 1.0 / (1.0 + size.square()).sqrt()
-        return self._errors[2:]
+            directions, size, _ = torch.linalg.svd(effects @ root, full_matrices=False)
+            mean = self.constants.mean
+            known = effects.new_zeros(len(effects)) if mean is None else effects @ mean
+            self._errors = window, believed, (directions, 1.0 - 1.0 / (1.0 + size.square()).sqrt(), known)
+        return self._errors[2]
 
     def learning_from(
         self, window: ObserverWindow, believed: Tensor, change: ChangeHypotheses
