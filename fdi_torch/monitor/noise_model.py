@@ -42,7 +42,7 @@ class NoiseModel:
 
     reading_std (sensors,): measurement noise in the readings' units. ratio: process over measurement noise, both as
     levels. whitening: of the observer's residual. gain: of the observer. interval: usual time between
-    samples, s. constants: the errors of the calibrated constants.
+    samples, s. constants: errors of constants with a tolerance.
     """
 
     reading_std: Tensor

@@ -87,7 +87,7 @@ class ObserverBank:
     (prediction-error method; Ljung 1999, ch. 7). In all methods believed (P,) are the values of `space` before the
     change.
 
-    constants: the errors of the calibrated constants. To first order, errors g ~ N(0, S) of these add A g to the
+    constants: errors of constants with a tolerance. To first order, errors g ~ N(0, S) of these add A g to the
     innovations. With A S^(1/2) = U D V', innovations e are therefore white as e - U (1 - (1 + D^2)^(-1/2)) U'e, which
     is the marginal likelihood over the errors. effects: groups of columns of `space` that belong to one
     effect, such as amplitude, period and phase of an oscillation. An effect with a memory and an onset parameter (a
