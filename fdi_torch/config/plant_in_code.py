@@ -149,7 +149,7 @@ class Plant(PlantDescription):
 
         sizes = [(t.name, 1e3 * t.area * t.height, emptying_time(self, t)) for t in self.tanks]
         table = Table.of_rows(("tank", "volume, l", "empties from full in, s"), sizes)
-        return notebook_svg(schematic(self), f"plant-{self.name}", f"{self.title}") + table.html()
+        return notebook_svg(schematic(self), f"plant-{self.name}", self.title) + table.html()
 
 
 def _listed(part: str, components: Iterable[Component], kind: type[Component]) -> tuple[Component, ...]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from fdi_torch.monitor.flow_filter import FlowFilter
 from fdi_torch.monitor.flow_noise_estimate import by_initial_levels, free_residual
-from fdi_torch.monitor.law_errors import STEP, ConstantErrors, prior_std
+from fdi_torch.monitor.law_errors import STEP, ConstantErrors, raised
 from fdi_torch.monitor.noise_model import NoiseModel
 from fdi_torch.monitor.observer import Observation, Observer
 from fdi_torch.monitor.samples import Samples
@@ -36,7 +36,7 @@ def calibration_errors(
     if noise.whitening.flows is None or not names:
         return ConstantErrors()
     columns = [space.index(name) for name in names]
-    lanes = theta + STEP * torch.diag(prior_std(space))[columns]
+    lanes = raised(theta, space, columns)
     every = replace(fault_free, readings=fault_free.readings.expand(len(lanes), *fault_free.readings.shape))
     moved = Observer(network, noise.gain, space, lanes, longest_step).run(every)
     effects = (moved.steady_residual - seen.steady_residual) / STEP

@@ -41,6 +41,11 @@ def prior_std(space: ParameterSpace) -> Tensor:
     return torch.where(torch.isfinite(std), std, flat)
 
 
+def raised(theta: Tensor, space: ParameterSpace, columns: Sequence[int]) -> Tensor:
+    """theta (P,) with each of the columns in turn raised by STEP standard deviations of its prior, (columns, P)."""
+    return theta + STEP * torch.diag(prior_std(space))[list(columns)]
+
+
 @dataclass(frozen=True)
 class ConstantErrors:
     """Errors of P calibrated constants, in standard deviations of their priors. columns (P): of these constants.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.uncertainty import end_reached
-from fdi_torch.monitor.law_errors import STEP, ConstantErrors, prior_std
+from fdi_torch.monitor.law_errors import STEP, ConstantErrors, raised
 from fdi_torch.monitor.observer import ObserverRun, initial_levels, run_observers
 from fdi_torch.monitor.observer_gain import Gain
 from fdi_torch.monitor.samples import Samples
@@ -114,6 +114,7 @@ class ObserverBank:
             groups.setdefault(ParameterName.parse(name).prefix, []).append(column)
         self.effects = tuple(tuple(columns) for columns in groups.values())
         self._columns = ParameterSpace(self.changing.constants[name] for name in names)
+        # Of the window and the values asked for last: the result of `_of_constants`.
         self._errors: tuple[ObserverWindow, Tensor, Tensor, Tensor] | None = None
 
     def white_innovations(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> Tensor:
@@ -135,8 +136,7 @@ class ObserverBank:
     def _of_constants(self, window: ObserverWindow, believed: Tensor) -> tuple[Tensor, Tensor]:
         """Directions U (S sensors, P) of the errors of P constants, and the shares (P,) that they take."""
         if self._errors is None or self._errors[0] is not window or not torch.equal(self._errors[1], believed):
-            moved = believed + STEP * torch.diag(prior_std(self.space))[list(self.constants.columns)]
-            lanes = torch.cat([believed[None], moved])
+            lanes = torch.cat([believed[None], raised(believed, self.space, self.constants.columns)])
             never = ChangeHypotheses(lanes, lanes.new_full((len(lanes),), NEVER), torch.zeros(len(lanes)).bool())
             white = self._as_if_exact(window, lanes, never).flatten(1)
             values, vectors = torch.linalg.eigh(self.constants.covariance)

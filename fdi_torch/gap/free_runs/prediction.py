@@ -128,7 +128,7 @@ def _run(data: DataSet, start_samples: int, skipped: int) -> Prediction:
     if not bool(early.any()):
         source = data.recording.source
         raise ValueError(f"{source}: expected readings among the first {start_samples} samples, got none")
-    # A sensor whose readings hardly move is no more accurate for that: its noise must not dwarf that of the others.
+    # The rough noise is a share of the readings' spread, so that a sensor that hardly moves would outweigh all others.
     noise = Noise.rough(data.readings).at_least(sample_noise(data.readings, data.mask.to(data.readings)))
     fitter = Fitter(replace(data, mask=early), noise)
     engine, theta = _start_from_segment(fitter, skipped) if skipped else _start_from_samples(fitter)
