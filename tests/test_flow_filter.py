@@ -124,8 +124,10 @@ def test_flows_learnt_from_a_window_too_are_those_of_the_whole_recording(correla
     noise, _ = learn_noise(NETWORK, samples.segment(0, 300))
     residual, flows = Observer(NETWORK, noise.gain).run(samples).steady_residual, noise.whitening.flows
     assert flows is not None
-    further = noise.whitening.learning_from(residual[300:], 300)[0]
-    whole, _ = estimate_flow_filter(flows.linear, noise.gain, residual, flows.reading_std, flows.start_std, 1.0)
+    exact = residual.new_zeros(0, *residual.shape)
+    further = noise.whitening.learning_from(residual[300:], exact[:, 300:], 300)[0]
+    known = flows.reading_std, flows.start_std, 1.0
+    whole, _ = estimate_flow_filter(flows.linear, noise.gain, residual, exact, *known)
     assert further.flows is not None
     found, expected = further.flows.noise, whole.noise
     assert found.correlation_time == pytest.approx(expected.correlation_time, rel=0.05)
@@ -233,7 +235,8 @@ def test_innovations_do_not_depend_on_the_gain_of_the_observer() -> None:
     for share in (0.2, 0.6):
         gain = hand_gain(share * torch.eye(3, dtype=torch.float64))
         residual = Observer(NETWORK, gain).run(samples).steady_residual
-        flows, _ = estimate_flow_filter(linear, gain, residual, residual.std(dim=0), heights, 1.0)
+        exact = residual.new_zeros(0, *residual.shape)
+        flows, _ = estimate_flow_filter(linear, gain, residual, exact, residual.std(dim=0), heights, 1.0)
         whites.append(flows(residual)[0][100:])
     assert float((whites[0] - whites[1]).square().mean().sqrt()) < 0.02 * float(whites[0].square().mean().sqrt())
 

@@ -18,8 +18,7 @@ from fdi_torch.config.simulation import reading_noise
 from fdi_torch.effects import full_name
 from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
 from fdi_torch.monitor.monitor_setup import usual_faults
-from fdi_torch.parameters import ParameterName
-from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.description import PlantDescription, uncertain_constants
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.quantities import display_unit, parse_quantity, significant
 from fdi_torch.recording import Recording
@@ -30,7 +29,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     named = [full_name(name.strip(), plant) for name in (arguments.faults or "").split(",") if name.strip()]
     faults = named or usual_faults(plant)
     recording, constant = _inputs(arguments, plant)
-    uncertain = [n for n in plant.tolerances if n not in faults and ParameterName.parse(n).field != "start_level"]
+    uncertain = uncertain_constants(plant, faults)
     report = diagnosability(
         plant,
         faults,

@@ -1,46 +1,29 @@
-"""Errors of constants that were calibrated on the fault-free part, in which random flows and noise look like errors."""
+"""Errors of constants: those calibrated on the fault-free part, where random flows look like errors, and all others."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from fdi_torch.monitor.flow_filter import FlowFilter
 from fdi_torch.monitor.flow_noise_estimate import by_initial_levels, free_residual
-from fdi_torch.monitor.law_errors import STEP, ConstantErrors, raised
-from fdi_torch.monitor.noise_model import NoiseModel
-from fdi_torch.monitor.observer import Observation, Observer
-from fdi_torch.monitor.samples import Samples
-from fdi_torch.parameters import ParameterSpace
-from fdi_torch.plant.network import TankNetwork
+from fdi_torch.monitor.law_errors import ConstantErrors
 
 
-def calibration_errors(
-    network: TankNetwork,
-    fault_free: Samples,
-    space: ParameterSpace,
-    theta: Tensor,
-    names: Sequence[str],
-    noise: NoiseModel,
-    seen: Observation,
-    longest_step: float | None = None,
-) -> ConstantErrors:
-    """What the fault-free part leaves unknown about the constants `names` of `space`, whose least-squares estimates are
-    in theta (P,). Without a flow filter they count as exact.
+def constant_errors(columns: Sequence[int], effects: Tensor, flows: FlowFilter | None) -> ConstantErrors:
+    """What is not known about constants in columns of a space: of the first ones, which are calibrated, what least
+    squares on the fault-free part left unknown (nothing without a flow filter); of the others, their tolerances.
 
-    noise, seen: learnt with theta from the same samples, and the run of its observer.
+    effects (P, S, sensors): of the P calibrated ones on the residuals of the fault-free part, per standard deviation of
+    their priors.
     """
-    if noise.whitening.flows is None or not names:
-        return ConstantErrors()
-    columns = [space.index(name) for name in names]
-    lanes = raised(theta, space, columns)
-    every = replace(fault_free, readings=fault_free.readings.expand(len(lanes), *fault_free.readings.shape))
-    moved = Observer(network, noise.gain, space, lanes, longest_step).run(every)
-    effects = (moved.steady_residual - seen.steady_residual) / STEP
-    return ConstantErrors(tuple(columns), covariance_of_least_squares(noise.whitening.flows, effects))
+    covariance, count = torch.eye(len(columns), dtype=torch.float64), len(effects)
+    covariance[:count] = 0.0
+    if count and flows is not None:
+        covariance[:count, :count] = covariance_of_least_squares(flows, effects)
+    return ConstantErrors(tuple(columns), covariance, count)
 
 
 def covariance_of_least_squares(flows: FlowFilter, effects: Tensor) -> Tensor:

@@ -52,11 +52,11 @@ class Explainer:
         While the most likely onset under a plausible hypothesis is the beginning of the window, the fault may have
         begun earlier. The window is then doubled, back to `earliest` s at most.
         """
-        s = self.settings
+        s, observer = self.settings, self.observer.knowing(state.errors.constants)
         while True:
             window = state.window(start)
             fits = isolate(
-                self.observer,
+                observer,
                 window,
                 believed,
                 self.faults,

@@ -11,6 +11,7 @@ from fdi_torch.monitor.detection import DRIFT, Detector
 from fdi_torch.monitor.events import Explanation, percent_text, size_of
 from fdi_torch.monitor.hypothesis import Fault
 from fdi_torch.monitor.isolation import isolate
+from fdi_torch.monitor.law_errors import ConstantErrors
 from fdi_torch.monitor.noise_model import NoiseModel, operating_point
 from fdi_torch.monitor.observer import Observation
 from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow
@@ -56,6 +57,7 @@ def fault_warnings(
     believed: Tensor,
     step: float,
     faults: Sequence[Fault],
+    constants: ConstantErrors,
 ) -> list[str]:
     """Warning about a single fault in the fault-free part that explains the readings down to their noise.
 
@@ -70,7 +72,7 @@ def fault_warnings(
     gain = kalman_gain(linear, NO_PROCESS_NOISE * float(std.min()) * torch.ones_like(start), std, start)
     zeros, count = torch.zeros_like(std), len(samples)
     whitening = Whitening(zeros, std.new_zeros(0, len(std), len(std)), torch.diag(1.0 / std), count, zeros)
-    observer = ObserverBank(network, space, gain, whitening, step)
+    observer = ObserverBank(network, space, gain, whitening, step, constants)
     steady = [fault for fault in faults if not fault.shape]
     first, _ = observer.first_state(samples, believed)
     best = isolate(observer, ObserverWindow(samples, first, 1), believed, steady, deepest=1)[0]

@@ -41,7 +41,8 @@ class FlowFilter:
     (sensors,): measurement noise; correlation: of its neighbouring values, the same for all sensors. observer: the
     observer's gain. start_std (tanks,): of the initial levels, m.
     interval: s. learnt (samples, sensors): what the residual that the noise was learnt from would have been without
-    the observer's corrections, NaN where a reading is missing. begins: number of samples that the observer had
+    the observer's corrections, NaN where a reading is missing. by_constants (samples, sensors, P): its derivatives by
+    the errors of constants, in standard deviations of their priors. begins: number of samples that the observer had
     processed before the filter starts, from unknown levels and flows.
     """
 
@@ -52,6 +53,7 @@ class FlowFilter:
     start_std: Tensor
     interval: float
     learnt: Tensor
+    by_constants: Tensor
     begins: int = 0
     correlation: float = 0.0
 
@@ -212,7 +214,7 @@ class FlowFilter:
         size, lanes = len(self.transition), batch.numel()
         raw = (residual * self.observer.spread(number, count)).reshape(lanes, count, channels).contiguous()
         state = raw.new_zeros(size) if memory is None or number == self.begins else memory
-        state = state.expand(*batch, size).reshape(lanes, -1).contiguous()
+        state = state.expand(*batch, size).reshape(lanes, size).contiguous()
         out, path = torch.empty_like(raw), raw.new_empty(lanes, count, size)
         processed = number - self.begins
         tables = [self.gain.table(processed, count).contiguous(), self.observer.table(number, count).contiguous()]

@@ -1,6 +1,7 @@
 """Estimate of the noise model of `FlowFilter`: random flows into the tanks, and the measurement noise of the sensors.
 
-It maximises the likelihood of the observer's residuals (`estimate/state_noise.py`).
+It maximises the likelihood of the observer's residuals (`estimate/state_noise.py`), averaged over the initial levels
+and the errors of constants. Without that, errors of constants would count as random flows.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ def estimate_flow_filter(
     linear: Linear,
     observer: Gain,
     residual: Tensor,
+    effects: Tensor,
     reading_std: Tensor,
     start_std: Tensor,
     interval: float,
@@ -35,13 +37,16 @@ def estimate_flow_filter(
 ) -> tuple[FlowFilter, float]:
     """The filter for the noise that is most likely with an observer's residuals (S, sensors), and its log-likelihood.
 
+    effects (P, S, sensors): of the errors of constants on the residuals, per standard deviation of their priors.
     reading_std (sensors,): first guess of the measurement noise. correlation: of its neighbouring values. Raises
     BuildError without a compiler.
     """
     first = StateNoise(_usual_flow(linear, reading_std, start_std), FIRST_TIME * interval, torch.ones_like(reading_std))
     free = free_residual(linear, observer, residual)
-    start = FlowFilter(linear, first, reading_std, observer, start_std, interval, free, correlation=correlation)
-    flows, likely = _likeliest(start, [free], CORRELATION_TIMES)
+    by_constants = free_residual(linear, observer, effects).nan_to_num().permute(1, 2, 0)
+    known = linear, first, reading_std, observer, start_std, interval
+    start = FlowFilter(*known, free, by_constants, correlation=correlation)
+    flows, likely = _likeliest(start, [(free, by_constants)], CORRELATION_TIMES)
     return flows, likely.log_likelihood
 
 
@@ -66,18 +71,19 @@ def likeliest_correlation(estimate: Callable[[float], tuple[FlowFilter, float]])
 
 
 def _likeliest(
-    start: FlowFilter, segments: Sequence[Tensor], times: Sequence[float] = ()
+    start: FlowFilter, segments: Sequence[tuple[Tensor, Tensor]], times: Sequence[float] = ()
 ) -> tuple[FlowFilter, Likelihood]:
     """The filter with the most likely noise, by a search from that of `start` on, and its likelihood.
 
-    segments (S, sensors): residuals without corrections, NaN where missing, each from unknown levels on. The
-    search begins at the best of these correlation times, in sampling intervals, and that of `start`.
+    segments: residuals (S, sensors) without corrections, NaN where missing, each from unknown levels on, and their
+    derivatives (S, sensors, P) by the errors of constants. The search begins at the best of these correlation times,
+    in sampling intervals, and that of `start`.
     """
-    linear, free = start.linear, torch.cat(list(segments))
+    linear, (free, by_constants) = start.linear, map(torch.cat, zip(*segments, strict=True))
     count, tanks = len(free), len(start.start_std)
     fresh, by_levels = torch.zeros(count, dtype=torch.bool), free.new_zeros(*free.shape, len(segments) * tanks)
     first = 0
-    for k, segment in enumerate(segments):
+    for k, (segment, _) in enumerate(segments):
         last, fresh[first] = first + len(segment), True
         moved = by_initial_levels(linear, len(segment))[..., :tanks] * start.start_std
         by_levels[first:last, :, k * tanks : (k + 1) * tanks] = moved
@@ -85,12 +91,13 @@ def _likeliest(
     a, b, c = (x.expand(count, *x.shape) for x in (linear.transition, forcing(linear.transition), linear.output))
     propagation = Propagation(a, b, c, start.interval, fresh, torch.isfinite(free))
     sensors = SensorNoise(start.reading_std, torch.full_like(start.reading_std, start.correlation))
-    unit, ones = _usual_flow(linear, start.reading_std, start.start_std), free.new_ones(by_levels.shape[-1])
+    columns = torch.cat([by_levels, by_constants], dim=-1)
+    unit, ones = _usual_flow(linear, start.reading_std, start.start_std), free.new_ones(columns.shape[-1])
     residual = free.nan_to_num()
 
     def solved(noise: StateNoise) -> Likelihood:
         priors = ones, 0.0 * ones
-        return estimate_state_noise(propagation, sensors, residual, by_levels, *priors, unit, noise, climb=False)
+        return estimate_state_noise(propagation, sensors, residual, columns, *priors, unit, noise, climb=False)
 
     noise = replace(start.noise, scale=torch.ones_like(start.reading_std))
     likely = _with_likeliest_time(solved, noise, start.interval, times)
@@ -140,15 +147,18 @@ def _usual_flow(linear: Linear, reading_std: Tensor, start_std: Tensor) -> Tenso
     return FIRST_UNIT * metres.median() * torch.ones_like(start_std)
 
 
-def learning_from(flows: FlowFilter, residual: Tensor, number: int) -> tuple[FlowFilter, float]:
+def learning_from(flows: FlowFilter, residual: Tensor, effects: Tensor, number: int) -> tuple[FlowFilter, float]:
     """The filter with the most likely noise, given its earlier data and further residuals, and the logarithm of the
     likelihood ratio to the present noise.
 
-    residual (S, sensors): scaled to the steady variance, of the observer's samples from `number` on. The filter
+    residual (S, sensors): scaled to the steady variance, of the observer's samples from `number` on. effects (P, S,
+    sensors): of the errors of constants on it, last of those beside which the flows were learnt. The filter
     restarts there, because the covariance of its state under the present noise does not hold for other noise.
     """
-    further = free_residual(flows.linear, flows.observer, residual, number)
-    likeliest, at = _likeliest(replace(flows, begins=number), [flows.learnt, further])
+    own = effects[len(effects) - flows.by_constants.shape[-1] :]
+    further, by_constants = (free_residual(flows.linear, flows.observer, x, number) for x in (residual, own))
+    segments = [(flows.learnt, flows.by_constants), (further, by_constants.nan_to_num().permute(1, 2, 0))]
+    likeliest, at = _likeliest(replace(flows, begins=number), segments)
     return likeliest, at.log_likelihood - at.start_log_likelihood
 
 

@@ -38,7 +38,7 @@ def size_change(
     known = [f for f in faults if f.size in off]
     if not known:
         return None
-    window = state.window(start)
+    window, observer = state.window(start), observer.knowing(state.errors.constants)
     fits = isolate(observer, window, state.believed, known, deepest=len(known), healthy=state.healthy)
     best = next(f for f in fits if f.hypothesis.columns)
     near_nominal = (best.value - state.healthy).abs() <= 3.0 * best.std

@@ -48,12 +48,15 @@ def raised(theta: Tensor, space: ParameterSpace, columns: Sequence[int]) -> Tens
 
 @dataclass(frozen=True)
 class ConstantErrors:
-    """Errors of P calibrated constants, in standard deviations of their priors. columns (P): of these constants.
-    covariance (P, P).
+    """Errors of P constants, in standard deviations of their priors.
+
+    columns (P): of these constants, the `calibrated` ones first. covariance (P, P). mean (P,): zero by default.
     """
 
     columns: tuple[int, ...] = ()
     covariance: Tensor = field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.float64))
+    calibrated: int = 0
+    mean: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -102,12 +105,25 @@ class LawErrors:
         return own.as_calibrated()
 
     def as_calibrated(self) -> LawErrors:
-        """The same if the constants are known as at the end of the fault-free part."""
-        own = slice(2 * len(self.columns), 2 * len(self.columns) + len(self.constants.columns))
+        """The same if the constants are known as in `constants`: as at the end of the fault-free part."""
+        own, constants = self._of_constants, self.constants
         mean, covariance = self.mean.clone(), self.covariance.clone()
         mean[own], covariance[own], covariance[:, own] = 0.0, 0.0, 0.0
-        covariance[own, own] = self.constants.covariance
+        mean[own], covariance[own, own] = 0.0 if constants.mean is None else constants.mean, constants.covariance
         return replace(self, mean=mean, covariance=covariance)
+
+    @property
+    def _of_constants(self) -> slice:
+        return slice(2 * len(self.columns), 2 * len(self.columns) + len(self.constants.columns))
+
+    def as_learnt(self) -> LawErrors:
+        """The same at the end of the fault-free part. What it tells about constants that were calibrated on it is known
+        already, so that it counts for the others only."""
+        own, constants, count = self._of_constants, self.constants, self.constants.calibrated
+        mean, covariance = self.mean[own].clone(), self.covariance[own, own].clone()
+        mean[:count], covariance[:count], covariance[:, :count] = 0.0, 0.0, 0.0
+        covariance[:count, :count] = constants.covariance[:count, :count]
+        return replace(self, constants=replace(constants, mean=mean, covariance=covariance)).as_calibrated()
 
     def with_unknown_deviation(self) -> LawErrors:
         """The same if nothing is known about b from now on."""

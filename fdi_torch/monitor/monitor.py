@@ -143,6 +143,7 @@ class Monitor:
             hidden=state.hidden,
             pending=state.pending,
             learning_until=state.learning_until,
+            errors=replace(fresh.errors, constants=state.errors.constants).as_calibrated(),
         )
         events = [self.writer.notice(fresh, notice)]
         if state.pending is not None:
@@ -178,7 +179,7 @@ class Monitor:
                     learning_until=LONG_AGO,
                     detector_memory=None,
                     earliest_start=state.learning_until,
-                    errors=moved.errors.as_calibrated(),  # it includes what the errors have seen so far
+                    errors=moved.errors.as_learnt(),
                 )
             return moved, count, []
         state, events = self.alarms.on_threshold(moved) if raised else (moved, [])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -12,18 +13,19 @@ from torch import Tensor
 from fdi_torch.effects import build_network, placements_for, without_startup_effects
 from fdi_torch.estimate.fitting import StartLevels, set_up
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
-from fdi_torch.monitor.calibration_errors import calibration_errors
+from fdi_torch.monitor.calibration_errors import constant_errors
 from fdi_torch.monitor.detection import Chart, make_detector
 from fdi_torch.monitor.fault_free_checks import false_alarm_rate_text, fault_warnings, residual_warnings
 from fdi_torch.monitor.hypothesis import SHAPE, faults_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
-from fdi_torch.monitor.noise_model import learn_noise
+from fdi_torch.monitor.noise_model import effects_of_constants, learn_noise
+from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.samples import samples_of_recording, usual_interval
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.monitor.whitening import FEWEST_SAMPLES
 from fdi_torch.parameters import ParameterName, ParameterSpace
-from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
+from fdi_torch.plant.description import FLOW_KINDS, PlantDescription, uncertain_constants
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.step_length import commensurate_step
 
@@ -59,7 +61,8 @@ def prepare_monitor(
     """A monitor for `faults` (parameters such as 'T1.leak.size'; the usual ones by default). The usual ones that are
     not among them are causes that are not on the list.
 
-    calibrate: constants that are first fitted to the fault-free recording, with their tolerances as priors. start:
+    calibrate: constants that are first fitted to the fault-free recording, with their tolerances as priors. All others
+    with a tolerance keep their values and are uncertain by it. start:
     knowledge of the initial levels. step: longest integration step, s; by default `usual_step`, or the fraction of the
     sampling interval next to it. ranges: replace the usual ranges of faults.
     Raises ValueError.
@@ -73,8 +76,9 @@ def prepare_monitor(
     network = build_network(plant, placements_for([*watched, *unlisted]))
     running = without_startup_effects(plant, fault_free.ran)  # the fault-free part need not be the start of the run
     learning = build_network(running, placements_for([*watched, *calibrate, *unlisted]))
+    uncertain = uncertain_constants(plant, {*watched, *calibrate, *unlisted})
     values = calibration(running, fault_free, calibrate, step, start) if calibrate else {}
-    space = ParameterSpace([network.constants[name] for name in (*watched, *calibrate, *unlisted)])
+    space = ParameterSpace([network.constants[name] for name in (*watched, *calibrate, *uncertain, *unlisted)])
     for name in watched:
         if ParameterName.parse(name).field == "phase":  # a full turn either way, so that no fit stops at +-pi
             space = space.with_changes(name, low=-2.0 * math.pi, high=2.0 * math.pi)
@@ -88,10 +92,12 @@ def prepare_monitor(
         space = space.with_changes(name, low=low, high=high)
     believed = space.vector(values)
     samples = samples_of_recording(fault_free, plant)
-    noise, seen = learn_noise(learning, samples, space, believed, longest_step=step)
-    noise = replace(
-        noise, constants=calibration_errors(learning, samples, space, believed, calibrate, noise, seen, step)
-    )
+    calibrated, others = ([space.index(name) for name in names] for names in (calibrate, uncertain))
+    noise, seen = learn_noise(learning, samples, space, believed, longest_step=step, uncertain=others)
+    observed = partial(Observer, learning, noise.gain, longest_step=step)
+    effects = effects_of_constants(observed, samples, space, believed, calibrated)
+    constants = constant_errors([*calibrated, *others], effects, noise.whitening.flows)
+    noise = replace(noise, constants=constants)
     sampling = float(torch.diff(samples.time).median())
     generator = torch.Generator().manual_seed(seed)
     every = time_between_false_alarms
@@ -99,7 +105,7 @@ def prepare_monitor(
     monitor = Monitor(network, space, noise, detector, settings, step, len(watched), len(unlisted))
     warnings = (
         *residual_warnings(plant, noise, detector, seen),
-        *fault_warnings(learning, space, samples, believed, step, faults_of(watched)),
+        *fault_warnings(learning, space, samples, believed, step, faults_of(watched), constants),
     )
     text = false_alarm_rate_text(noise, detector, every)
     return PreparedMonitor(monitor, believed, values, warnings, text)

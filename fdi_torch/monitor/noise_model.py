@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from fdi_torch.monitor.flow_filter import FlowFilter
 from fdi_torch.monitor.flow_noise_estimate import estimate_flow_filter, likeliest_correlation
-from fdi_torch.monitor.law_errors import ConstantErrors
+from fdi_torch.monitor.law_errors import STEP, ConstantErrors, raised
 from fdi_torch.monitor.observer import Observation, Observer, bind_parameters, initial_levels
 from fdi_torch.monitor.observer_gain import (
     Gain,
@@ -42,7 +42,7 @@ class NoiseModel:
 
     reading_std (sensors,): measurement noise in the readings' units. ratio: process over measurement noise, both as
     levels. whitening: of the observer's residual. gain: of the observer. interval: usual time between
-    samples, s. constants: the errors of the calibrated constants.
+    samples, s. constants: errors of constants with a tolerance.
     """
 
     reading_std: Tensor
@@ -60,10 +60,13 @@ def learn_noise(
     theta: Tensor | None = None,
     levels: Tensor | None = None,
     longest_step: float | None = None,
+    uncertain: Sequence[int] = (),
 ) -> tuple[NoiseModel, Observation]:
     """Identify the noise by maximum likelihood over the ratio of process to measurement noise, and run its observer.
 
-    fault_free: one recording. levels (tanks,): initial levels if known. All candidate ratios run in parallel.
+    fault_free: one recording. levels (tanks,): initial levels if known. uncertain: columns of `space` that are
+    constants with errors; the residuals of the run are without the most likely ones. All candidate ratios run in
+    parallel.
     """
     if fault_free.batch:
         raise ValueError(f"expected one fault-free recording, got a batch of {tuple(fault_free.batch)}")
@@ -78,7 +81,42 @@ def learn_noise(
     coarse = min(candidates(EXPONENTS), key=lambda candidate: candidate.score)
     fine = candidates([coarse.exponent + offset for offset in FINE])
     best = candidates([_minimizing_exponent(fine)])[0]
-    return replace(_noise(network, linear, best), interval=usual_interval(fault_free.time)), best.seen
+    gain = _gain(network, linear, network.nominal.new_tensor([best.exponent]))
+    gain = Gain(gain.steady[0], gain.opening[:, 0], gain.inflation[:, 0])
+    seen, effects = best.seen, best.seen.residual.new_zeros(0, *best.seen.residual.shape)
+    if uncertain and space is not None and theta is not None:
+        observed = partial(Observer, network, gain, longest_step=longest_step)
+        effects = effects_of_constants(observed, fault_free, space, theta, uncertain, levels)
+    noise = replace(_noise(network, linear, gain, best, effects), interval=usual_interval(fault_free.time))
+    if flows := noise.whitening.flows:
+        explained = _likely_errors(flows, seen.steady_residual, effects)
+        seen = replace(seen, residual=seen.residual - seen.inflation * explained)
+    return noise, seen
+
+
+def effects_of_constants(
+    observed: Callable[..., Observer],
+    samples: Samples,
+    space: ParameterSpace,
+    theta: Tensor,
+    columns: Sequence[int],
+    levels: Tensor | None = None,
+) -> Tensor:
+    """Effects (P, S, sensors) of P constants of a space on the residuals of an observer, per standard deviation of
+    their priors. observed(space, theta): the observer with such values (*batch, P)."""
+    lanes = torch.cat([theta[None], raised(theta, space, columns)])
+    every = replace(samples, readings=samples.readings.expand(len(lanes), *samples.readings.shape))
+    residual = observed(space, lanes).run(every, levels).steady_residual
+    return (residual[1:] - residual[0]) / STEP
+
+
+def _likely_errors(flows: FlowFilter, residual: Tensor, effects: Tensor) -> Tensor:
+    """The most likely sum (S, sensors) of effects (P, S, sensors) with standard normal coefficients in residuals."""
+    std = flows.innovation_std
+    x, y = ((flows(values)[0] / std).nan_to_num() for values in (effects, residual))
+    x, y = x.flatten(1), y.flatten()
+    likely = torch.linalg.solve(x @ x.mT + torch.eye(len(x), dtype=x.dtype), x @ y)
+    return torch.tensordot(likely, effects.nan_to_num(), 1)
 
 
 @dataclass(frozen=True)
@@ -116,20 +154,18 @@ def _gain(network: TankNetwork, linear: Linear, exponents: Tensor) -> Gain:
     return kalman_gain(linear, shares.expand(-1, len(start_std)), unit.expand(len(exponents), -1), start_std)
 
 
-def _noise(network: TankNetwork, linear: Linear, best: _Candidate) -> NoiseModel:
+def _noise(network: TankNetwork, linear: Linear, gain: Gain, best: _Candidate, effects: Tensor) -> NoiseModel:
     """The measurement noise from the innovations' covariance, H P H' + R, at the best ratio."""
     unit, ratio = torch.linalg.vector_norm(linear.output, dim=-1), network.nominal.new_tensor(10.0**best.exponent)
     process = with_effects(ratio.expand(len(network.description.tanks)), network.order)
     predicted = riccati(linear, torch.diag_embed(process**2), torch.diag(unit**2))
     variance = torch.diagonal(linear.output @ predicted @ linear.output.mT) + unit**2
     reading_std = torch.sqrt(best.seen.steady_residual.square().nanmean(dim=0) / variance) * unit
-    batch = _gain(network, linear, ratio.log10().unsqueeze(0))
-    gain = Gain(batch.steady[0], batch.opening[:, 0], batch.inflation[:, 0])
-    whitening = _whitening(network, linear, gain, best.seen)
+    whitening = _whitening(network, linear, gain, best.seen, effects)
     return NoiseModel(reading_std, float(ratio), whitening, gain)
 
 
-def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation) -> Whitening:
+def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation, effects: Tensor) -> Whitening:
     """Whitening of an observer's residuals: random flows by their Kalman filter, what remains by an autoregression.
 
     First the noise of the sensors is taken as white. If the residuals remain correlated, or if the random flows are
@@ -138,22 +174,23 @@ def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observati
     """
     residual, interval = seen.steady_residual, usual_interval(seen.time)
     std, start = residual.square().nanmean(dim=0).sqrt(), start_uncertainty(network.description, residual)
-    estimate = partial(estimate_flow_filter, linear, gain, residual, std, start, interval)
+    estimate = partial(estimate_flow_filter, linear, gain, residual, effects, std, start, interval)
     try:
         flows, log_likelihood = estimate(0.0)
     except BuildError:
         return score_whitenings(residual)[0][1]
-    score, whitening = _scored(flows, log_likelihood, residual)
+    score, whitening = _scored(flows, log_likelihood, residual, effects)
     if whitening.order or not flows.noise.correlation_time:
-        score_of_correlated, of_correlated = _scored(*likeliest_correlation(estimate), residual)
+        score_of_correlated, of_correlated = _scored(*likeliest_correlation(estimate), residual, effects)
         if score_of_correlated + math.log(len(residual)) < score:  # the correlation is one more parameter
             return of_correlated
     return whitening
 
 
-def _scored(flows: FlowFilter, log_likelihood: float, residual: Tensor) -> tuple[float, Whitening]:
-    """-2 log-likelihood with the penalty for what whitens the innovations of a flow filter, and that whitening."""
-    fits = score_whitenings(flows(residual)[0])
+def _scored(flows: FlowFilter, log_likelihood: float, residual: Tensor, effects: Tensor) -> tuple[float, Whitening]:
+    """-2 log-likelihood with the penalty for what whitens the innovations of a flow filter, without the most likely
+    errors of constants, and that whitening."""
+    fits = score_whitenings(flows(residual - _likely_errors(flows, residual, effects))[0])
     without = next(score for score, whitening in fits if not whitening.order and not bool(whitening.mean.any()))
     return fits[0][0] - without - 2.0 * log_likelihood, replace(fits[0][1], flows=flows)
 

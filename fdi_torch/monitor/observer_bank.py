@@ -87,7 +87,7 @@ class ObserverBank:
     (prediction-error method; Ljung 1999, ch. 7). In all methods believed (P,) are the values of `space` before the
     change.
 
-    constants: the errors of the calibrated constants. To first order, errors g ~ N(0, S) of these add A g to the
+    constants: errors of constants with a tolerance. To first order, errors g ~ N(0, S) of these add A g to the
     innovations. With A S^(1/2) = U D V', innovations e are therefore white as e - U (1 - (1 + D^2)^(-1/2)) U'e, which
     is the marginal likelihood over the errors. effects: groups of columns of `space` that belong to one
     effect, such as amplitude, period and phase of an oscillation. An effect with a memory and an onset parameter (a
@@ -114,36 +114,51 @@ class ObserverBank:
             groups.setdefault(ParameterName.parse(name).prefix, []).append(column)
         self.effects = tuple(tuple(columns) for columns in groups.values())
         self._columns = ParameterSpace(self.changing.constants[name] for name in names)
-        # Of the window and the values asked for last: the result of `_of_constants`.
-        self._errors: tuple[ObserverWindow, Tensor, Tensor, Tensor] | None = None
+        self._errors: tuple[ObserverWindow, Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
 
     def white_innovations(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> Tensor:
         """White innovations (L, S, sensors); zero where a reading, or one that the whitening needs, is missing."""
         white = self._as_if_exact(window, believed, changes)
         if not self.constants.columns:
             return white
-        directions, shares = self._of_constants(window, believed)
-        along = white.flatten(1) @ directions
-        return white - ((along * shares) @ directions.mT).reshape(white.shape)
+        directions, shares, known = self._of_constants(window, believed)
+        rest = white.flatten(1) - known
+        return (rest - (rest @ directions * shares) @ directions.mT).reshape(white.shape)
+
+    def knowing(self, constants: ConstantErrors) -> ObserverBank:
+        """The same observers with other knowledge of the errors of constants."""
+        bank = copy(self)
+        bank.constants, bank._errors = constants, None
+        return bank
 
     def _as_if_exact(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> Tensor:
-        """The white innovations if all calibrated constants are exact. believed: (P,) or (L, P)."""
-        residual = self.run(window, believed, changes)[1]
+        """The white innovations if all constants are exact."""
+        return self._white(window, self.run(window, believed, changes)[1])
+
+    def _white(self, window: ObserverWindow, residual: Tensor) -> Tensor:
         white = self.whitening.of_innovations(self.whitening.innovations(residual, window.number, window.memory)[0])
         white[:, : self.whitening.order] = 0.0
         return torch.nan_to_num(white, nan=0.0)
 
-    def _of_constants(self, window: ObserverWindow, believed: Tensor) -> tuple[Tensor, Tensor]:
-        """Directions U (S sensors, P) of the errors of P constants, and the shares (P,) that they take."""
+    def _beside_errors(self, window: ObserverWindow, believed: Tensor) -> Tensor:
+        """Residuals (1 + P, S, sensors) without a change, and with each of P constants raised by STEP."""
+        lanes = torch.cat([believed[None], raised(believed, self.space, self.constants.columns)])
+        never = ChangeHypotheses(lanes, lanes.new_full((len(lanes),), NEVER), torch.zeros(len(lanes)).bool())
+        return self.run(window, lanes, never)[1]
+
+    def _of_constants(self, window: ObserverWindow, believed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Directions U (S sensors, P) of the errors of P constants, the shares (P,) that they take, and what their mean
+        adds to the innovations (S sensors,)."""
         if self._errors is None or self._errors[0] is not window or not torch.equal(self._errors[1], believed):
-            lanes = torch.cat([believed[None], raised(believed, self.space, self.constants.columns)])
-            never = ChangeHypotheses(lanes, lanes.new_full((len(lanes),), NEVER), torch.zeros(len(lanes)).bool())
-            white = self._as_if_exact(window, lanes, never).flatten(1)
+            white = self._white(window, self._beside_errors(window, believed)).flatten(1)
+            effects = ((white[1:] - white[0]) / STEP).mT
             values, vectors = torch.linalg.eigh(self.constants.covariance)
             root = vectors * values.clamp(min=0.0).sqrt()
-            directions, size, _ = torch.linalg.svd(((white[1:] - white[0]) / STEP).mT @ root, full_matrices=False)
-            self._errors = window, believed, directions, 1.0 - 1.0 / (1.0 + size.square()).sqrt()
-        return self._errors[2:]
+            directions, size, _ = torch.linalg.svd(effects @ root, full_matrices=False)
+            mean = self.constants.mean
+            known = effects.new_zeros(len(effects)) if mean is None else effects @ mean
+            self._errors = window, believed, (directions, 1.0 - 1.0 / (1.0 + size.square()).sqrt(), known)
+        return self._errors[2]
 
     def learning_from(
         self, window: ObserverWindow, believed: Tensor, change: ChangeHypotheses
@@ -152,8 +167,9 @@ class ObserverBank:
         the log of the likelihood of these flows over that of the present ones.
         """
         bank, residual = copy(self), self.run(window, believed, change)[1][0]
+        beside = self._beside_errors(window, believed)
         bank._errors = None
-        bank.whitening, gain = self.whitening.learning_from(residual, window.number)
+        bank.whitening, gain = self.whitening.learning_from(residual, (beside[1:] - beside[0]) / STEP, window.number)
         return bank, gain
 
     def in_blocks(self, window: ObserverWindow, changes: ChangeHypotheses, even: int = 1) -> list[ChangeHypotheses]:

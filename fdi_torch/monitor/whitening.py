@@ -53,15 +53,16 @@ class Whitening:
         eye = torch.eye(len(self.mean), dtype=self.mean.dtype)
         return self.whitener @ (eye - self.coefficients.sum(0)) @ self.mean
 
-    def learning_from(self, residual: Tensor, number: int) -> tuple[Whitening, float]:
+    def learning_from(self, residual: Tensor, effects: Tensor, number: int) -> tuple[Whitening, float]:
         """The whitening if the random flows are learnt from further residuals (S, C) too, the observer's from `number`
-        on, and the log of their likelihood over that with the present ones.
+        on, and the log of their likelihood over that with the present ones. effects (P, S, C): of the errors of
+        constants on these residuals.
 
         The ratio of the innovations' standard deviations to those that the flow filter predicts is kept.
         """
         if self.flows is None:
             return self, 0.0
-        flows, gain = learning_from(self.flows, residual, number)
+        flows, gain = learning_from(self.flows, residual, effects, number)
         whitener = self.whitener * (self.flows.innovation_std / flows.innovation_std)
         return replace(self, whitener=whitener, samples=self.samples + len(residual), flows=flows), gain
 

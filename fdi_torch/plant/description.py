@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -215,6 +215,12 @@ class PlantDescription:
 
         units = tuple(self.channel_units().values()), tuple(sensor.unit for sensor in self.sensors)
         return Recording(time, inputs, outputs, self.channels(), self.outputs(), *units, hold=hold, source=source)
+
+
+def uncertain_constants(plant: PlantDescription, besides: Collection[str] = ()) -> list[str]:
+    """The constants with a tolerance, apart from initial levels and from those in `besides`."""
+    names = (n for n in plant.tolerances if n not in besides)
+    return [n for n in names if ParameterName.parse(n).field != "start_level"]
 
 
 def with_tolerances(plant: PlantDescription, kept: Callable[[ParameterName], bool]) -> PlantDescription:
