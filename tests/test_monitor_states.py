@@ -15,11 +15,11 @@ from fdi_torch.monitor.alarm_state import FOLLOWS, Alarm, State
 from fdi_torch.monitor.detection import CHARTS, make_detector
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.hypothesis import Hypothesis, HypothesisFit
-from fdi_torch.monitor.known_faults import end_recovered
+from fdi_torch.monitor.known_faults import end_recovered, possible_ends
 from fdi_torch.monitor.monitor import Monitor, ResidualTrace
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
-from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, HiddenFault
+from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, HiddenFault, MonitorState
 from fdi_torch.monitor.samples import ABSENT, ClockState, Samples, samples_of_recording, split_at_gaps
 from fdi_torch.monitor.state_update import residuals_to_test
 from fdi_torch.monitor.window_monitor import WindowMonitor
@@ -182,7 +182,15 @@ def test_on_a_slow_clock_as_many_residuals_are_kept_as_the_detector_compares_wit
 
 
 def drained(mouth: float, seconds: int, folder: Path, closes: int = 600, fills: int = 640) -> list[Event]:
-    """Events of two tanks: the drain of T opens at 400 s and closes, U leaks from 500 s on.
+    """The events of `drained_state`, with those of the end."""
+    watch, state, events = drained_state(mouth, seconds, folder, closes, fills)
+    return [*events, *watch.close(state)]
+
+
+def drained_state(
+    mouth: float, seconds: int, folder: Path, closes: int, fills: int
+) -> tuple[Monitor, MonitorState, list[Event]]:
+    """A monitor of two tanks: the drain of T opens at 400 s and closes, U leaks from 500 s on.
 
     A pump then fills T again. The drain's mouth (m) lies above the floor: water stays, and Torricelli's law
     does not hold.
@@ -216,8 +224,7 @@ def drained(mouth: float, seconds: int, folder: Path, closes: int = 600, fills: 
     ready = prepare_monitor(plant, free, ["T.leak.size", "U.leak.size"], ranges=wide, settings=settings)
     samples = samples_of_recording(recording, plant)
     start = ready.monitor.start(samples, ready.believed, learning_until=390.0)
-    state, events = ready.monitor.advance(start, samples.segment(1, len(samples)))
-    return [*events, *ready.monitor.close(state)]
+    return ready.monitor, *ready.monitor.advance(start, samples.segment(1, len(samples)))
 
 
 def test_a_drain_is_not_told_as_closed_while_its_tank_is_dry(tmp_path: Path) -> None:
@@ -268,3 +275,19 @@ def test_the_end_of_a_drain_lies_within_the_time_in_which_its_dry_tank_does_not_
     assert last.onset is not None and last.onset_std is not None and last.onset_std < 40.0
     assert abs(last.onset - closes) <= 3.0**0.5 * last.onset_std + 1.0
     assert "back to nominal" in last.text and " between 4" in last.text and "inf" not in last.text
+
+
+def test_another_fault_does_not_tell_when_a_drain_ended_in_a_dry_tank(tmp_path: Path) -> None:
+    """The drain closes at 450 s and T fills from 515 s on. A leak of U since 500 s has a sharp onset."""
+    watch, state, _ = drained_state(0.0, 535, tmp_path, 450, 515)
+    drain, leak = (watch.observer.space.index(f"{tank}.leak.size") for tank in ("T", "U"))
+    value, std = torch.zeros_like(state.believed), torch.zeros_like(state.believed)
+    value[leak], std[leak] = 0.5, 0.05
+    hypothesis = Hypothesis((drain, leak), recovered=(drain,))
+    change = DetectedChange(
+        2, state.believed, 400.0, (HypothesisFit(hypothesis, value, std, 500.0, 0.5, 9.0, 1.0, 2.0, 3.0),), 535.0, 999.0
+    )
+    (track,) = state.tracks
+    assert track.column == drain
+    ends = possible_ends(watch.observer, state, replace(change, ended=(track,)), 60.0)
+    assert ends is not None and ends[0] < 450.0 and 510.0 < ends[1] < 520.0

@@ -4,6 +4,7 @@ cannot show it any more.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from fdi_torch.monitor.alarm_state import State
 from fdi_torch.monitor.event_text import EventWriter
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit
+from fdi_torch.monitor.hypothesis_fit import changes_of
 from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.monitor_settings import REVISE
 from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, HiddenFault, MonitorState
@@ -153,10 +155,10 @@ def possible_ends(
     """Interval in which the faults of a change may have ended, s; None if the standard deviation of the fitted onset
     describes it.
 
-    In a dry tank the readings determine no onset. Where the fit leaves more than noise, the fitted onset may be the
-    time from which the fault's law is wrong, as in a tank that runs dry. Another onset is possible if its misfit is at
-    most that of three standard deviations larger, or if it changes the white innovations by less than the error of the
-    fault's law.
+    In a dry tank the readings determine no onset, and the fitted one may be the time from which the fault's law is
+    wrong. Another onset is possible if its misfit is at most that of three standard deviations larger, or if it changes
+    the white innovations by less than the error of the fault's law, which is no larger than the noise if the fit leaves
+    no more than that. Only the ends move: what else changed keeps its onset, and to first order its effect.
     """
     best = change.best
     if not change.ended or best.hypothesis.incipient:
@@ -165,17 +167,20 @@ def possible_ends(
     times = window.samples.time[:: max(len(window) // END_CANDIDATES, 1)]
     onsets = torch.cat([times, times.new_tensor([best.onset])])
     sudden = torch.zeros(len(onsets), dtype=torch.bool)
-    lanes = ChangeHypotheses(best.value.repeat(len(onsets), 1), onsets, sudden)
-    blocks = observer.in_blocks(window, lanes)
+    columns = [track.column for track in change.ended]
+    after = change.before.clone()
+    after[columns] = best.value[columns]
+    blocks = observer.in_blocks(window, ChangeHypotheses(after.repeat(len(onsets), 1), onsets, sudden))
     white = torch.cat([observer.white_innovations(window, change.before, block) for block in blocks])
+    white = white + (observer.white_innovations(window, change.before, changes_of([best])) - white[-1])
     misfits = 0.5 * white.square().sum((1, 2)) / best.misfit_ratio
     between = ((window.times > times[:, None]) != (window.times > best.onset)).to(white.dtype)
     moved = ((white[:-1] - white[-1]).square().mean(-1) * between).sum(-1) / between.sum(-1).clamp(min=1.0)
-    law_error = 0.0 if best.fits else max(map(_law_error, change.ended))
+    law_error = min(max(map(_law_error, change.ended)), 1.0 if best.fits else math.inf)
     possible = (misfits[:-1] - misfits[-1] <= 4.5) | (moved.sqrt() < law_error)
-    before, after = times <= best.onset, times > best.onset
-    first = min([best.onset, *_while(times[before].flip(0), possible[before].flip(0))])
-    last = max([best.onset, *_while(times[after], possible[after])])
+    earlier, later = times <= best.onset, times > best.onset
+    first = min([best.onset, *_while(times[earlier].flip(0), possible[earlier].flip(0))])
+    last = max([best.onset, *_while(times[later], possible[later])])
     step = float(torch.diff(times).max())
     reach = 3.0 * best.onset_std + step
     is_sharp = best.onset_std <= step and first >= best.onset - reach and last <= best.onset + reach

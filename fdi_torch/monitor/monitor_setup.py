@@ -76,7 +76,7 @@ def prepare_monitor(
     network = build_network(plant, placements_for([*watched, *unlisted]))
     running = without_startup_effects(plant, fault_free.ran)  # the fault-free part need not be the start of the run
     learning = build_network(running, placements_for([*watched, *calibrate, *unlisted]))
-    uncertain = uncertain_constants(plant, {*watched, *calibrate, *unlisted})
+    uncertain = uncertain_constants(running, {*watched, *calibrate, *unlisted})
     values = calibration(running, fault_free, calibrate, step, start) if calibrate else {}
     space = ParameterSpace([network.constants[name] for name in (*watched, *calibrate, *uncertain, *unlisted)])
     for name in watched:
