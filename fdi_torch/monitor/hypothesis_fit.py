@@ -112,12 +112,14 @@ def fit(
     free[:, -1] = not known_onset
     for i, hypothesis in enumerate(hypotheses):
         free[i, hypothesis.free] = True
+    slots = _slots(free)
     incipient = torch.tensor([h.incipient for h in hypotheses])
     first, last = window.samples.time[0], window.samples.time[-2]
     oscillations, middle = oscillation_columns(observer.space.names), 0.5 * float(first + last)
 
-    def linearise(point: Tensor, lanes: Tensor) -> Linearisation:
-        return _expansion(observer, window, believed, point, free[lanes], incipient[lanes], middle)
+    def linearise(values: Tensor, lanes: Tensor) -> Linearisation:
+        point = slots.inserted(fixed, values, lanes)
+        return _expansion(observer, window, believed, point, slots, lanes, incipient[lanes], middle)
 
     fixed = torch.cat([believed, first[None]]).repeat(len(starts), 1)
     fixed[:, -1] = starts[:, -1]
@@ -131,17 +133,22 @@ def fit(
         low[:, phase] = torch.where(free[:, phase], starts[:, phase] - 2.0 * math.pi, low[:, phase])
         high[:, phase] = torch.where(free[:, phase], starts[:, phase] + 2.0 * math.pi, high[:, phase])
     settings = RefineSettings(iterations=ITERATIONS, decrease_tolerance=1e-3, step_tolerance=1e-6)
-    refined = levenberg_marquardt(linearise, starts, low, high, settings)
-    final = linearise(refined.theta, torch.arange(len(hypotheses)))
-    theta = with_wrapped_phases(with_phases_at(refined.theta, oscillations, free, -middle), oscillations, free)
-    std = std_with_phases_at_zero(certainty(final.curvature, held=~free), theta, oscillations, free, middle)
-    width = torch.cat([observer.space_width(), (last - first)[None]])
+    box, every = (slots.of(low), slots.of(high)), torch.arange(len(hypotheses))
+    refined = levenberg_marquardt(linearise, slots.of(starts), *box, settings)
+    final = linearise(refined.theta, every)
+    theta = with_phases_at(slots.inserted(fixed, refined.theta, every), oscillations, free, -middle)
+    theta = with_wrapped_phases(theta, oscillations, free)
+    std = std_with_phases_at_zero(_covariance(final.curvature, slots, theta), theta, oscillations, free, middle)
+    width = slots.of(torch.cat([observer.space_width(), (last - first)[None]]).expand_as(fixed))
     level, limit = float(window.readings), _noise_limit(observer, window)
-    held = free & held_back(refined.theta, final.gradient, low, high)
-    slope = torch.where(held, final.gradient.abs(), 0.0)
+    slope = torch.where(held_back(refined.theta, final.gradient, *box), final.gradient.abs(), 0.0)
     change, age = theta - fixed, window.samples.time[-1] - theta[:, -1]
     room = torch.where(change > 0.0, high - fixed, fixed - low)
     share = (torch.maximum(change.abs(), std) / room).nan_to_num(0.0).clamp(max=1.0)
+    occam_factors = [
+        _log_occam_factor(final.curvature[i, :n, :n], slope[i, :n], width[i, :n], known_onset, hypothesis)
+        for i, (n, hypothesis) in enumerate(zip(slots.counts, hypotheses, strict=True))
+    ]
     return [
         HypothesisFit(
             hypothesis,
@@ -153,7 +160,7 @@ def fit(
             - float(final.cost[i])
             + prior(hypothesis)
             + (prior.growth(share[i, hypothesis.new], float(age[i])) if hypothesis.incipient else 0.0)
-            + _log_occam_factor(final.curvature[i], slope[i], width, free[i], hypothesis),
+            + occam_factors[i],
             float(final.cost[i]),
             level,
             limit,
@@ -167,14 +174,59 @@ def fit(
     ]
 
 
-def _log_occam_factor(curvature: Tensor, slope: Tensor, width: Tensor, free: Tensor, hypothesis: Hypothesis) -> float:
-    """Log of the posterior's volume over the prior's, of the free columns.
+@dataclass(frozen=True)
+class _Slots:
+    """The free columns of H points (H, P+1), gathered so that a fit has no more columns than it needs.
+
+    columns, used (H, Q): those of each point come first, the other slots are not used. Q is a power of two: pairwise
+    sums over the slots then do not depend on the other points.
+    """
+
+    columns: Tensor
+    used: Tensor
+
+    def of(self, values: Tensor) -> Tensor:
+        """Values (H, P+1) in the slots (H, Q); zero in those that are not used."""
+        return torch.where(self.used, values.gather(1, self.columns), 0.0)
+
+    def inserted(self, points: Tensor, values: Tensor, lanes: Tensor) -> Tensor:
+        """Those of the points (H, P+1) in `lanes` (L,), with values (L, Q) in their free columns."""
+        result, (row, slot) = points[lanes], self.used[lanes].nonzero(as_tuple=True)
+        result[row, self.columns[lanes][row, slot]] = values[row, slot]
+        return result
+
+    @property
+    def counts(self) -> list[int]:
+        """Number of free columns of each point."""
+        return self.used.sum(1).tolist()
+
+
+def _slots(free: Tensor) -> _Slots:
+    """Slots for the free columns of points, free (H, P+1)."""
+    most = max(int(free.sum(1).max()), 1)
+    columns = free.to(torch.int8).argsort(dim=1, descending=True, stable=True)[:, : 1 << (most - 1).bit_length()]
+    return _Slots(columns, free.gather(1, columns))
+
+
+def _covariance(curvature: Tensor, slots: _Slots, like: Tensor) -> Tensor:
+    """Covariance (H, P+1, P+1) of all columns of points, zero for those that are not free, infinite variance where
+    nothing determines them. curvature (H, Q, Q)."""
+    covariance = like.new_zeros(*like.shape, like.shape[-1])
+    for lane, count in enumerate(slots.counts):
+        columns = slots.columns[lane, :count]
+        covariance[lane, columns.unsqueeze(1), columns] = certainty(curvature[lane, :count, :count]).covariance
+    return covariance
+
+
+def _log_occam_factor(
+    curvature: Tensor, slope: Tensor, width: Tensor, known_onset: bool, hypothesis: Hypothesis
+) -> float:
+    """Log of the posterior's volume over the prior's, of the free columns, of which the last one is the onset.
 
     Independent faults have independent onsets; each further fault therefore costs as much as an onset of its own.
     """
-    chosen, further = free.nonzero().flatten(), len(hypothesis.new) - 1
-    onset = log_volume(curvature[-1:, -1:], width[-1:])
-    return log_volume(curvature[chosen][:, chosen], width[chosen], slope[chosen]) + max(further, 0) * onset
+    further = 0 if known_onset else max(len(hypothesis.new) - 1, 0)
+    return log_volume(curvature, width, slope) + further * log_volume(curvature[-1:, -1:], width[-1:])
 
 
 def _expansion(
@@ -182,40 +234,38 @@ def _expansion(
     window: ObserverWindow,
     believed: Tensor,
     point: Tensor,
-    free: Tensor,
+    slots: _Slots,
+    lanes: Tensor,
     incipient: Tensor,
     middle: float,
 ) -> Linearisation:
-    """Half the sum of squares of the white innovations about points (L, P+1), with slopes by central differences.
-
-    Free phases are those at `middle` s.
+    """Half the sum of squares of the white innovations about points (L, P+1) of `lanes` (L,), with slopes by central
+    differences. Free phases are those at `middle` s.
     """
-    count, width = point.shape
-    oscillations = oscillation_columns(observer.space.names)
+    oscillations, count = oscillation_columns(observer.space.names), len(point)
     length = float(window.samples.time[-1] - window.samples.time[0])
     steps = torch.cat([SIZE_STEP * observer.space_width(), 0.5 * torch.diff(window.samples.time).median()[None]])
     steps = steps.repeat(count, 1)
     for period, _ in oscillations:
         steps[:, period] = period_step(point[:, period], length)
-    varied = free.nonzero()  # (K, 2): lane, column
-    step = steps[varied[:, 0], varied[:, 1]]
-    ahead, behind = point[varied[:, 0]].clone(), point[varied[:, 0]].clone()
-    rows = torch.arange(len(varied))
-    ahead[rows, varied[:, 1]] += step
-    behind[rows, varied[:, 1]] -= step
-    source = torch.cat([torch.arange(count), varied[:, 0], varied[:, 0]])
-    lanes = with_phases_at(torch.cat([point, ahead, behind]), oscillations, free[source], -middle)
-    changes = ChangeHypotheses(lanes[:, :-1], lanes[:, -1], incipient[source])
-    blocks = observer.in_blocks(window, changes)
+    used, free = slots.used[lanes], torch.zeros_like(point, dtype=torch.bool)
+    lane, slot = used.nonzero(as_tuple=True)
+    column = slots.columns[lanes][lane, slot]
+    free[lane, column] = True
+    step, rows = steps[lane, column], torch.arange(len(lane))
+    ahead, behind = point[lane].clone(), point[lane].clone()
+    ahead[rows, column] += step
+    behind[rows, column] -= step
+    source = torch.cat([torch.arange(count), lane, lane])
+    every = with_phases_at(torch.cat([point, ahead, behind]), oscillations, free[source], -middle)
+    blocks = observer.in_blocks(window, ChangeHypotheses(every[:, :-1], every[:, -1], incipient[source]))
     white = torch.cat([observer.white_innovations(window, believed, block).flatten(1) for block in blocks])
     error = white[:count]
-    slope = (white[count : count + len(varied)] - white[count + len(varied) :]) / (2.0 * step).unsqueeze(1)
-    gradient, curvature = error.new_zeros(count, width), error.new_zeros(count, width, width)
-    gradient[varied[:, 0], varied[:, 1]] = (slope * error[varied[:, 0]]).sum(-1)
-    for lane in range(count):
-        rows = (varied[:, 0] == lane).nonzero().flatten()
-        columns = varied[rows, 1]
-        curvature[lane, columns.unsqueeze(1), columns] = slope[rows] @ slope[rows].mT
+    slope = (white[count : count + len(lane)] - white[count + len(lane) :]) / (2.0 * step).unsqueeze(1)
+    gradient, curvature = error.new_zeros(used.shape), error.new_zeros(*used.shape, used.shape[-1])
+    gradient[lane, slot] = (slope * error[lane]).sum(-1)
+    for k, own in enumerate(slope.split(used.sum(1).tolist())):
+        curvature[k, : len(own), : len(own)] = own @ own.mT
     return Linearisation(0.5 * error.square().sum(-1), gradient, curvature)
 
 

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.information import Certainty
 from fdi_torch.parameters import ParameterName
 
 # Phase change, in radians at the ends of a window, of the finite-difference step of a period.
@@ -50,12 +49,13 @@ def period_step(period: Tensor, length: float) -> Tensor:
 
 
 def std_with_phases_at_zero(
-    certainty: Certainty, theta: Tensor, oscillations: Sequence[tuple[int, int]], free: Tensor, time: float
+    c: Tensor, theta: Tensor, oscillations: Sequence[tuple[int, int]], free: Tensor, time: float
 ) -> Tensor:
-    """Standard deviations (L, P') for phases at t = 0, from the covariance for phases at `time` s (delta method)."""
-    std = certainty.std.clone()
+    """Standard deviations (L, P') for phases at t = 0, from the covariance c (L, P', P') for phases at `time` s (delta
+    method)."""
+    std = c.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
     for period, phase in oscillations:
-        slope, c = 2.0 * math.pi * time / theta[:, period].square(), certainty.covariance
+        slope = 2.0 * math.pi * time / theta[:, period].square()
         variance = c[:, phase, phase] + slope**2 * c[:, period, period] + 2.0 * slope * c[:, period, phase]
         error = torch.where(torch.isfinite(variance), variance.clamp(min=0.0), torch.inf).sqrt()
         std[:, phase] = torch.where(free[:, phase], error, std[:, phase])
