@@ -177,7 +177,7 @@ class Recording(Shown):
 
     @property
     def interval(self) -> float:
-        """The usual sampling interval, s: the least median interval between the readings of any sensor.
+        """The usual sampling interval, s: the smallest median interval between the readings of any sensor.
 
         Rows with readings of other sensors only, or with inputs only, do not count.
         """

@@ -48,7 +48,7 @@ def number_and_unit(text: str) -> tuple[float, str]:
         raise UnitError(f"no quantity: {text[:MOST_CHARACTERS]}")
     number, unit = match[1], match[2].strip().removeprefix("*")
     if not math.isfinite(float(number)):
-        raise UnitError(f"beyond all numbers: {number}")
+        raise UnitError(f"too large for a floating-point number: {number}")
     return float(number), f"1{unit}" if unit.startswith("/") else unit or "1"
 
 
@@ -89,7 +89,7 @@ def in_unit(number: float, unit: str, target: str) -> float:
     except (pint.PintError, OverflowError, ZeroDivisionError) as error:
         raise UnitError(str(error)) from None
     if math.isfinite(number) and not math.isfinite(converted):
-        raise UnitError(f"beyond all numbers: {number:g} {unit}")
+        raise UnitError(f"too large for a floating-point number once converted: {number:g} {unit}")
     return converted
 
 

@@ -22,7 +22,7 @@ MOST_SETTINGS, MOST_TRIALS = 4096, 10**6
 MOST_LINE = 2**20
 """Characters in a line of a CSV file."""
 MOST_UNPACKED, MOST_EXPANSION = 3 * 2**23, 50
-"""Greatest size of an unpacked recording, bytes, and greatest expansion factor; the larger limit applies."""
+"""Maximum size of an unpacked recording, bytes, and maximum expansion factor; the larger limit applies."""
 MOST_SHEET, MOST_SHEET_EXPANSION = 3 * 2**22, 15
 """The same for an Excel workbook; a logger's columns expand 8 times, and reading them is slow."""
 MOST_ARRAY_BYTES, MOST_ARRAY_EXPANSION = 2**26, 50

@@ -79,7 +79,7 @@ def test_words_for_nothing_read_are_missing_readings(tmp_path: Path, word: str) 
         ),
         (b"PK\x03\x04\x00\x00", "expected an Excel workbook that is whole, got one that cannot be read"),
         (b"FEA1\x00\x00", "got a Feather file of version 1; write it as version 2"),
-        (b"t_s\x00\x00", "expected a CSV, MCAP, Parquet, .* or HDF5 file, got something that is no text"),
+        (b"t_s\x00\x00", "expected a CSV, MCAP, Parquet, .* or HDF5 file, got something that is not text"),
     ],
 )
 def test_what_cannot_be_read_is_refused_with_a_fix(tmp_path: Path, text: str | bytes, sentence: str) -> None:

@@ -34,13 +34,13 @@ RECORDED, HELD_OUT = 3601, 2401
 COARSE = 0.25
 """Integration step of preliminary simulations, s."""
 WIDEST, _LEAST = 2.5, 0.2
-"""Largest deviation of a constant, in standard deviations, and its least value, as a share of the nominal one."""
+"""Largest deviation of a constant, in standard deviations, and its smallest value, as a share of the nominal one."""
 _MOST_TRIALS = 12
 """Number of adjustments of the inputs after which a rig counts as one that no inputs keep within its tanks."""
 LOW, HIGH = 0.13, 0.8
 """Range of the commanded flow, as a share of a pump's max_flow, of a rig that only its plant file describes."""
 FULL, LEAST = 0.5, 0.02
-"""Highest resting level, as a share of the height, for which the inputs of such a rig are reduced; the least HIGH."""
+"""Highest resting level of such a rig, as a share of the height, above which HIGH is reduced; and its lower limit."""
 NOISE = 1 / 35
 """Unit of the measurement noise over the mean level at equilibrium: 0.05, 0.1 or 0.2 of it are 0.14, 0.29 or 0.57 %."""
 

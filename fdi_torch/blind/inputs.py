@@ -117,7 +117,7 @@ def drawn(rng: np.random.Generator, inputs: str) -> Signal:
 
 
 def commanded(rig: Rig, rng: np.random.Generator, samples: int, signal: Signal = steps) -> Array:
-    """(T, C) in the header's unit, with a signal of this kind for every channel."""
+    """The commands (T, C) in the header's unit: one random signal of the given kind for each channel."""
     limits = channel_limits(rig)
     shares = np.stack([signal(rng, samples) for _ in limits], axis=1)
     return as_printed(rig, limits[:, 0] + (limits[:, 1] - limits[:, 0]) * shares)
@@ -198,8 +198,8 @@ def draw_control(
 ) -> tuple[LevelControl, ...]:
     """The control of one level, for recordings with the lengths of `levels` ((T, N) m, undisturbed, open loop).
 
-    limits (M, 2): lowest and highest flow of each pump, quantum (M,): its least change, m^3/s. Set points lie between
-    the fifth and the four fifths of the levels that the open loop reaches, so that the pump can hold them.
+    limits (M, 2): lowest and highest flow of each pump, quantum (M,): its smallest change, m^3/s. Set points lie
+    between the fifth and the four fifths of the levels that the open loop reaches, so that the pump can hold them.
     Raises ValueError where no pump feeds a measured tank.
     """
     tanks, measured = [t.name for t in plant.tanks], {s.tank for s in plant.sensors}

@@ -39,7 +39,7 @@ STEPS = {
     "validate": "Validate the methods",
     "use": "Use elsewhere",
 }
-"""The parts of the overview in order, by `STEP` of a command's options."""
+"""Headings of the overview in order. Each file of `cli/options` names the one of its command as `STEP`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -138,7 +138,7 @@ def _carried_out(name: str, words: list[str]) -> int:
 def _resource_problem(error: Exception) -> str:
     """Message about a lack of memory or a singular problem; empty for other errors."""
     if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
-        return "expected less work than this machine has memory for, got more; shorten the run, or lower population"
+        return "the run needs more memory than this machine has; shorten it, or lower population"
     if "LinAlgError" in type(error).__name__:
         return (
             "expected readings that determine the result, got a singular matrix: channels that are constant, identical "

@@ -180,7 +180,7 @@ COMMAND = re.compile(
     r".*(pump|valve|ventil|pwm|duty|cmd|command|speed|drehzahl)|[A-Z]+C\W?\d+\W?(out|op)$", re.IGNORECASE
 )
 """Words, and tags of a controller's output (LIC-101.OUT)."""
-PUMPS = "pumps:    # ! the tank that each fills, and its greatest flow; a flow out of a tank belongs under transfers"
+PUMPS = "pumps:    # ! the tank that each fills, and its maximum flow; a flow out of a tank belongs under transfers"
 
 
 class _Column(NamedTuple):
@@ -282,7 +282,7 @@ def _pump(column: _Column, tank: str) -> str:
     if column.kind == "1":
         fields.append(f"gain: {significant(6.0 * per_unit, 3)} l/min" + (f"/{column.unit}" if per_unit < 1.0 else ""))
     elif column.kind != "m^3/s":
-        largest = 5.9 * per_unit / (column.highest or 1.0)  # rounded, the highest command stays below the greatest flow
+        largest = 5.9 * per_unit / (column.highest or 1.0)  # rounded, the highest command stays below the maximum flow
         fields.append(f"gain: {significant(largest, 3)} l/min/{column.unit}")
     return _line(column, fields, "command")
 

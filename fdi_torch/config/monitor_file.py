@@ -27,12 +27,12 @@ class WindowConfig(Strict):
 
     lookback: ScaledSeconds = Field(LOOKBACK, description="length before an alarm in which its onset is searched, s")
     confirm: ScaledSeconds = Field(CONFIRM, description="time after an alarm until the fault is isolated, s")
-    longest: ScaledSeconds = Field(LONGEST, description="greatest length of a window, s")
+    longest: ScaledSeconds = Field(LONGEST, description="maximum length of a window, s")
     stride: Seconds | None = Field(
         None, description="distance of windows that are fitted separately, s; by default longest"
     )
     incipient: bool = Field(True, description="whether faults may also grow slowly")
-    together: int = Field(2, ge=1, description="greatest number of simultaneous faults")
+    together: int = Field(2, ge=1, description="maximum number of simultaneous faults")
 
     def settings(self) -> MonitorSettings:
         return MonitorSettings(**self.model_dump(exclude={"stride"}))

@@ -89,8 +89,8 @@ class SensorConfig(Strict):
     gain: Amount = Field(1.0, description="reading for a level of 1: no unit, or in mbar/cm, V/cm, mA/cm, %/cm")
     offset: Amount | None = Field(None, description="reading at level 0, in the reading's unit")
     channel: str | None = Field(None, description="its output channel, if it differs from its name")
-    low: Amount | None = Field(None, description="least reading, in its unit")
-    high: Amount | None = Field(None, description="greatest reading, in its unit")
+    low: Amount | None = Field(None, description="lowest reading, in its unit")
+    high: Amount | None = Field(None, description="highest reading, in its unit")
 
 
 class EffectConfig(Strict):
@@ -100,7 +100,7 @@ class EffectConfig(Strict):
 
 
 class MatterConfig(Strict):
-    smallest: Amount = Field(0.0, description="least deviation from nominal that is reported, with its unit")
+    smallest: Amount = Field(0.0, description="smallest deviation from nominal that is reported, with its unit")
     urgency: str = Field("", description="a word that is added to its events, such as high")
 
 
@@ -121,7 +121,7 @@ class PlantConfig(component_sections(_NamedPlant)):  # type: ignore[misc]
     )
     effects: list[EffectConfig] = Field(default_factory=list, description="known effects of the plant")
     matters: dict[str, MatterConfig] = Field(
-        default_factory=dict, description="least reported size and urgency of faults by name, such as T1.leak"
+        default_factory=dict, description="smallest reported size and urgency of faults by name, such as T1.leak"
     )
     units: dict[str, str] = Field(
         default_factory=dict,

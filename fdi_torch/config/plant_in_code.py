@@ -45,9 +45,9 @@ class Plant(PlantDescription):
     standard deviations of constants, by patterns such as '*.discharge_coefficient' (* is any name); of an offset, a
     start level or a parameter of an effect in its unit. varying: patterns of the constants that differ between
     recordings. effects: the plant's known effects. further: components of the other kinds of `FLOW_KINDS`, such as
-    weirs=[Weir(...)] and transfers=[Transfer(...)]. matters: least reported size and urgency of faults for a monitor,
-    SI. units: units for display by SI unit or channel, such as {"m": "mm", "m^3/s": "l/min"}, in place of the written
-    ones.
+    weirs=[Weir(...)] and transfers=[Transfer(...)]. matters: smallest reported size (SI) and urgency of faults for a
+    monitor. units: units for display by SI unit or channel, such as {"m": "mm", "m^3/s": "l/min"}, in place of the
+    written ones.
 
     `dump_plant` writes it as a plant file, which `load_plant` reads as an equal plant. Raises ValueError naming
     component and field, with the expected and the given value.

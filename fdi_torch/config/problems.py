@@ -85,7 +85,7 @@ def _elsewhere(error: Exception, known: Mapping[str, str]) -> str:
     if not isinstance(error, UnknownKeyError):
         return ""
     if ":" in error.key:
-        return "; part key and value by a colon and a space"
+        return "; separate key and value by a colon and a space"
     if comma := _comma([error.key]):
         return comma
     places = [path for path in known if path.rpartition(".")[2] == error.key and "NAME." not in path]

@@ -84,14 +84,14 @@ class ColumnConfig(Strict):
     )
     quality: str | None = Field(None, description="header of the column that says whether the value counts")
     good: list[str | int] = Field(default_factory=list, description="its words for valid; by default good, ok, 192 ...")
-    stamps: str | None = Field(None, description="of t: format of time stamps, as in '%d/%m/%Y %H:%M:%S'")
+    stamps: str | None = Field(None, description="for the time t: format of time stamps, as in '%d/%m/%Y %H:%M:%S'")
     zone: Annotated[str | None, BeforeValidator(_zone)] = Field(
-        None, description="of t: time zone of local time, as in Europe/Berlin; by default UTC"
+        None, description="for the time t: time zone of local time, as in Europe/Berlin; by default UTC"
     )
-    shift: Seconds = Field(0.0, description="of t: added to this clock, s")
-    sort: bool = Field(False, description="of t: rows may be in any order")
+    shift: Seconds = Field(0.0, description="for the time t: correction that is added to the times of this file, s")
+    sort: bool = Field(False, description="for the time t: true if the rows are not in the order of time")
     period: Seconds | None = Field(
-        None, gt=0, description="of t: time between rows, 50 ms, of a file without a column of time"
+        None, gt=0, description="for the time t: time from row to row, such as 50 ms, of a file without a time column"
     )
 
 

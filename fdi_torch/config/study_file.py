@@ -44,7 +44,7 @@ class StudyConfig(Strict):
     faults: Literal["simulated", "uniform", "modes"] = Field(
         "simulated", description="those of simulate, uniformly distributed ones, or every subset of the parameters"
     )
-    smallest: Share = Field(0.1, ge=0, lt=1, description="under modes: least size of a fault relative to its range")
+    smallest: Share = Field(0.1, ge=0, lt=1, description="under modes: smallest size of a fault relative to its range")
     snr_db: list[Decibel | None] = Field([None], min_length=1, description="signal-to-noise ratios, dB; null: no noise")
     trials: int = Field(1000, ge=1, description="number of trials per setting")
     block: int = Field(100, ge=1, description="number of trials computed at once")
@@ -52,7 +52,7 @@ class StudyConfig(Strict):
         list(ESTIMATORS), min_length=1, description="estimators to compare; free and boxed are hybrid searches"
     )
     starts: int = Field(2, ge=1, description="number of members of the search that are refined")
-    searches: int = Field(3, ge=1, description="greatest number of searches, for trials with residuals above the noise")
+    searches: int = Field(3, ge=1, description="maximum number of searches, for trials with residuals above the noise")
     search_step: ScaledSeconds = Field(5.0, gt=0, description="integration step of the search, s")
     search_every: int = Field(5, ge=1, description="decimation of the readings in the search")
     steps: ScaledSteps = Field(

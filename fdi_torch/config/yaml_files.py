@@ -45,7 +45,7 @@ def _values(text: bytes, source: str) -> Any:
     try:
         return yaml.load(text.decode("utf-8"), _Loader)
     except RecursionError:
-        raise ConfigError([f"{source}: expected YAML of a few levels, got hundreds within each other"]) from None
+        raise ConfigError([f"{source}: expected YAML of a few levels, got hundreds of nested ones"]) from None
     except UnicodeDecodeError:
         raise ConfigError(
             [f"{source}: expected a YAML file (text in UTF-8), got other bytes; name another file"]

@@ -85,9 +85,7 @@ class Entry(Shown):
 
     @in_its_units
     def _amount(self, parameter: Parameter) -> str:
-        """An example value for a file: of the size, and of parameters that are zero at nominal, a tenth of the range
-        away from the nominal value; else that value.
-        """
+        """An example value for a file: the nominal value, moved by a tenth of the range if it is the size or zero."""
         value = parameter.nominal
         if parameter is self.parameters[0] or (value == 0.0 and parameter.name not in (*MOMENTS, "ramp")):
             up, down = parameter.high - value, value - parameter.low

@@ -19,7 +19,7 @@ NOISE_MEANING = "standard deviation of the noise that is clipped with the level"
 class ReadingLimit(Effect):
     """A limit of the reading, which is absent at its nominal value far outside the sensor's range.
 
-    upper: whether it is the greatest reading, or the least one. noise: standard deviation of the noise that is clipped
+    upper: whether it is the highest reading, or the lowest one. noise: standard deviation of the noise that is clipped
     with the level. behind: share of it that is added after a first limit.
     """
 
@@ -34,7 +34,7 @@ class ReadingLimit(Effect):
         absent = outer(reading_at(plant, sensor, share) for share in (-1.0, 2.0))
         furthest = inner(reading_at(plant, sensor, share) for share in (0.0, 1.0))
         low, high = sorted((absent, furthest))
-        meaning = f"{'greatest' if self.upper else 'least'} reading"
+        meaning = f"{'highest' if self.upper else 'lowest'} reading"
         return (
             Parameter("limit", sensor.unit, absent, low, high, meaning=meaning),
             Parameter("noise", sensor.unit, 0.0, 0.0, meaning=NOISE_MEANING),

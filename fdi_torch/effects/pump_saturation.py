@@ -1,4 +1,4 @@
-"""A pump or transfer whose greatest flow is below its nominal limit."""
+"""A pump or transfer whose maximum flow is below its nominal limit."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class PumpSaturation(Effect):
         pump = plant.metered_flow(place)
         full = pump.max_flow
         return (
-            Parameter("limit", "m^3/s", full, 0.0, full, meaning="greatest flow of the pump"),
+            Parameter("limit", "m^3/s", full, 0.0, full, meaning="maximum flow of the pump"),
             Parameter("knee", "1", 0.0, 0.0, 1.0, meaning="smoothness of the limit"),
         )
 

@@ -21,7 +21,10 @@ _MAX_CORRECTION_RATIO = 0.75  # largest 2 |correction| / |step| (Transtrum and S
 
 @dataclass(frozen=True)
 class Quadratic:
-    """Quadratic models of L lanes: gradient (L, P) and curvature (L, P, P) at theta (L, P) within [low, high]."""
+    """Quadratic models of L independent problems (lanes) within [low, high].
+
+    theta, gradient: (L, P). curvature: (L, P, P).
+    """
 
     theta: Tensor
     gradient: Tensor
@@ -48,7 +51,7 @@ class Quadratic:
 
 @dataclass(frozen=True)
 class Step:
-    """Steps of L lanes.
+    """A step of each of L independent problems (lanes).
 
     trial (L, P): the point reached. predicted (L,): decrease of the cost according to the undamped model.
     solvable (L,): whether the damped model has a minimum.

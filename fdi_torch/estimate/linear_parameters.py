@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-RIDGE = 1e-6  # least root of a prior precision; keeps parameters without information in place
+RIDGE = 1e-6  # minimum root of a prior precision; keeps parameters without information in place
 
 
 def decomposed(

@@ -45,7 +45,7 @@ class Profile(Shown):
     """Profile likelihood of one parameter, SI units.
 
     x (K,): values at which the parameter was held, ascending. ratio (K,): likelihood ratio. theta (K, P): all
-    parameters there. converged (K,) bool: whether that fit converged. value: where the likelihood is greatest.
+    parameters there. converged (K,) bool: whether that fit converged. value: where the likelihood has its maximum.
     low, high: limits of the interval at `confidence`. ends: 'low', 'high' for limits that are the parameter's bound, or
     beyond which the readings set no limit. improvement: by how much the largest log-likelihood that the profile found
     exceeds that at the estimate.

@@ -26,7 +26,7 @@ from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.experiment import divided
 
 ROUNDS = 4
-"""Most divisions by errors of the plant; the error of a root at zero head falls slower than with the square."""
+"""Limit of divisions by the plant's errors: the error of a root at zero head falls slower than with the square."""
 MOST_DIVISION, MOST_ADDED = 8, 20_000
 """A recording grows at most by this factor, and by this number of steps; it then keeps larger errors."""
 

@@ -142,7 +142,7 @@ def _tolerances_of_causes(answer: Answer) -> dict[str, float]:
 
 
 def _same_shape(placed: PlacedEffect, before: PlantDescription, after: PlantDescription) -> PlacedEffect:
-    """The effect with unchanged parameters where their nominal values depend on constants that have changed."""
+    """The effect at `after`, with the parameters that it had at `before` even if their nominal values have changed."""
     old, new = (effect(placed.effect).parameters(placed.location, plant) for plant in (before, after))
     moved = {a.name: a.nominal for a, b in zip(old, new, strict=True) if a.nominal != b.nominal}
     return replace(placed, parameters={**moved, **placed.parameters})

@@ -35,7 +35,7 @@ UNDETERMINED = 1e-9  # precision, in units of a parameter's range, that counts a
 
 
 class Fitter:
-    """Fits candidates to one data set under one noise: of the sensors, and of random flows if `whitening` is given."""
+    """Fits candidates to one data set with one noise model: of the sensors, and of random flows by `whitening`."""
 
     def __init__(self, data: DataSet, noise: Noise, whitening: Recomputed[KalmanWhitening] | None = None) -> None:
         self.data, self.noise, self._whitening = data, noise, whitening
@@ -86,8 +86,8 @@ class Fitter:
     ) -> Fit:
         """Fit all starts of a candidate and return the best. Nuisance parameters start from `base`.
 
-        target: cost of the competitor; starts that approach it too slowly are given up. cap: most evaluations. held:
-        parameters that keep their initial values.
+        target: cost of the competitor; starts that approach it too slowly are given up. cap: maximum number of
+        evaluations. held: parameters that keep their initial values.
         """
         by_free: dict[tuple[str, ...], list[Start]] = {}
         for start in self._starts(candidate, base, target):

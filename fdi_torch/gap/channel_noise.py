@@ -64,7 +64,7 @@ class Noise:
 
     @property
     def energy(self) -> Tensor:
-        """Sum of the squared kernel, (C,): variance of the noise over that of the innovations."""
+        """Variance of the noise divided by that of its innovations, (C,)."""
         last = self.ar ** (2 * self.mean_of) if self.mean_of else 0.0
         return (1.0 - last) / (1.0 - self.ar**2)
 

@@ -20,8 +20,8 @@ from fdi_torch.simulate.joint_collocation import with_blanks
 from fdi_torch.simulate.resampling import interpolate, step_means
 
 FEWEST = 0.5
-"""Least valid readings of a mean, as a share of the usual number in a step; it limits the variance to twice the usual
-one."""
+"""Minimum number of valid readings of a mean, as a share of the usual number in a step; it limits the variance to twice
+the usual one."""
 
 
 @dataclass(frozen=True)

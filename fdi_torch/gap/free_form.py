@@ -30,7 +30,7 @@ from fdi_torch.plant.signals import Clock
 LOCAL_NODES, TIME_NODES = 8, 16
 HEAD_NODES = 14
 PRIOR = 0.2  # standard deviation of a coefficient
-NARROWEST = 1e-6  # width of a grid, in units of the plant's scales or of its greatest command
+NARROWEST = 1e-6  # width of a grid, in units of the plant's scales or of its largest command
 UNIT = 0.01  # size of a coefficient at which its influence on the readings is computed
 
 

@@ -89,7 +89,7 @@ class ScreeningResult:
     strength: Tensor
 
     def __add__(self, other: ScreeningResult) -> ScreeningResult:
-        """The screening of the options of both, made under one noise."""
+        """The options of both, which were screened with the same noise model."""
         score, strength = (torch.cat([getattr(x, name) for x in (self, other)]) for name in ("score", "strength"))
         return ScreeningResult(self.options + other.options, score, strength)
 

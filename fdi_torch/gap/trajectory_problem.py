@@ -172,7 +172,7 @@ def descend(
     box: tuple[Tensor, Tensor] | None = None,
 ) -> DescentResult:
     """Least squares from theta (L, P). readings: number of valid ones. target: cost of a competitor, see BEHIND.
-    cap: most evaluations. decrement: as DECREMENT. box: lower and upper bounds of each lane, (L, P) each."""
+    cap: maximum number of evaluations. decrement: as DECREMENT. box: bounds of each lane, low and high (L, P)."""
     # The optimiser's cost is a negative log-likelihood, half of chi-square.
     competition = Competition(0.5 * BEHIND, SHARE, 0.5 * target)
     share = decrement / max(readings, 1)

@@ -110,7 +110,7 @@ def _loaded(run: Run, message: Message) -> Any:
     try:
         return orjson.loads(message.data)
     except ValueError as error:
-        raise LogError(f"{run.path}: a message on {message.topic} is no JSON ({error})") from None
+        raise LogError(f"{run.path}: a message on {message.topic} is not JSON ({error})") from None
 
 
 def _header(name: str, unit: str) -> str:

@@ -50,7 +50,7 @@ class Recovery:
         gaps = "" if not self.lost else f"1 damaged stretch of {size} bytes is lost"
         if len(self.lost) > 1:
             gaps = f"{len(self.lost)} damaged stretches, {size} bytes in all, are lost"
-        end = "" if self.ended else "the run did not come to its end: up to its last second is missing"
+        end = "" if self.ended else "the run did not finish: at most its last second is missing"
         losses = "; ".join(part for part in (gaps, end) if part)
         return f"{self.source}: {self.messages} messages saved in {self.target}; {losses}"
 

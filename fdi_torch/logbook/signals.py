@@ -113,7 +113,7 @@ def arrays(run: Run, name: str = "results.npz") -> dict[str, np.ndarray]:
             expect_unpacked(unpacked, len(content), name, MOST_ARRAY_BYTES, MOST_ARRAY_EXPANSION)
             return {item.filename.removesuffix(".npy"): _array_in(archive.read(item)) for item in members}
     except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, NotImplementedError, RuntimeError) as error:
-        raise LogError(f"{run.path}: {name} is no .npz of plain arrays ({error})") from None
+        raise LogError(f"{run.path}: {name} is not an .npz file of plain arrays ({error})") from None
 
 
 def _array_in(content: bytes) -> np.ndarray:

@@ -175,7 +175,7 @@ def recovery_guesses(
     healthy: Tensor,
     hypotheses: Sequence[Hypothesis],
 ) -> Tensor:
-    """Starting values and onset of H recoveries, (H, P+1): the onset with the least sum of squared innovations."""
+    """Starting values and onset of H recoveries, (H, P+1): the onset with the smallest sum of squared innovations."""
     onsets = _onsets(window, ONSETS)
     theta = believed.repeat(len(hypotheses), ONSETS, 1)
     for i, hypothesis in enumerate(hypotheses):

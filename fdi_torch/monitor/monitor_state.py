@@ -43,7 +43,7 @@ class FaultTrack:
 
 @dataclass(frozen=True)
 class HiddenFault:
-    """A fault that seems to have ended, but that the readings since would not show, for example in a dry tank.
+    """A fault that seems to have ended while the readings could not show it, as a leak of a dry tank.
 
     track: before it ended. size: before it ended. ended: not before, s. seen: until when the readings were examined, s.
     """

@@ -68,7 +68,7 @@ class PlacedEffect:
 class FaultPriority:
     """The importance of a fault to the operators of the rig.
 
-    fault: its size parameter ('T1.leak.size'). smallest: least deviation from nominal that the monitor reports, SI.
+    fault: its size parameter ('T1.leak.size'). smallest: smallest deviation from nominal that the monitor reports, SI.
     urgency: a free word such as high.
     """
 
@@ -83,7 +83,7 @@ class PlantDescription:
 
     tolerances: prior standard deviations, of a constant ('P13.discharge_coefficient') relative to its value, of an
     offset, a start level or an effect's parameter ('Q1.pump_lag.time_constant') in its unit. varying: constants that
-    differ between recordings, such as the offset of a sensor that is zeroed before each run. matters: least
+    differ between recordings, such as the offset of a sensor that is zeroed before each run. matters: smallest
     reported size and urgency of single faults; the monitor reports any other fault at any size. units: units for
     display, see `fdi_torch.quantities.display_in`; they do not count for equality.
     """

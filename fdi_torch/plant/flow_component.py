@@ -116,7 +116,7 @@ class FlowComponent(Component):
 
     @property
     def full_command(self) -> float:
-        """Greatest useful value of the input channel, in its SI unit."""
+        """Largest useful value of the input channel, in its SI unit."""
         return 1.0
 
     def problems(self) -> Iterator[str]:

@@ -82,7 +82,7 @@ def bounded_by_recording(space: ParameterSpace, end: float) -> ParameterSpace:
 
 
 def head_range(plant: PlantDescription, pipe: str, operating_range: OperatingRange) -> Range:
-    """Least and greatest absolute driving head of a pipe or an outlet, m."""
+    """Minimum and maximum absolute driving head of a pipe or an outlet, m."""
     component, levels = plant.pipe(pipe), operating_range.levels
     low, high = (max(level - component.elevation, 0.0) for level in levels[component.source])
     if component.is_outlet:

@@ -211,8 +211,8 @@ def _runs(flags: Tensor) -> list[tuple[int, int]]:
 
 FROZEN_SAMPLES = 20
 ODD_SHARE, FEWEST_STEPS, ALIKE, IRREGULAR, FINER = 0.1, 40, 2.0, 3.0, 5.0
-"""A channel is logged on change if nine in ten of its steps exceed a least step, and the times between them differ by
-more than a factor of three. The least step is close to the usual one and far above the resolution.
+"""A channel is logged on change if nine in ten of its steps exceed a minimum step, and the times between them differ by
+more than a factor of three. The minimum step is close to the usual one and far above the resolution.
 """
 CLIPPED_SAMPLES = 5
 CLIPPED_PILE = 5.0
@@ -239,7 +239,7 @@ def reading_findings(recording: Recording) -> Iterator[ChannelFinding]:
 
 
 def _on_change(name: str, values: Tensor, time: Tensor, unit: str) -> Iterator[ChannelFinding]:
-    """Readings logged only when they have changed by a least step, so that successive ones are hardly ever closer."""
+    """Readings logged only when they have changed by a minimum step, so that successive ones are hardly ever closer."""
     steps, intervals = torch.diff(values).abs(), torch.diff(time)
     least_step = float(steps.quantile(ODD_SHARE)) if len(steps) >= FEWEST_STEPS else 0.0
     usual = float(steps.median())

@@ -99,7 +99,7 @@ def unit_notes(bounds: Sequence[Bound]) -> list[str]:
 
 
 def column_of(path: Path, header: Sequence[str], column: str) -> str:
-    """The header `column` of a column that is no channel. Raises ValueError, with the nearest, if there is none."""
+    """The header `column`, checked to exist. Raises ValueError, which suggests the most similar header."""
     if column in header:
         return column
     raise ValueError(f"{path}: expected a column '{column}', got {', '.join(header)}{nearest(column, header)}")

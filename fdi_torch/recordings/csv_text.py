@@ -153,7 +153,7 @@ def _encoding(path: Path, start: bytes) -> str:
     if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     if foreign or b"\0" in start:
-        got = foreign or "something that is no text"
+        got = foreign or "something that is not text"
         raise ValueError(f"{path}: expected a CSV, MCAP, Parquet, Feather, Excel, MATLAB or HDF5 file, got {got}")
     try:
         codecs.getincrementaldecoder("utf-8")().decode(start)

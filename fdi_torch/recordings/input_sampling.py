@@ -107,7 +107,7 @@ def _score_of_the_next(recording: Recording, plant: PlantDescription, pump: Mete
 
 
 def _scatter(recording: Recording, plant: PlantDescription, tank: str) -> float:
-    """Least noise or resolution of a tank's readings, as a level, m; infinite without a sensor."""
+    """Smallest noise or resolution of a tank's readings, as a level, m; infinite without a sensor."""
     scatters = [torch.inf]
     for sensor in plant.sensors:
         values = recording.valid_readings(sensor.column) / sensor.gain

@@ -26,7 +26,7 @@ BY_CHANCE = 1e-3
 
 @dataclass(frozen=True)
 class Scatter:
-    """A sensor's noise: standard deviation without quantization; and step: least difference of two values."""
+    """A sensor's noise: standard deviation without quantization; and step: smallest difference of two values."""
 
     noise: float
     step: float

@@ -28,7 +28,7 @@ from fdi_torch.plant.signals import Clock
 from fdi_torch.recording import Recording
 
 SAMPLES = 20_000
-"""Most samples of a thinned recording, for speed."""
+"""Maximum number of samples; longer recordings are thinned for speed."""
 GROUPS, SUMS = 16, 4
 """Groups of each tank's balance, and sums of successive intervals in each group."""
 DEVIATION = 0.07
@@ -65,7 +65,7 @@ class TankBalance:
     def log_evidence(self, rounding: float) -> float:
         """Log likelihood of the measured changes, up to a constant that all corrections share; NaN without intervals.
 
-        rounding: least uncertainty of the flows in a sum, m.
+        rounding: numerical error of the flows in a sum, the lower limit of their uncertainty, m.
 
         The variance of the sums is unknown; with GROUPS independent ones, the best fit of mean square s^2 has the
         likelihood s^-GROUPS. The prior of b is the multivariate Cauchy distribution of centre 1 and scale SCALE, a
@@ -121,7 +121,7 @@ def balance_along(plant: PlantDescription, recording: Recording, units: Mapping[
     """The balance between samples of a recording whose inputs are known, thinned to about SAMPLES.
 
     units: of the level changes of tanks, m, by default 1. Metered flows are not limited here, since they are
-    proportional to a wrong unit only below their greatest flow.
+    proportional to a wrong unit only below their maximum flow.
     """
     recording = recording.every(math.ceil(len(recording) / SAMPLES))
     network = build_network(plant)

@@ -66,7 +66,7 @@ class Material:
 
     @property
     def unexplained(self) -> bool:
-        """Whether the model of this run does not explain its recording; False for a log that does not say."""
+        """True if the log says that the model of this run fails to explain its recording."""
         return self.about("result").get("explained") == "false"
 
     @property

@@ -30,8 +30,8 @@ from fdi_torch.report.style import INK, MARK, MODEL, PAPER, SOFT, styled
 
 INCH = 0.8  # per unit of the drawing; a tank is one unit wide
 POINTS_PER_UNIT = 72 * INCH
-TALL = 1.4  # least height of a tank
-COLUMN, BETWEEN = 1.95, 1.7  # least distance from a tank's middle to the next one's; least free height between two rows
+TALL = 1.4  # minimum height of a tank
+COLUMN, BETWEEN = 1.95, 1.7  # minimum distance of two tanks' middles; minimum free height between two rows
 LOWEST = 0.12  # height of a line between two tanks above their floors
 ASIDE, LANE = 0.68, 0.36  # from a tank's middle to a line beside its left wall, and on to the next one
 

@@ -31,8 +31,8 @@ _SKELETON = Path(__file__).with_name("array_program.hpp")
 
 @dataclass(frozen=True)
 class NewtonControl:
-    """tolerance: largest correction, m, at which Newton's method has converged. rounds: most corrections of a block of
-    steps. guessed: whether the path is a guess of the trajectory."""
+    """tolerance: largest correction, m, at which Newton's method has converged. rounds: maximum number of
+    corrections of a block of steps. guessed: whether the path is a guess of the trajectory."""
 
     tolerance: float
     rounds: int

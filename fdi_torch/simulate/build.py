@@ -117,8 +117,8 @@ def _own_folder() -> Path:
         status = folder.lstat()
         if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid():
             raise BuildError(
-                f"{folder}: expected a folder of this user's own for compiled plants, got one of another user or a "
-                "link; remove it, or set XDG_CACHE_HOME"
+                f"{folder}: the cache of compiled plants has to be a folder that you own, but another user owns it or "
+                "it is a link; remove it, or set XDG_CACHE_HOME"
             )
         if stat.S_IMODE(status.st_mode) != 0o700:
             folder.chmod(0o700)

@@ -37,8 +37,8 @@ from fdi_torch.simulate.traced_rates import traced_rates
 # Newton's method has converged at corrections below these, in units of the plant's length scale: of the whole plant,
 # of one tank.
 CONVERGED, ONE_CONVERGED = 1e-7, 1e-5
-ONE_ROUNDS = 8  # most corrections of one tank
-ROUNDS = 12  # most corrections of a block of steps
+ONE_ROUNDS = 8  # maximum number of corrections of one tank
+ROUNDS = 12  # maximum number of corrections of a block of steps
 
 
 class Collocation:

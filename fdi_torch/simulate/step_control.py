@@ -22,7 +22,7 @@ STEP_FOR_ONE_METRE = 2000.0
 CROSSING = 0.25
 # Number of steps whose errors accumulate before the tanks' dynamics damp them.
 ADDED_UP = 100.0
-LONGER, SHORTER = 3.0, 0.1  # greatest and least ratio of successive steps
+LONGER, SHORTER = 3.0, 0.1  # maximum and minimum ratio of successive steps
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class StepControl:
     """The accuracy of adaptive steps.
 
     tolerance: of a level's error per step, m. resolution: time scale of the smoothing of square roots and rims, s.
-    shortest: least length of a step, s. slope_tolerance: error per step of a level's slope by a parameter, relative to
-    that parameter's largest slope so far. At the kink of a root, the error of levels grows with step^1.5 and that of
+    shortest: minimum length of a step, s. slope_tolerance: error per step of a level's slope by a parameter, relative
+    to that parameter's largest slope so far. At the kink of a root, the error of levels grows with step^1.5 and that of
     slopes with step^0.5, so that it is the cube root of the levels' tolerance.
     """
 

@@ -7,9 +7,9 @@ from typing import Literal
 
 Estimator = Literal["free", "boxed", "correlation", "linearised", "search"]
 ESTIMATORS: Mapping[Estimator, str] = {
-    "free": "greatest likelihood without bounds on the parameters",
-    "boxed": "greatest likelihood within the bounds",
-    "correlation": "greatest correlation of readings and model, the objective of the 2020 paper",
+    "free": "maximum likelihood without bounds on the parameters",
+    "boxed": "maximum likelihood within the bounds",
+    "correlation": "maximum correlation of readings and model, the objective of the 2020 paper",
     "linearised": "the efficient estimator, which knows the truth",
     "search": "the best of the global search, not refined",
 }

@@ -143,7 +143,7 @@ def test_what_is_no_json_is_not_exported(tmp_path: Path) -> None:
     sink.message(Channel("/a", "cdr"), 0, 0, 0, b"\x00")
     sink.message(Channel("/b", "json"), 0, 0, 0, b"\x00")
     sink.finish()
-    for topic, reason in (("/a", "is in cdr"), ("/b", "is no JSON")):
+    for topic, reason in (("/a", "is in cdr"), ("/b", "is not JSON")):
         with pytest.raises(LogError, match=reason):
             export(read_run(tmp_path / "a.mcap"), topic, "ndjson", io.BytesIO())
 

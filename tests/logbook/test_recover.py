@@ -140,7 +140,7 @@ def test_the_report_tells_what_was_lost(tmp_path: Path) -> None:
     assert done.target == tmp_path / "a.recovered.mcap" and done.messages == 40 and not done.whole and not done.ended
     assert [(gap.start, gap.end) for gap in done.lost] == [chunks[1][:2], (chunks[3][0], chunks[3][0] + 30)]
     assert "40 messages saved" in done.sentence and "2 damaged stretches" in done.sentence
-    assert "did not come to its end" in done.sentence
+    assert "did not finish" in done.sentence
     run = read_run(done.target)
     record = run.metadata["fdi_torch.recovery"]
     assert record["lost"] == "2" and record["ended"] == "false" and record["lost.0"].startswith(f"{chunks[1][0]} to ")
@@ -153,7 +153,7 @@ def test_a_file_cut_between_two_chunks_has_no_damage_and_yet_no_end(tmp_path: Pa
     source.write_bytes(source.read_bytes()[:third])
     done = recover(source)
     assert done.messages == 40 and not done.lost and not done.ended and not done.whole
-    assert "did not come to its end" in done.sentence
+    assert "did not finish" in done.sentence
 
 
 def test_a_whole_file_is_said_to_be_whole(finished: Path) -> None:

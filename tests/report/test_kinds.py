@@ -189,7 +189,7 @@ def test_a_study_page_shows_settings_and_trials(tmp_path: Path) -> None:
     assert {"trials_1", "errors_2", "isolation"} <= names(made) and ">T1.leak<" in text
     assert "cost, no unit" in text or ">cost<" in text
     assert ">iterations<" not in text, "the same in all trials"
-    assert "Estimator: free, greatest likelihood without bounds on the parameters." in text
+    assert "Estimator: free, maximum likelihood without bounds on the parameters." in text
     assert "38 of 40 modes stated correctly; 2 faults missed" in text and "none (10 %)" in text
 
 

@@ -61,7 +61,7 @@ class LocalSignals:
     """Local signals (K,) along one recording, and the terms that depend on them.
 
     step (K,): lengths of the steps, s. scale: time scale of the plant. recordings: the signals of all recordings,
-    between whose least and greatest values the grids lie. In all terms, factor is the name of a signal that multiplies
+    between whose minimum and maximum the grids lie. In all terms, factor is the name of a signal that multiplies
     the regressors, if given.
     """
 
@@ -69,7 +69,7 @@ class LocalSignals:
         self.signals, self.step, self.scale, self.recordings = signals, step, scale, recordings
 
     def ends(self, signal: str) -> tuple[float, float]:
-        """Least and greatest value of a signal over all recordings."""
+        """Minimum and maximum of a signal over all recordings."""
         low = min(float(s[signal].min()) for s in self.recordings)
         high = max(float(s[signal].max()) for s in self.recordings)
         return low, max(high, low + 1e-9 * (max(abs(low), abs(high)) or 1.0))
@@ -164,7 +164,7 @@ class DiscrepancyModel:
 
 
 def discrepancy_model_at(place: str, plant: PlantDescription) -> DiscrepancyModel:
-    """The discrepancy model of a place that is no sensor."""
+    """The discrepancy model of a place other than a sensor."""
     kind = place_kind(plant, place)
     if kind == "tank_pair":
         return _pair(place, plant)

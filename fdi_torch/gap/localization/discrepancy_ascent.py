@@ -139,7 +139,7 @@ class Ascent:
         start: Tensor | None = None,
         exchanges: bool = False,
     ) -> EvaluatedDiscrepancy:
-        """The discrepancy under one noise.
+        """The most probable discrepancy for one noise model.
 
         start (M,): precisions of its columns from which the regression starts. Without it, the regression starts from
         nothing, and the regressor at the best of all positions is one more column: a stiction whose band lies between

@@ -49,7 +49,7 @@ FREQUENCY_ERROR = 1.0 / 600.0  # of the best frequency, in units of 1/T
 
 class Positions:
     """All positions of a kink, a jump, a relay or a step in time at a place, and all frequencies of its sinusoids,
-    under one noise.
+    for one noise model.
 
     under: fitter with the disturbance noise. precision (M,): of the columns of the discrepancy, infinite for those that
     are not used. The strength of each position is computed with these present; regressors that are added later only

@@ -20,7 +20,7 @@ from fdi_torch.gap.marginal_likelihood import occam, with_disturbances
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.linearised import Linearised
 
-COLLINEAR = 1e-12  # least share of a parameter's variance that others leave, a limit of rounding
+COLLINEAR = 1e-12  # minimum share of a parameter's variance that others leave, a limit of rounding
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ FATIGUE_TIMES = (150.0, 500.0)  # s, of the mean of a flow's recent past that ch
 RAMPS = 12  # ramps in time, at equal distances
 CYCLES = 8  # fewest periods in a recording of a line that its spectrum shows
 SLOW_CYCLES = tuple(1.0 + 0.25 * j for j in range(4 * (CYCLES - 1)))  # periods of slower sinusoids
-STEPS = 120  # most step functions of time, over all recordings
+STEPS = 120  # maximum number of step functions of time, over all recordings
 SAMPLES_A_STEP = 9  # fewest samples per step function of time
 HARMONICS = 3  # of a dominant frequency of the residual
 

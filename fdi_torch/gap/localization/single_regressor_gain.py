@@ -52,7 +52,7 @@ class SingleRegressorGain(NamedTuple):
 
 
 class SingleRegressorGains:
-    """Gain in log evidence of the best single regressor of a place, under one noise.
+    """Gain in log evidence of the best single regressor of a place, for one noise model.
 
     under: fitter with the disturbance noise.
     """

@@ -135,7 +135,7 @@ def _with_notes(recording: Recording, stuck: Sequence[StuckSegment]) -> Recordin
 
 
 MANY = 3
-"""Most stuck segments of one sensor that are reported, the longest."""
+"""Maximum number of stuck segments reported per sensor, the longest ones."""
 
 
 def _longest_first(stuck: Sequence[StuckSegment]) -> list[StuckSegment]:

@@ -138,9 +138,10 @@ def blockwise_fit(
     cap: int = CAP,
     target: float = -math.inf,
 ) -> BlockwiseFit:
-    """Fit the plant, with the effects of a candidate, within its tolerances. cap: most evaluations of one fit.
+    """Fit the plant, with the effects of a candidate, within its tolerances.
 
-    target: log-likelihood of the competitor; a fit that approaches it too slowly is given up, as in `Fitter.fit`.
+    cap: maximum number of evaluations of one fit. target: log-likelihood of the competitor; a fit that approaches it
+    too slowly is given up, as in `Fitter.fit`.
     """
     data = blocked.data
     spans = torch.tensor([reading_span(blocked.plant, s) for s in blocked.plant.sensors], dtype=torch.float64)

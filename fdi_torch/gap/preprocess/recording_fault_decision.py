@@ -35,10 +35,10 @@ library lacks (`estimate.evidence.Odds`)."""
 SURE = math.log(0.95 / 0.05)
 """Posterior log odds above which a fault is reported."""
 EVALUATIONS = 30
-"""Most evaluations of the fit of a rival effect. It limits computing time: a fit that is stopped early understates the
-evidence for the rival, so that a fault of the recording is reported more easily."""
+"""Maximum number of evaluations of the fit of a rival effect. It limits computing time: a fit that is stopped early
+understates the evidence for the rival, so that a fault of the recording is reported more easily."""
 RIVALS, MOST_EFFECTS = 6, 2
-"""Most rival effects fitted, and most effects in one combination; they limit computing time as well."""
+"""Maximum numbers of rival effects fitted and of effects in one combination; they limit computing time as well."""
 
 
 def recording_fault(

@@ -29,7 +29,7 @@ class Transfer(MeteredFlow):
     name: str
     source: str = word_field("the tank it draws from")
     target: str = word_field("the tank it leads to, or outside", written_default=OUTSIDE)
-    max_flow: float = quantity_field("m^3/s", "greatest flow, m^3/s", role="estimated")
+    max_flow: float = quantity_field("m^3/s", "maximum flow, m^3/s", role="estimated")
     gain: float = gain_field()
     command: str | None = word_field("its input channel, if it differs from its name", default=None)
     gain_unit: str = "1"

@@ -194,5 +194,5 @@ def calibration_panel(title: str, bins: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def _intervals(scores: Sequence[Share]) -> np.ndarray:
-    """The least value of each, the share, and the largest value (3, scores), %."""
+    """The minimum of each, the share, and the largest value (3, scores), %."""
     return 100 * np.array([(s["ci95"][0], s["share"], s["ci95"][1]) for s in scores]).T
