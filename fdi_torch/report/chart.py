@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from fdi_torch.clock import clock_text, clock_zero
 from fdi_torch.report.html import clean, short
-from fdi_torch.report.style import HEIGHT, MARK, SOFT, VARIABLES, label_lines, logarithmic, panel, styled
+from fdi_torch.report.style import HEIGHT, MARK, SOFT, VARIABLES, label_lines, logarithmic, panel
 
 BINS = 400
 
@@ -61,7 +61,6 @@ MOST_EVENTS = 50
 TIME = "time, s"  # label of a time axis
 PLANNED = "next"  # name of the clock of charts that show the proposed experiment
 LATE_DIGITS, ROUNDING = 1e-5, 1e-15  # differences relative to the values: beyond the fifth digit; of rounding
-ONE_ROW = 44  # letters of title and names of lines that fit one row above the picture
 
 
 class Line(NamedTuple):
@@ -163,9 +162,6 @@ def draw(chart: Chart) -> Figure:
         axes.set_ylim(bottom=0.0)
     if len(chart.lines) > 1:
         label_lines(axes)
-        if len(chart.title) + sum(len(line.name) + 4 for line in chart.lines) > ONE_ROW:
-            with styled():
-                axes.set_title(short(chart.title), pad=18.0)
     return figure
 
 

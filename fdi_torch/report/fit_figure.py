@@ -15,7 +15,7 @@ from fdi_torch.recording import Recording
 from fdi_torch.report.chart import thinned
 from fdi_torch.report.html import short
 from fdi_torch.report.numbers import axis, shown_unit
-from fdi_torch.report.style import MARK, MODEL, SOFT, label_lines, set_title, styled
+from fdi_torch.report.style import MARK, MODEL, SOFT, label_lines, set_panel_title, set_title, styled
 
 
 def fit_figure(
@@ -37,9 +37,9 @@ def fit_figure(
         FigureCanvasAgg(figure)
         axes = figure.subplots(2, count, sharex=True, squeeze=False, height_ratios=(2, 1))
         for i, column in enumerate(columns):
+            set_panel_title(axes[0, i], short(plant.channel_words(column)))
             of_sensor = {name: predicted[:, i] for name, predicted in predictions.items()}
             _draw_sensor(axes[0, i], axes[1, i], recording, recording.output_names.index(column), of_sensor)
-            axes[0, i].set_title(short(plant.channel_words(column)))
         set_title(figure, title)
     return figure
 

@@ -80,7 +80,7 @@ def panel(title: str, x_label: str, y_label: str, width: float = WIDTH, height: 
         figure = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.subplots()
-        axes.set_title(title)
+        set_panel_title(axes, title)
         axes.set_xlabel(x_label)
         axes.set_ylabel(y_label)
     return figure, axes
@@ -112,8 +112,11 @@ def power_text(value: float) -> str:
 
 
 def label_lines(axes: Axes, columns: int = 4) -> None:
-    """Label the lines above the plot in their colours, so that no box hides data."""
+    """Label the lines above the plot in their colours, so that no box hides data; a long title is above the labels."""
+    title, names = axes.get_title("left"), axes.get_legend_handles_labels()[1]
     with styled():
+        if "\n" in title or len(title) + sum(len(name) + 4 for name in names) > _row(axes):
+            axes.set_title(title, pad=18.0)
         axes.legend(
             loc="lower right",
             bbox_to_anchor=(1.02, 0.97),
@@ -126,6 +129,18 @@ def label_lines(axes: Axes, columns: int = 4) -> None:
             borderaxespad=0.0,
             fontsize=9.0,
         )
+
+
+def set_panel_title(axes: Axes, title: str) -> None:
+    """Set the title of a panel, broken into lines that fit its width."""
+    axes.set_title(fill(title, _row(axes)))
+
+
+def _row(axes: Axes) -> int:
+    """Letters of a panel's title that fit one row."""
+    place, figure = axes.get_subplotspec(), axes.get_figure(root=True)
+    columns = place.get_gridspec().ncols if place else 1
+    return int(LETTERS_AN_INCH * (figure.get_figwidth() / columns - 0.7)) if figure else MOST_TITLE
 
 
 def set_title(figure: Figure, title: str) -> None:

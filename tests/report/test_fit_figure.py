@@ -8,8 +8,10 @@ from matplotlib.figure import Figure
 
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.recording import Recording
+from fdi_torch.report.chart import Chart, Line, draw
 from fdi_torch.report.fit_figure import fit_figure
-from fdi_torch.report.style import set_title
+from fdi_torch.report.sections.gap_closure import curve_panel
+from fdi_torch.report.style import MODEL, set_title
 
 TITLE = "est: fault not isolated: T2.leak.size or OUT2.plugging.size (T2.leak.size - OUT2.plugging.size = 0.1 ± 0.008)"
 
@@ -29,6 +31,26 @@ def test_title_and_labels_fit_into_the_picture(sensors: int) -> None:
         assert figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1
     for axes in figure.axes:
         assert axes.yaxis.label.get_window_extent().height <= axes.get_window_extent().height
+
+
+NAMES = ("h1", "LI101", "Füllstand LI-101 im Behälter")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_title_of_a_panel_is_apart_from_the_labels_of_its_lines(name: str) -> None:
+    time = torch.arange(50.0, dtype=torch.float64)
+    read = torch.sin(time)[:, None].expand(-1, 2)
+    recording = Recording(time, time[:, None], read, ("Q",), (name, f"{name}2"), ("m^3/s",), ("m",) * 2)
+    figure = fit_figure(recording, {"nominal": 0.8 * read, "corrected": 0.9 * read}, "run", load_plant("three_tank"))
+    lines = [Line(each, time.numpy(), read[:, 0].numpy(), MODEL) for each in ("recalibrated", "with the causes")]
+    curve = {"location": "P", "variable": f"{name} commanded", "at": [0, 1], "free": [0, 1], "free_std": [1, 1]}
+    panels = [draw(Chart("a", f"{name}, hold-out", "reading, m", lines)), curve_panel({**curve, "effect": [0, 1]})]
+    for each in (figure, *panels):
+        each.draw_without_rendering()
+        for axes in (axes for axes in each.axes if axes.get_legend()):
+            title, labels = axes._left_title.get_window_extent(), axes.get_legend().get_window_extent()
+            assert not title.overlaps(labels), axes.get_title("left")
+            assert title.x1 <= each.bbox.x1 and title.y1 <= each.bbox.y1
 
 
 def test_a_value_stays_beside_its_error() -> None:

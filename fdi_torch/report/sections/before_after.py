@@ -105,7 +105,7 @@ def _variables(material: Material, recording: Signals) -> Iterator[tuple[str, st
         yield f"By {name}", axis(f"{name} commanded", unit), scale * recording.inputs[:, i]
     for name, head in _heads(material, recording):
         unit, scale = shown_unit("m")
-        yield f"By the flow in {name}", axis("head along the pipe", unit), scale * head
+        yield f"By the head along {name}", axis("head along the pipe", unit), scale * head
 
 
 def _heads(material: Material, recording: Signals) -> Iterator[tuple[str, np.ndarray]]:

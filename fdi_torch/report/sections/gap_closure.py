@@ -207,8 +207,7 @@ def curve_panel(curve: Mapping[str, Any]) -> Figure:
     x, free, std = scale * as_vector(curve["at"]), y_scale * as_vector(curve["free"]), as_vector(curve["free_std"])
     name = short(curve.get("variable", ""), 30)
     label = axis(QUANTITIES.get(quantity, "added"), y_unit)
-    below = "\n" if "effect" in curve else ""  # a line for the labels
-    figure, axes = panel(f"{short(curve.get('location', ''), 20)}: by {name}{below}", axis(name, unit), label)
+    figure, axes = panel(f"{short(curve.get('location', ''), 20)}: by {name}", axis(name, unit), label)
     axes.axhline(0.0, color=SOFT, lw=0.8)
     axes.fill_between(x, free - 2.0 * y_scale * std, free + 2.0 * y_scale * std, color=MODEL, alpha=0.2, lw=0.0)
     axes.plot(x, free, color=MODEL, lw=1.4, label="free function")
