@@ -214,3 +214,17 @@ def test_the_result_of_a_gap_is_on_one_screen(browser: Any, plant: str, tmp_path
         box = tab.locator("section", has=tab.locator(f"h3:text-is('{title}')")).bounding_box()
         assert box["y"] >= 0 and box["y"] + box["height"] <= height, title
     tab.context.close()
+
+
+@pytest.mark.parametrize(("name", "width"), [("T1.leak.size", 1100), ("Zulauf_FIC_101.pump_lag.time_constant", 1280)])
+def test_an_estimate_beside_the_rig_shows_all_its_columns(browser: Any, tmp_path: Path, name: str, width: int) -> None:  # noqa: F811
+    """A long name takes its place from the rig. A still longer one scrolls within its card."""
+    target = tmp_path / "train.html"
+    target.write_text(
+        page([report_of(material_of(write_train(tmp_path / "train.mcap", name), load_plant("three_tank")))])
+    )
+    tab, _ = opened(browser, target, width)
+    hidden = tab.locator(".lead .scroll").first.evaluate("e => e.scrollWidth - e.clientWidth")
+    rig, window = tab.locator(".lead > section").first.bounding_box(), tab.evaluate("document.body.scrollWidth")
+    assert hidden <= 0 and rig["width"] >= 280 and window <= width
+    tab.context.close()
