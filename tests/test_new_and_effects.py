@@ -16,7 +16,7 @@ import fdi_torch
 from fdi_torch import cli
 from fdi_torch.config.channels import mapped
 from fdi_torch.config.estimation import parameter_values, placements_of
-from fdi_torch.config.file_templates import template
+from fdi_torch.config.file_templates import plant_from_recording, template
 from fdi_torch.config.loaded_recordings import listed_recordings, read_recording
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import build_plant, load_plant
@@ -118,6 +118,13 @@ def test_a_spreadsheet_in_place_of_a_yaml_file_is_no_text(tmp_path: Path) -> Non
     (tmp_path / "trend.xlsx").write_bytes(b"PK\x03\x04\x8c\x00")
     with pytest.raises(ConfigError, match=r"expected a YAML file \(text in UTF-8\), got other bytes"):
         load_run(tmp_path / "trend.xlsx")
+
+
+def test_a_tank_of_a_new_plant_holds_the_levels_of_its_column_in_their_unit(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text("Zeit (s);Zulauf (L/min);LI-101 (mm);PI-102 (mbar)\n0;20;832,5;40\n1;20;700;41\n")
+    text = plant_from_recording(path, "rig")
+    assert "A: {area: 200 cm^2, height: 920 mm}" in text and "B: {area: 200 cm^2, height: 60 cm}" in text
 
 
 def test_an_effect_of_the_catalogue_is_shown_with_its_parameters() -> None:

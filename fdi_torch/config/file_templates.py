@@ -241,7 +241,7 @@ def plant_from_recording(path: Path, name: str) -> str:
         f"name: {name}",
         "",
         "tanks:    # ! cross-section, and height from the floor to the rim",
-        *(f"  {tank}: {{area: 200 cm^2, height: {100.0 * HEIGHT:g} cm}}" for tank in tanks),
+        *(f"  {tank}: {{area: 200 cm^2, height: {_height(c)}}}" for tank, c in zip(tanks, sensors, strict=True)),
         "",
         "pipes:    # ! which there are, and the area of each orifice; target outside: an outlet",
         *(
@@ -271,6 +271,13 @@ def _columns(path: Path, headers: list[str]) -> list[_Column]:
         _Column(header, name, spelled(unit), kind, high)
         for (header, name, unit), kind, high in zip(split, kinds, highest, strict=True)
     ]
+
+
+def _height(column: _Column) -> str:
+    """A height a tenth above the highest level of a column, in its unit."""
+    if column.kind != "m" or column.highest <= 0.0:
+        return f"{100.0 * HEIGHT:g} cm"
+    return f"{_rounded_up(1.1 * column.highest / unit_factor(column.unit, 'm')):.10g} {column.unit}"
 
 
 def _pump(column: _Column, tank: str) -> str:

@@ -35,7 +35,7 @@ def estimate_section(material: Material) -> Section | None:
     header += HEADER
     header += ["simulated"] if material.truth else []
     notes = [str(note) for note in final.get("unidentifiable") or ()]
-    notes += [f"{name} lies at the edge of its range" for name in final.get("at_bound") or ()]
+    notes += [f"{name} lies at an end of its range" for name in final.get("at_bound") or ()]
     return Section(
         "Estimate", [table(header, rows, left=header.index("unit") + 1), *_water(material), *bullets(notes)], lead=True
     )
