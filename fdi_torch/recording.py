@@ -49,6 +49,12 @@ class Recording(Shown):
     written: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
+        for given in (self.time, self.inputs, self.outputs):
+            if not isinstance(given, torch.Tensor):
+                raise TypeError(
+                    f"{self.source}: expected time, inputs and outputs to be tensors, got a {type(given).__name__}; "
+                    "convert it by torch.tensor(..., dtype=torch.float64)"
+                )
         if self.mask is None:
             object.__setattr__(self, "mask", torch.isfinite(self.outputs))
         samples = len(self.time)

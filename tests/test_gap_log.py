@@ -180,7 +180,7 @@ def test_an_invalid_step_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
     file = str(write_csv(recorded(GAIN, 3, samples=100), tmp_path / "run.csv"))
     words = ["gap", "--plant", "three_tank", "--recording", file, "--step", "0", "--out", str(tmp_path)]
     assert cli.main(words) == cli.MISUSE
-    assert "--step: expected a positive number of seconds, got 0" in capsys.readouterr().err
+    assert "step: expected a positive number of seconds, got 0" in capsys.readouterr().err
 
 
 def test_what_cannot_be_diagnosed_leaves_no_log(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -346,6 +346,22 @@ def test_arguments_of_another_kind_are_named() -> None:
     for function in (fdi_torch.gap, fdi_torch.refit):
         with pytest.raises(ValueError, match=r"(gap|refit): expected a recording with at least two samples, got none"):
             function(RIG, [])  # type: ignore[operator]
+    for setting, said in (
+        ({"most": 0}, "most: expected at least one effect, got 0"),
+        ({"step": -1.0}, "step: expected"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            fdi_torch.gap(RIG, simulated(), **setting)
+    with pytest.raises(ValueError, match="report: expected at least one log, got none"):
+        fdi_torch.report([])
+    with pytest.raises(TypeError, match=r"expected a pandas\.DataFrame, got a dict; make one by pandas\.DataFrame"):
+        fdi_torch.read_frame({"t_s": [0, 1]}, RIG)
+    with pytest.raises(
+        TypeError, match=r"expected time, inputs and outputs to be tensors, got a list; .* torch\.tensor"
+    ):
+        fdi_torch.Recording([0, 1], [[1], [1]], [[1], [1]], ("Q",), ("h",), ("m^3/s",), ("m",))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"expected a file that ends in \.fmu, got notes\.txt; rename it"):
+        fdi_torch.export_fmu(RIG, "notes.txt")
     with pytest.raises(TypeError, match="predict: expected one recording, got a list of 2"):
         fdi_torch.predict(RIG, [simulated(), simulated()])  # type: ignore[arg-type]
     with pytest.raises(

@@ -50,18 +50,13 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         screen.note(note)
     show_clock(r.clock_zero for r in recordings)
     library = library_entries(names(arguments.library)) or None
-    if arguments.step is not None and not arguments.step > 0.0:
-        raise ValueError(f"--step: expected a positive number of seconds, got {arguments.step:g}")
+    settings = Settings(library, names(arguments.leave_out), arguments.step, arguments.most, arguments.named_only)
     if arguments.adopt:
         expect_writable(Path(arguments.adopt))
-    if arguments.most < 1:
-        raise ValueError(f"--most: expected at least one effect, got {arguments.most}")
-    left_out = names(arguments.leave_out)
     arguments.with_constants |= arguments.narrow
     folder = Path(arguments.out)
     log = free_path(folder, "gap")
     with screen.progress("gap") as advance:
-        settings = Settings(library, left_out, arguments.step, arguments.most, arguments.named_only)
 
         def next_stage(share: float, text: str) -> None:
             release_memory()

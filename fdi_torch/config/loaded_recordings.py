@@ -191,8 +191,11 @@ def read_frame(frame: Any, plant: AnyPlant, **keys: Any) -> Recording:
     Columns have headers as in a CSV file (`h1_cm`, `h1 [cm]`), or the names of the plant's channels with their units in
     `frame.attrs["units"]`, as `Recording.to_pandas` returns them. Time is the index if it has a name, else a column.
     keys: further keys of the entry under `recordings:` in a run file, such as columns={"h1": {"column": "LT1", "unit":
-    "mm"}}. An index of time stamps needs no name. Raises ConfigError naming row and column.
+    "mm"}}. An index of time stamps needs no name. Raises ConfigError naming row and column, TypeError for no frame.
     """
+    if not hasattr(frame, "to_csv"):
+        kind = type(frame).__name__
+        raise TypeError(f"expected a pandas.DataFrame, got a {kind}; make one by pandas.DataFrame(...)")
     if frame.index.name is None and frame.index.dtype.kind == "M":
         frame = frame.rename_axis(index="t")
     units = frame.attrs.get("units", {})

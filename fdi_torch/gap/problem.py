@@ -52,6 +52,12 @@ class Settings:
     named_only: bool = False
     trusted: bool = False
 
+    def __post_init__(self) -> None:
+        if self.most < 1:
+            raise ValueError(f"most: expected at least one effect, got {self.most}")
+        if self.step is not None and not self.step > 0.0:
+            raise ValueError(f"step: expected a positive number of seconds, got {self.step:g}")
+
 
 PLAIN = Settings()
 

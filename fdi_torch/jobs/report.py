@@ -54,9 +54,11 @@ def report(
     """Write one page for the logs; several logs are also compared.
 
     out: the page or its folder; by default next to the first log. pictures: also write each picture as PNG and SVG.
-    Raises ValueError if a log cannot be read or the page's name does not end in .html.
+    Raises ValueError without logs, if one cannot be read, or if the page's name does not end in .html.
     """
     paths = [Path(name) for name in ([logs] if isinstance(logs, str | Path) else logs)]
+    if not paths:
+        raise ValueError("report: expected at least one log, got none; name some")
     target = page_path(paths, None if out is None else str(out))
     reports: list[RunReport] = []
     notes: list[str] = []

@@ -37,8 +37,10 @@ def write_fmu(network: TankNetwork, path: Path) -> list[Variable]:
     """Write the FMU of a plant with its placed effects for this kind of machine, and return its variables.
 
     The zip file holds modelDescription.xml, the compiled library and, under sources/, the C++ it was compiled from.
-    Raises ValueError if an effect has a dead time, BuildError without a compiler, DiskError.
+    Raises ValueError for another ending or an effect with a dead time, BuildError without a compiler, DiskError.
     """
+    if path.suffix.lower() != ".fmu":
+        raise ValueError(f"expected a file that ends in .fmu, got {path}; rename it")
     source = fmu_source(network)
     variables = variables_of(network)
     name = network.description.name or "plant"
