@@ -454,6 +454,14 @@ def test_refit_and_predict_tell_how_far_they_are() -> None:
         assert shares[0] == 0.0 and shares[-1] == 1.0 and shares == sorted(shares)
 
 
+def test_draws_tell_how_far_they_are(tmp_path: Path) -> None:
+    pytest.importorskip("emcee")
+    told: list[tuple[float, str]] = []
+    found = fdi_torch.train(RIG, simulated(), ["A.leak"], output={"folder": str(tmp_path)})
+    found.sample(8, most_steps=200, tell=lambda share, text: told.append((share, text)))
+    assert told[-1][0] <= 1.0 and told[-1][1].startswith("draws: ")
+
+
 def test_an_effect_without_a_field_means_its_size() -> None:
     fitting = fdi_torch.set_up(RIG, [simulated()], ["A.leak", "Q.gain"], "equilibrium")
     assert fitting.space.names == ("A.leak.size", "Q.gain")

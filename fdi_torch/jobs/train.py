@@ -90,9 +90,15 @@ class TrainResult(Shown):
         return profiles_of(self.fitting, self.result, names or self.result.estimate.names, confidence)
 
     @in_its_units
-    def sample(self, draws: int = 1000, seed: int = 0, most_steps: int = 16_000) -> Draws:
-        """Draws from the posterior (extra `draws`); see `draw_posterior`."""
-        drawn = with_draws(self.fitting, self.result, draws, seed, most_steps).estimate.draws
+    def sample(
+        self,
+        draws: int = 1000,
+        seed: int = 0,
+        most_steps: int = 16_000,
+        tell: Tell = lambda share, text: None,
+    ) -> Draws:
+        """Draws from the posterior (extra `draws`); see `draw_posterior`. tell: as of `train`; it may take minutes."""
+        drawn = with_draws(self.fitting, self.result, draws, seed, most_steps, tell).estimate.draws
         assert drawn is not None
         return drawn
 
