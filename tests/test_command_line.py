@@ -116,6 +116,52 @@ def test_check_shows_channels_and_findings(rig: str, capsys: pytest.CaptureFixtu
     assert "h1       output  cm          40" in shown
 
 
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        (
+            "simulate.faults.T1.leek=0.3",
+            "simulate.faults: expected a parameter of the plant or its faults, got 'T1.leek'",
+        ),
+        ("simulate.faults.T1.leak=30", "simulate.faults.T1.leak: expected a size from 0 to 1, got 30"),
+        ("simulate.duration=600", "simulate.duration: expected a quantity in s, got the bare number 600"),
+        ("foo=1", "expected a known key (plant, recordings, "),
+        ("estimate.search={population: 2}", "estimate.search: expected a population of at least 4"),
+    ],
+)
+def test_a_wrong_value_of_the_option_set_is_not_blamed_on_the_file(
+    capsys: pytest.CaptureFixture[str], override: str, told: str
+) -> None:
+    assert cli.main(["simulate", "--quiet", "--set", "seed=3", "--set", override]) == cli.MISUSE
+    assert f"fdi simulate: --set {override}: {told}" in capsys.readouterr().err
+
+
+def test_a_mistake_in_the_file_is_blamed_on_it_beside_the_option_set(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run.yaml").write_text("simulate: {duration: 5, sample_tme: 1 s}")
+    words = ["--config", str(tmp_path / "run.yaml"), "--set", "seed=1", "--set", "simulate.sample_time=1 s"]
+    assert cli.main(["simulate", "--quiet", *words]) == cli.MISUSE
+    assert all(
+        f"fdi simulate: {tmp_path / 'run.yaml'}: simulate" in line for line in capsys.readouterr().err.splitlines()
+    )
+
+
+def test_a_misspelt_list_of_recordings_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "runs.yaml").write_text("plant: three_tank\nrecordigns: [{file: run.csv}]")
+    assert cli.main(["predict", "--plant", "three_tank", "--recording", str(tmp_path / "runs.yaml")]) == cli.MISUSE
+    assert (
+        "expected at least one, got none; list files under it; the nearest is 'recordigns'" in capsys.readouterr().err
+    )
+
+
+def test_a_command_without_its_file_says_what_writes_one(capsys: pytest.CaptureFixture[str]) -> None:
+    for command, kind in (("monitor", "monitor"), ("rehearse", "rehearsal"), ("study", "study")):
+        with pytest.raises(SystemExit):
+            cli.main([command])
+        assert f"required: --config; fdi new {kind} writes such a file" in capsys.readouterr().err
+
+
 def test_check_says_first_that_readings_lie_beyond_a_tank(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A plant file whose sizes are still those of the example, 60 cm of height, for levels up to 2 m."""
     rows = [f"{10 * k},{4 + k % 2},{1200 + 8 * (k % 90)},{800 + 3 * (k % 90)}" for k in range(300)]

@@ -164,7 +164,7 @@ def test_inputs_that_never_change() -> None:
     still = healthy()
     held = replace(still, inputs=still.inputs[:1].expand_as(still.inputs).clone())
     channels, text = found(check_recording(held, PLANT), "constant input")
-    assert channels == "Q1, Q2" and "never changes" in text
+    assert channels == "Q1, Q2" and "no change throughout" in text
     one = held.inputs.clone()
     one[200:, 0] *= 2.0
     assert not any(f.kind == "constant input" for f in check_recording(replace(held, inputs=one), PLANT).findings)

@@ -125,7 +125,7 @@ def _carried_out(name: str, words: list[str]) -> int:
         if arguments.traceback:
             raise
         for problem in getattr(error, "problems", [str(error)]):
-            screen.complain(f"fdi {name}: {problem}")
+            screen.complain(f"fdi {name}: {_of_option(problem, getattr(arguments, 'set', None) or ())}")
         return MISUSE
     except (MemoryError, RuntimeError) as error:
         sentence = _resource_problem(error)
@@ -133,6 +133,19 @@ def _carried_out(name: str, words: list[str]) -> int:
             raise
         screen.complain(f"fdi {name}: {sentence}")
         return MISUSE
+
+
+def _of_option(problem: str, overrides: Sequence[str]) -> str:
+    """The problem, said of --set in place of the file if it is about a key or value given there."""
+    _, _, said = problem.partition(": ")
+    place = said.partition(": ")[0] if " " not in said.partition(": ")[0] else ""
+    for override in overrides:
+        key = override.partition("=")[0]
+        rest = key.removeprefix(f"{place}.") if place else key
+        within = f"{place}.".startswith(f"{key}.")
+        if within or (key.startswith(place) and f"got '{rest}'" in said):
+            return f"--set {override}: {said}"
+    return problem
 
 
 def _resource_problem(error: Exception) -> str:
@@ -190,12 +203,21 @@ class _Parser(argparse.ArgumentParser):
             self.error(f"unrecognized argument: {file}; name it in the file for --config (fdi new writes one)")
         return known, others
 
+    def error(self, message: str) -> NoReturn:
+        lacks_file = message.endswith("required: --config")
+        super().error(f"{message}; fdi new {self._kind} writes such a file" if lacks_file else message)
+
+    @property
+    def _kind(self) -> str:
+        """The kind of file that this command reads by --config."""
+        command = self.prog.rpartition(" ")[2]
+        return {"rehearse": "rehearsal"}.get(command, command if command in ("monitor", "study") else "run")
+
     def _instead(self, option: str) -> str:
         """What this command takes in place of an option that others have."""
-        known, kind = self._option_string_actions, self.prog.rpartition(" ")[2]
+        known = self._option_string_actions
         if option in ("--plant", "--recording") and "--config" in known:
-            kind = kind if kind in ("monitor", "study") else "rehearsal" if kind == "rehearse" else "run"
-            return f"; name it in the file for --config, which fdi new {kind} {option} ... writes"
+            return f"; name it in the file for --config, which fdi new {self._kind} {option} ... writes"
         if option == "--config" and "--plant" in known and "--recording" in known:
             return "; name --plant and --recording, whose YAML file may list several"
         return nearest(option, known)

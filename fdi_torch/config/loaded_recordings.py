@@ -32,7 +32,7 @@ from fdi_torch.config.recording_config import (
 )
 from fdi_torch.config.yaml_files import YAML_ENDINGS, expect_kind, find_data, find_file, read_extended
 from fdi_torch.logbook import LogError
-from fdi_torch.names import unknown
+from fdi_torch.names import nearest, unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_also_in
 from fdi_torch.recording import Recording
@@ -125,7 +125,8 @@ def listed_recordings(
     listed = data.get("recordings")
     if not listed:
         expect_kind(data, "run", path, "a recording or a file with the key recordings")
-        raise ConfigError([f"{path}: recordings: expected at least one, got none; list files under it"])
+        near = nearest("recordings", [key for key in data if key != "recordings"])
+        raise ConfigError([f"{path}: recordings: expected at least one, got none; list files under it{near}"])
     try:
         return [RecordingConfig.model_validate(entry) for entry in listed], path.parent
     except ValidationError as error:

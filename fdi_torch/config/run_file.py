@@ -23,7 +23,7 @@ from fdi_torch.recording import Recording
 
 class RunConfig(Strict):
     plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
-    recordings: list[RecordingConfig] = Field(default_factory=list, description="real data")
+    recordings: list[RecordingConfig] = Field(default_factory=list, description="recordings of the rig")
     simulate: SimulationConfig | None = Field(None, description="or a run to be simulated")
     estimate: EstimationConfig = Field(default_factory=EstimationConfig)
     output: OutputConfig = Field(default_factory=OutputConfig)
