@@ -156,7 +156,7 @@ def _constant_inputs(recording: Recording) -> Iterator[ChannelFinding]:
     known = recording.inputs[torch.isfinite(recording.inputs).all(dim=1)]
     if known.numel() and bool((known == known[0]).all()):
         names = ", ".join(recording.input_names)
-        text = "no change throughout: is the column right? Constant inputs leave most faults indistinguishable (fdi plan)"
+        text = "no change throughout: right column? Constant inputs leave most faults indistinguishable (fdi plan)"
         yield ChannelFinding("constant input", names, text)
 
 
