@@ -147,6 +147,19 @@ def test_a_mistake_in_the_file_is_blamed_on_it_beside_the_option_set(
     )
 
 
+def test_check_speaks_in_the_units_of_the_columns_and_of_too_few_readings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The plant file has cm and cm^3/s."""
+    rows = [f"{k},{50 + k % 2},3,{500 + k},500,500" for k in range(20)]
+    (tmp_path / "run.csv").write_text("t_s,Q1_l/min,Q2_l/min,h1_mm,h2_mm,h3_mm\n" + "\n".join(rows))
+    cli.main(["check", "--plant", "three_tank", "--recording", str(tmp_path / "run.csv"), "--quiet"])
+    said = capsys.readouterr().out
+    assert "Q1: asks for up to 51 l/min of Q1, which delivers 5.4 l/min at most" in said
+    assert "- h1, h2, h3: 20 readings: fdi gap and fdi refit expect at least 60" in said
+    assert "record longer or more often; fdi gap" in said
+
+
 def test_a_misspelt_list_of_recordings_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "runs.yaml").write_text("plant: three_tank\nrecordigns: [{file: run.csv}]")
     assert cli.main(["predict", "--plant", "three_tank", "--recording", str(tmp_path / "runs.yaml")]) == cli.MISUSE
@@ -172,8 +185,8 @@ def test_check_says_first_that_readings_lie_beyond_a_tank(tmp_path: Path, capsys
     words = ["--plant", str(plant), "--recording", str(tmp_path / "run.csv")]
     assert cli.main(["check", *words]) == cli.NOT_EXPLAINED
     findings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("- ")]
-    told = "readings lie above the rim of A, up to 1.912 m of 60 cm, which neither noise nor tolerances explain"
-    assert told in findings[0].replace("191.2 cm", "1.912 m") and "correct tanks.A.height, or gain" in findings[0]
+    told = "readings lie above the rim of A, up to 1912 mm of 600 mm, which neither noise nor tolerances explain"
+    assert told in findings[0] and "correct tanks.A.height, or gain" in findings[0]
     assert sum("above the rim of A" in line for line in findings) == 1
 
 

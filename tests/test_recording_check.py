@@ -101,7 +101,7 @@ def test_too_few_readings_for_a_diagnosis_are_said_before_it(
         path = write_csv(healthy(samples), tmp_path / f"{samples}.csv")
         cli.main(["check", "--plant", "three_tank", "--recording", str(path)])
         said = capsys.readouterr().out
-        few = "- h1: 59 readings: fdi gap and fdi refit expect at least 60, of all recordings together"
+        few = "- h1, h2, h3: 59 readings: fdi gap and fdi refit expect at least 60, of all recordings together"
         assert (few in said) is (samples == 59)
 
 

@@ -60,8 +60,10 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     wrong = bool(guesses) or any(f.kind in WRONG for check in checks for f in check.findings)
     if checks and arguments.config is None:
         named = f"--plant {arguments.plant} --recording {arguments.recording or arguments.file}"
-        correct = "correct the plant file or the columns, then check again; " if wrong else ""
-        screen.say(f"next: {correct}fdi gap {named} says whether the plant file explains it")
+        few = len(checks) == 1 and any(finding.kind == "few" for finding in checks[0].findings)
+        first = "correct the plant file or the columns, then check again; " if wrong else ""
+        first += "record longer or more often; " if few else ""
+        screen.say(f"next: {first}fdi gap {named} says whether the plant file explains it")
     screen.result({"format": "fdi_torch.check/1", "plant": plant, "recordings": checks, "placeholders": guesses})
     return NOT_EXPLAINED if wrong else DONE
 

@@ -30,10 +30,12 @@ def checked(config: RecordingConfig, plant: PlantDescription, base: Path) -> tup
         for e in examinations
         for s in e.stuck
     ]
-    for name, count in zip(whole.output_names, whole.mask.sum(dim=0).tolist(), strict=True):
-        if count < LEAST:
-            text = f"{count} readings: fdi gap and fdi refit expect at least {LEAST}, of all recordings together"
-            problems.append(ChannelFinding("few", name, text, {"count": count}))
+    few = {n: k for n, k in zip(whole.output_names, whole.mask.sum(dim=0).tolist(), strict=True) if k < LEAST}
+    if few:
+        text = (
+            f"{min(few.values())} readings: fdi gap and fdi refit expect at least {LEAST}, of all recordings together"
+        )
+        problems.append(ChannelFinding("few", ", ".join(few), text, {"count": min(few.values())}))
     refused = {channel for e in examinations if e.fault for channel in e.fault.channels}
     doubts = [f for f in check.findings if not (f.kind == "undersampled" and f.channel in refused)]
     beyond = [f for f in doubts if f.kind == "range"]

@@ -53,10 +53,10 @@ class DeniedRim:
 
     @property
     def text(self) -> str:
-        name, rim = self.tank.name, _level(self.tank.height)
+        name, rim, highest = self.tank.name, *(_level(each, self.sensor) for each in (self.tank.height, self.highest))
         return (
-            f"{self.sensor.column}: {self.count} readings lie above the rim of {name}, up to {_level(self.highest)} of "
-            f"{rim}, which neither noise nor tolerances explain; correct tanks.{name}.height, or gain and offset of "
+            f"{self.sensor.column}: {self.count} readings lie above the rim of {name}, up to {highest} of {rim}, which "
+            f"neither noise nor tolerances explain; correct tanks.{name}.height, or gain and offset of "
             f"{self.sensor.name} if it reads too high: until then no cause that is found can be relied on"
         )
 
@@ -143,30 +143,31 @@ def _level_findings(
     low, high = float(levels.min()), float(levels.max())
     near = levels >= (1 - RIM_MARGIN) * rim
     if high > 10 * rim or high < SMALL_SHARE * rim:
-        text = f"highest level {_level(high)}, rim {_level(rim)}: a wrong unit, or empty throughout?"
+        text = f"highest level {_level(high, sensor)}, rim {_level(rim, sensor)}: a wrong unit, or empty throughout?"
         yield ChannelFinding("unit", sensor.column, text, {"high": high, "rim": rim})
     elif denied:
         numbers = {"high": denied.highest, "rim": rim, "count": denied.count}
         yield ChannelFinding("range", sensor.column, denied.text.partition(": ")[2], numbers)
     elif high > (1 + RIM_MARGIN) * rim:
         above = int((levels > (1 + RIM_MARGIN) * rim).sum())
-        text = f"{above} readings lie above the rim of {sensor.tank} ({_level(high)} of {_level(rim)})"
+        text = f"{above} readings lie above the rim of {sensor.tank} ({_level(high, sensor)} of {_level(rim, sensor)})"
         yield ChannelFinding("range", sensor.column, text, {"high": high, "rim": rim, "count": above})
     elif bool(near.any()):
         start, stop, count = float(time[near][0]), float(time[near][-1]), int(near.sum())
         text = (
-            f"within {100 * RIM_MARGIN:.0f} % of the rim of {sensor.tank} ({_level(rim)}) in {count} samples between "
-            f"{start:g} s and {stop:g} s: water may overflow there"
+            f"within {100 * RIM_MARGIN:.0f} % of the rim of {sensor.tank} ({_level(rim, sensor)}) in {count} samples "
+            f"between {start:g} s and {stop:g} s: water may overflow there"
         )
         yield ChannelFinding("rim", sensor.column, text, {"rim": rim, "start": start, "stop": stop, "count": count})
     if low < -RIM_MARGIN * rim:
         below = int((levels < -RIM_MARGIN * rim).sum())
-        text = f"{below} readings lie below the floor of {sensor.tank}, down to {_level(low)}: an offset?"
+        text = f"{below} readings lie below the floor of {sensor.tank}, down to {_level(low, sensor)}: an offset?"
         yield ChannelFinding("range", sensor.column, text, {"low": low, "count": below})
 
 
-def _level(value: float) -> str:
-    return quantity_text(value, "m")
+def _level(value: float, sensor: Sensor) -> str:
+    """A level, m, in the unit of a sensor's readings if they are levels."""
+    return quantity_text(value, "m", name=sensor.column)
 
 
 def _pump_findings(pump: MeteredFlow, command: Tensor) -> Iterator[ChannelFinding]:
@@ -174,7 +175,7 @@ def _pump_findings(pump: MeteredFlow, command: Tensor) -> Iterator[ChannelFindin
     if not len(flow):
         return
     low, high = float(flow.min()), float(flow.max())
-    lowest, highest, limit = (quantity_text(each, "m^3/s") for each in (low, high, pump.max_flow))
+    lowest, highest, limit = (quantity_text(each, "m^3/s", name=pump.channel) for each in (low, high, pump.max_flow))
     if high > 10 * pump.max_flow or 0 < high < SMALL_SHARE * pump.max_flow:
         text = f"its highest flow is {highest} of {limit}: is its unit right?"
         yield ChannelFinding("unit", pump.channel, text, {"high": high, "limit": pump.max_flow})
