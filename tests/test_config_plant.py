@@ -163,7 +163,7 @@ def test_numbers_without_a_short_form_read_back_to_the_last_bit() -> None:
         ("tanks.T1.aera", "1 m^2", "p.yaml: tanks.T1: expected a known key .* got 'aera'; the nearest is 'area'"),
         ("pump", {}, "p.yaml: expected a known key .* got 'pump'; the nearest is 'pumps'"),
         ("tanks.T1.area", "160 cm", "p.yaml: tanks.T1.area: expected a quantity in m\\^2 .* got '160 cm'"),
-        ("tanks.T1.area", 160, "p.yaml: tanks.T1.area: .* got the bare number 160; write its unit, such as m"),
+        ("tanks.T1.area", 160, "p.yaml: tanks.T1.area: .* got the bare number 160; write its unit, such as cm.2$"),
         ("tanks.T1.area", True, "p.yaml: tanks.T1.area: expected a quantity in m\\^2, got True"),
         (
             "tanks.T1.area",

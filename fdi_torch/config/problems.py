@@ -99,5 +99,5 @@ def _comma(parts: Sequence[Any]) -> str:
 
 
 def _shown(value: Any) -> str:
-    text = repr(value).partition("\n")[0]
+    text = "nothing" if value is None else repr(value).partition("\n")[0]
     return text if len(text) < 60 else text[:57] + "..."

@@ -10,7 +10,7 @@ from pydantic.fields import FieldInfo
 
 from fdi_torch.config.problems import UnknownKeyError, naming
 from fdi_torch.names import unknown
-from fdi_torch.quantities import parse_quantity
+from fdi_torch.quantities import display_unit, parse_quantity
 from fdi_torch.recording import LARGEST
 
 
@@ -41,7 +41,8 @@ def quantity(value: Any, unit: str) -> float:
     elif unit == "1":
         number = float(value)
     else:
-        raise ValueError(f"expected a quantity in {unit}, got the bare number {value}; write its unit, such as {unit}")
+        usual, _ = display_unit(unit)
+        raise ValueError(f"expected a quantity in {unit}, got the bare number {value}; write its unit, such as {usual}")
     if not abs(number) <= LARGEST:
         raise ValueError(f"expected a quantity in {unit} within {LARGEST:g}, got {value}")
     return number

@@ -150,7 +150,9 @@ def set_title(figure: Figure, title: str) -> None:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write the picture as PNG or SVG, by the path's suffix; equal figures give equal files."""
+    """Write the picture as PNG or SVG, by the path's suffix; equal figures give equal files. Raises ValueError."""
+    if path.suffix not in (".png", ".svg"):
+        raise ValueError(f"expected a picture that ends in .png or .svg, got {path}; rename it")
     metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
     with styled(), replacing(path) as new:
         figure.savefig(new, dpi=160, metadata=metadata)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from matplotlib.figure import Figure
@@ -11,7 +13,7 @@ from fdi_torch.recording import Recording
 from fdi_torch.report.chart import Chart, Line, draw
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.sections.gap_closure import curve_panel
-from fdi_torch.report.style import MODEL, set_title
+from fdi_torch.report.style import MODEL, save, set_title
 
 TITLE = "est: fault not isolated: T2.leak.size or OUT2.plugging.size (T2.leak.size - OUT2.plugging.size = 0.1 ± 0.008)"
 
@@ -51,6 +53,11 @@ def test_the_title_of_a_panel_is_apart_from_the_labels_of_its_lines(name: str) -
             title, labels = axes._left_title.get_window_extent(), axes.get_legend().get_window_extent()
             assert not title.overlaps(labels), axes.get_title("left")
             assert title.x1 <= each.bbox.x1 and title.y1 <= each.bbox.y1
+
+
+def test_a_picture_of_another_format_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"expected a picture that ends in \.png or \.svg, got .*rig\.foo; rename it"):
+        save(Figure(), tmp_path / "rig.foo")
 
 
 def test_a_value_stays_beside_its_error() -> None:
