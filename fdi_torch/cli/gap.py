@@ -64,11 +64,14 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
         answer = run_gap(log, plant, recordings, holdouts, settings, next_stage)
         advance(1.0, "done")
-    diff = _adopt(arguments, plant, recordings, answer, screen)
+    diff, refused = _adopt(arguments, plant, recordings, answer, screen)
+    if refused:
+        screen.complain(f"fdi gap: {refused}")
     planned = _written(plant, answer, folder)
     adopted_file = arguments.adopt if diff else None
     rim_denied = bool(denied_by(plant, recordings))
-    show(answer, plant, next_steps(answer, bool(holdouts), library, planned, adopted_file, rim_denied), screen)
+    steps = next_steps(answer, bool(holdouts), library, planned, adopted_file, rim_denied, refused)
+    show(answer, plant, steps, screen)
     for line in diff:
         screen.say(line)
     screen.say(log_words(log))
@@ -82,34 +85,31 @@ def _adopt(
     recordings: Sequence[Recording],
     answer: Answer,
     screen: Screen,
-) -> list[str]:
-    """Write the adopted plant if requested. Returns the lines of the diff, none if nothing was adopted."""
+) -> tuple[list[str], str]:
+    """Write the adopted plant if requested. Returns the lines of the diff, or why nothing was adopted."""
     if not arguments.adopt:
-        return []
+        return [], ""
     named = any(cause.effect != UNKNOWN for cause in answer.causes)
     if not named and not (arguments.with_constants and answer.verdict == "no_gap"):
         constants = "; --with-constants writes the fitted constants" if answer.verdict == "no_gap" else ""
-        screen.complain(f"fdi gap: nothing to adopt: the verdict is {answer.verdict.replace('_', ' ')}{constants}")
-        return []
+        return [], f"nothing to adopt: the verdict is {answer.verdict.replace('_', ' ')}{constants}"
     if named and not answer.converged:
-        screen.complain("fdi gap: nothing adopted: the fit of the likeliest explanation has not converged")
-        return []
+        return [], "nothing adopted: the fit of the likeliest explanation has not converged"
     better, errors = adopted(plant, answer, arguments.with_constants), _errors(answer)
     if arguments.narrow:
         better = narrowed(better, errors)
     if named and not _error(better, recordings) <= _error(plant, recordings):
-        screen.complain(
-            "fdi gap: nothing adopted: the plant with the causes has a larger free-run error than the plant file; "
+        return [], (
+            "nothing adopted: the plant with the causes has a larger free-run error than the plant file; "
             "--with-constants also writes the constants that were fitted together with the causes"
         )
-        return []
     diff = write_adopted(arguments.plant, plant, better, Path(arguments.adopt), screen, errors)
     constants = (
         "as fitted with them" if arguments.with_constants else "unchanged (--with-constants writes the fitted ones)"
     )
     what = f"the causes, its constants {constants}" if named else "its fitted constants; no cause was found"
     screen.note(f"plant file with {what}: {arguments.adopt}")
-    return diff
+    return diff, ""
 
 
 def _errors(answer: Answer) -> dict[str, float]:

@@ -58,9 +58,10 @@ def next_steps(
     planned: Path | None,
     adopted: str | None,
     rim_denied: bool = False,
+    refused: str = "",
 ) -> list[str]:
     """What to do next. planned: path of the next input; adopted: path of the adopted plant file; None if
-    not written. rim_denied: whether readings lie above a rim of the plant file.
+    not written. rim_denied: whether readings lie above a rim of the plant file. refused: why nothing was adopted.
     """
     steps = []
     if rim_denied:
@@ -96,8 +97,8 @@ def next_steps(
         )
     elif not rim_denied and any(c.effect != UNKNOWN and not rounds(c.effect) for c in answer.causes):
         benefit = "train and monitor no longer take the gap for a fault"
-        written = f"with {adopted} as their plant, {benefit}" if adopted else ""
-        steps.append(f"{written or f'--adopt FILE writes the plant file with the causes; with it {benefit}'}")
+        written = f"with {adopted} as their plant, {benefit}" if adopted else refused
+        steps.append(written or f"--adopt FILE writes the plant file with the causes; with it {benefit}")
     if not has_holdout and answer.verdict != "no_gap":
         steps.append("--holdout FILE, another recording of the same rig, measures how far the gap closes")
     return steps
