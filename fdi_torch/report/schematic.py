@@ -196,7 +196,7 @@ class _Drawing:
             self.words(component.name, (points[-1][0], points[-1][1] - 0.06), "center", "top")
         elif start[1] == end[1] > self.corner(component.source)[1] + LOWEST:
             self.words(component.name, (middle[0], middle[1] + 0.03 + sketch.round), "center", "bottom")
-        elif middle[0] < self.corner(component.source)[0] - 0.5:
+        elif start[0] == end[0] and middle[0] < self.corner(component.source)[0] - 0.5:
             self.words(component.name, (middle[0] - 0.08 - sketch.round, middle[1] + 0.1), "right", "top")
         elif component.falls and start[0] == end[0]:
             self.words(component.name, (middle[0] + 0.12, middle[1] + 0.1), "left", "top")

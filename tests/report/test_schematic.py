@@ -61,6 +61,18 @@ def test_a_sensor_is_drawn_at_the_wall_that_is_free() -> None:
     assert at["hA"] < at["A"] - 0.5 and at["hB"] > at["B"] + 0.5
 
 
+def test_a_pipe_to_the_left_is_named_below_its_line_as_one_to_the_right() -> None:
+    tanks = [Tank(name, 0.1, 1.0) for name in ("C", "A", "B")]
+    pipes = [Pipe("right", "A", "B", 1e-4, 0.6), Pipe("left", "A", "C", 1e-4, 0.6)]
+    plant = Plant(tanks, pipes, sensors=[Sensor("h", "A")])
+    places, texts = tank_places(plant), schematic(plant).axes[0].texts
+    assert len({places["A"][1] - places[tank][1] for tank in "BC"}) == 2, "one at each side"
+    at = {text.get_text(): text.get_position() for text in texts}
+    assert at["left"][1] == pytest.approx(at["right"][1])
+    middle = {at[name][0] - at["A"][0] for name in ("left", "right")}
+    assert sum(middle) == pytest.approx(0.0)
+
+
 def test_a_chain_is_drawn_in_its_order() -> None:
     columns = {name: column for name, (_, column) in tank_places(load_plant("three_tank")).items()}
     assert columns == {"T1": 0, "T3": 1, "T2": 2}
