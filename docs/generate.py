@@ -68,10 +68,11 @@ def commands() -> str:
         "# Commands",
         "Generated from the argument parsers. Results go to standard output, progress to standard error. Exit codes: "
         "0 done, 2 misuse, 3 ran but did not converge (recover, replay: something was lost, or differs), 4 "
-        "converged, but the model does not explain the recording (train), 130 interrupted, 143 terminated.",
+        "converged, but the model does not explain the recording (check: something is wrong), 130 interrupted, 143 "
+        "terminated.",
         "\n".join(["| command | purpose |", "|---|---|", *(f"| {a} | {cell(b)} |" for a, b in rows)]),
-        "Every command also has `--json` (print JSON and nothing else on standard output), `--quiet` (no progress) and "
-        "`--traceback` (show where an error arose).",
+        "Every command also has `--json` (print JSON and nothing else on standard output; of monitor, a line an event), "
+        "`--quiet` (no progress) and `--traceback` (show where an error arose).",
         *(command(name) for name in COMMANDS),
     ]
     return "\n\n".join(parts) + "\n"

@@ -79,7 +79,7 @@ def test_events_of_a_monitor_and_its_page_show_the_clock_time(
     explained = next(line for line in events if " explained " in line or " isolated " in line)
     seconds = float(explained.split()[0])
     assert f"{BEGAN + timedelta(seconds=round(seconds))}" in explained
-    assert "(began 2026-11-20 08:38:" in explained
+    assert "(onset 2026-11-20 08:38:" in explained
     (path,) = tmp_path.glob("*.mcap")
     page = Path(report([path]).page).read_text()
     assert "2026-11-20 08:38:" in page and "after 2026-11-20 08:30:00" in page

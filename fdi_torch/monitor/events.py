@@ -161,7 +161,7 @@ class Event:
     def line(self) -> str:
         """Head, text and clock time of the onset if the recording has one."""
         onset = "" if self.onset is None or self.kind == "followed" else clock_text(self.onset)
-        return f"{self.head}{self.text}{f' (began {onset})' if onset else ''}"
+        return f"{self.head}{self.text}{f' (onset {onset})' if onset else ''}"
 
     @property
     def best(self) -> Explanation | None:
