@@ -71,7 +71,7 @@ def commands() -> str:
         "converged, but the model does not explain the recording (check: something is wrong), 130 interrupted, 143 "
         "terminated.",
         "\n".join(["| command | purpose |", "|---|---|", *(f"| {a} | {cell(b)} |" for a, b in rows)]),
-        "Every command also has `--json` (print JSON and nothing else on standard output; of monitor, a line an event), "
+        "Every command also has `--json` (print JSON and nothing else on standard output; monitor: a line an event), "
         "`--quiet` (no progress) and `--traceback` (show where an error arose).",
         *(command(name) for name in COMMANDS),
     ]

@@ -29,7 +29,7 @@ Metres = Annotated[float, BeforeValidator(lambda value: quantity(value, "m"))]
 
 
 class NoiseConfig(Strict):
-    colour: float = Field(0.0, ge=0, lt=1, description="AR(1) coefficient of the measurement noise")
+    correlation: float = Field(0.0, ge=0, lt=1, description="of the measurement noise with its last sample, AR(1)")
     wander: Metres = Field(0.0, ge=0, description="standard deviation of the levels' random walk per sample")
 
 
@@ -148,4 +148,4 @@ def _rig(
         controller = moving_commands(plant, inputs, c.naming.share if c.naming else 0.0)
     elif loop == "closed":
         controller = moving_set_points(plant, inputs, levels, c.naming.swing if c.naming else 0.0)
-    return SimulatedRig(network, space, inputs, levels, std, c.sampling, noise.wander, noise.colour, controller)
+    return SimulatedRig(network, space, inputs, levels, std, c.sampling, noise.wander, noise.correlation, controller)

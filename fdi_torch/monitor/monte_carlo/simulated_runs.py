@@ -58,12 +58,12 @@ class SimulatedRig:
         reading_std: Tensor,
         sampling: float = 1.0,
         wander: float = 0.0,
-        colour: float = 0.0,
+        correlation: float = 0.0,
         controller: Callable[[], Controller] | None = None,
     ) -> None:
         self.network, self.switched = network, SwitchedNetwork(network, space.names)
         self.space, self.inputs, self.levels, self.reading_std = space, inputs, levels, reading_std
-        self.sampling, self.wander, self.colour, self.controller = sampling, wander, colour, controller
+        self.sampling, self.wander, self.correlation, self.controller = sampling, wander, correlation, controller
         step = commensurate_step(usual_step(network.description), sampling)
         self._stepper = Stepper(self.switched, min(sampling, step))
         self._onsets = own_onsets(network, space).values()
@@ -86,7 +86,7 @@ class SimulatedRig:
         for k in range(samples):
             seen, state = self._stepper.read(state, k * self.sampling, self.sampling, values)
             drawn = torch.randn(noise.shape, generator=generator, dtype=like.dtype)
-            noise = self.colour * noise + (1.0 - self.colour**2) ** 0.5 * drawn
+            noise = self.correlation * noise + (1.0 - self.correlation**2) ** 0.5 * drawn
             readings.append(seen + self.reading_std * noise)
             if controller is not None:
                 inputs = controller(readings[-1], like.new_tensor(self.sampling))
