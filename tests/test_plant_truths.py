@@ -27,7 +27,7 @@ from fdi_torch.plant.description import (
 )
 from fdi_torch.plant.inverted_sensor import levels_from_readings
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.plant.orifice import limit_draw, rim_strength, weir_flow, weir_law
+from fdi_torch.plant.orifice import limit_draw, limit_emptying, rim_strength, weir_flow, weir_law
 from fdi_torch.plant.signals import Clock, CumulativeSignal
 from fdi_torch.simulate.equilibrium import equilibrium
 from fdi_torch.simulate.experiment import grid_nodes, lay_out
@@ -365,6 +365,15 @@ def test_in_endless_steps_a_brimful_tank_spills_and_a_dry_one_gives_what_flows_i
     excess, inflow, one = (torch.tensor(x, dtype=torch.float64) for x in (1e-3, 2e-4, 1.0))
     assert float(weir_flow(excess, inflow, 0.02 * one, 0.8 * one, 1e12 * one)) == pytest.approx(2e-4)
     assert float(limit_draw(one, excess, inflow, 0.02 * one, 1e12 * one)) == pytest.approx(2e-4)
+
+
+@pytest.mark.parametrize("error", [-1e-19, 0.0, 1e-19])
+def test_rounding_errors_do_not_change_the_slopes_of_a_tank_at_rest_on_its_floor(error: float) -> None:
+    level, one = torch.zeros((), dtype=torch.float64, requires_grad=True), torch.ones((), dtype=torch.float64)
+    emptying = limit_emptying(error - 0.1 * level, level, one)
+    drawn = limit_draw(0.1 * level - error, level, 0.0 * one, one, one)
+    for limited, slope in ((emptying, -0.1), (drawn, 0.1)):
+        assert torch.autograd.grad(limited, level)[0].item() == slope
 
 
 def test_nothing_runs_over_a_rim_that_is_not_reached_however_coarse_the_steps() -> None:

@@ -13,6 +13,7 @@ STABLE_SPILL_TIMES_STEP = 1.7
 EMPTYING_RATE_TIMES_STEP = 2.0
 WEIR_COEFFICIENT = 0.6
 _DRY = 1e-9  # m; keeps the weir's slope finite at zero excess
+_ROUNDING = 1e-15  # m; change of a level in a step of the resolution, far above rounding errors
 
 
 def signed_root(head: torch.Tensor, width: torch.Tensor) -> torch.Tensor:
@@ -58,7 +59,8 @@ def limit_emptying(rate: torch.Tensor, level: torch.Tensor, resolution: torch.Te
     """
     # No slope at the floor itself: otherwise an iteration that starts from an empty tank could not leave it at once.
     slowest = torch.where(level > 0.0, -EMPTYING_RATE_TIMES_STEP * level / resolution, 0.0)
-    return torch.maximum(rate, slowest)
+    # At rest on the floor both are zero but for rounding errors, which must not choose between their slopes.
+    return torch.where(rate < slowest - _ROUNDING / resolution, slowest, rate)
 
 
 def weir_law(excess: torch.Tensor, strength: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -115,5 +117,5 @@ def limit_draw(
     faster than `limit_emptying` allows, so that the target receives what the source loses, and a dry tank passes on
     exactly its inflow.
     """
-    available = inflow + EMPTYING_RATE_TIMES_STEP * tank_area * level / resolution
-    return torch.minimum(flow, torch.clamp(available, min=0.0))
+    available = torch.clamp(inflow + EMPTYING_RATE_TIMES_STEP * tank_area * level / resolution, min=0.0)
+    return torch.where(available < flow - _ROUNDING * tank_area / resolution, available, flow)
