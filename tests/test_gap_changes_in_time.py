@@ -19,12 +19,12 @@ LIBRARY = ("pump_gain", "pump_saturation", "coefficient_drift", "unmetered_flow"
 
 def test_a_pump_whose_supply_runs_low_is_no_drift_of_the_outlet() -> None:
     """It delivers less the more it has pumped, nearly as a gain that falls."""
-    told = recorded({}, 34, samples=500)
+    told = recorded({}, 34, samples=600)
     assert told.inputs is not None
     pumped = torch.cumsum(told.inputs[:, 1], dim=0)
     share = torch.sqrt(1.0 - 0.35 * pumped / pumped[-1])
     spent = torch.stack([told.inputs[:, 0], told.inputs[:, 1] * share], dim=1)
-    real = recorded({}, 34, samples=500, std=5e-4, inputs=spent)
+    real = recorded({}, 34, samples=600, std=5e-4, inputs=spent)
     answer = diagnose(nominal_plant(), replace(real, inputs=told.inputs), settings=Settings(LIBRARY))
     assert answer.where[0][0] == "Q2" and answer.where[0][1] > 0.95
     assert all(
