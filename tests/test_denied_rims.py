@@ -40,7 +40,8 @@ def recorded(rig: Plant = RIG, peak: str = "6 l/min", **faults: Any) -> Recordin
 def test_the_true_cause_is_found_although_the_rim_in_the_plant_file_is_wrong(tmp_path: Path) -> None:
     """A leak raises no level above 34 cm; a rim there had been explained by a drifting sensor, with certainty."""
     leaking = recorded(**{"A.leak": 0.2})
-    found, right = (fdi_torch.gap(plant, leaking, out=tmp_path) for plant in (LOW, RIG))
+    library = ("leak", "sensor_drift", "sensor_gain", "plugging")
+    found, right = (fdi_torch.gap(plant, leaking, out=tmp_path, library=library) for plant in (LOW, RIG))
     assert found.headline == right.headline and "leak at A" in found.headline
     assert re.match(TOLD, found.answer.remarks[0]) and not any("rim" in remark for remark in right.answer.remarks)
     assert "plant.tanks.A.height (34 cm; 60 cm)" in fdi_torch.compare([found.log, right.log]).headline

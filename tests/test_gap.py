@@ -191,26 +191,28 @@ def test_a_known_cause_is_named_with_its_size_and_closes_the_gap() -> None:
 
 def test_a_leak_is_told_with_its_flow_at_the_mean_level() -> None:
     """By Torricelli's law; a cause without a flow of its own, such as a pump gain, has none."""
-    plant, recording = nominal_plant(), recorded({"T1.leak.size": 0.2}, 61)
-    (cause,) = diagnose(plant, recording, settings=Settings(("leak", "pump_gain"))).causes
+    plant, settings = nominal_plant(), Settings(("leak@T1", "pump_gain@Q2"), named_only=True)
+    recording = recorded({"T1.leak.size": 0.2}, 61, samples=400)
+    (cause,) = diagnose(plant, recording, settings=settings).causes
     hole = leak_pipe(plant, "T1")
     speed = math.sqrt(2.0 * plant.gravity * float(recording.outputs[:, 0].mean()))
     assert cause.flow == pytest.approx(0.2 * hole.discharge_coefficient * hole.area * speed, rel=0.05)
-    gain = recorded({"Q2.pump_gain.factor": 1.12}, 62)
-    (cause,) = diagnose(plant, gain, settings=Settings(("leak", "pump_gain"))).causes
+    gain = recorded({"Q2.pump_gain.factor": 1.12}, 62, samples=400)
+    (cause,) = diagnose(plant, gain, settings=settings).causes
     assert cause.effect == "pump_gain" and cause.flow is None
 
 
 def test_two_causes_are_named_together() -> None:
     values = {"Q2.pump_gain.factor": 1.12, "h1.sensor_bias.bias": 0.03}
-    answer = diagnose(nominal_plant(), recorded(values, 31), settings=Settings(SMALL))
+    answer = diagnose(nominal_plant(), recorded(values, 31, samples=500), settings=Settings(SMALL))
     assert answer.verdict == "named"
     assert {(c.effect, c.location) for c in answer.causes} == {("pump_gain", "Q2"), ("sensor_bias", "h1")}
 
 
 def test_a_cause_that_the_library_lacks_is_unknown_at_its_place() -> None:
-    values = {"P13.plugging.size": 0.4, "P13.plugging.onset": 450.0}
-    answer = diagnose(nominal_plant(), recorded(values, 41), settings=Settings((*SMALL, "plugging"), ("plugging",)))
+    values = {"P13.plugging.size": 0.4, "P13.plugging.onset": 225.0}
+    recording = recorded(values, 41, samples=500)
+    answer = diagnose(nominal_plant(), recording, settings=Settings((*SMALL, "plugging"), ("plugging",)))
     assert answer.verdict == "unknown"
     assert [(c.effect, c.location) for c in answer.causes] == [("unknown", "P13")]
     assert answer.where[0][0] == "P13"
@@ -225,7 +227,8 @@ def test_slow_noise_that_no_effect_explains_is_no_unknown_cause() -> None:
 
 
 def test_the_answer_follows_the_protocol() -> None:
-    answer = diagnose(nominal_plant(), recorded({"Q2.pump_gain.factor": 1.12}, 51), settings=Settings(("pump_gain",)))
+    recording = recorded({"Q2.pump_gain.factor": 1.12}, 51, samples=400)
+    answer = diagnose(nominal_plant(), recording, settings=Settings(("pump_gain",)))
     found, gain = answer.to_dict(), {"effect": "pump_gain", "location": "Q2"}
     assert found["format"] == "fdi_torch.gap/2"
     assert found["ambiguity_set"] == [[gain]] and found["certain"] == [gain]
@@ -310,8 +313,9 @@ def test_planned_noise_is_that_of_the_level_whatever_unit_a_sensor_has() -> None
 
 
 def test_named_causes_can_be_adopted() -> None:
-    recording = recorded({"Q2.pump_gain.factor": 1.12}, 71, samples=600)
-    answer = diagnose(nominal_plant(), recording, settings=Settings(("pump_gain", "sensor_bias@h1")))
+    recording = recorded({"Q2.pump_gain.factor": 1.12}, 71, samples=400)
+    settings = Settings(("pump_gain@Q2", "sensor_bias@h1"), named_only=True)
+    answer = diagnose(nominal_plant(), recording, settings=settings)
     plant = adopted(nominal_plant(), answer)
     (placed,) = plant.effects
     assert placed.effect == "pump_gain" and placed.location == "Q2"

@@ -43,9 +43,8 @@ def trained(plant: PlantDescription, recording: Recording, folder: Path) -> dict
 @pytest.fixture(scope="module")
 def better() -> PlantDescription:
     """The plant file with what a fault-free recording of the rig showed it to lack."""
-    answer = diagnose(
-        nominal_plant(), recorded(LAMINAR, 3), settings=Settings(("laminar_flow", "pump_lag", "leak", "plugging"))
-    )
+    settings = Settings(("laminar_flow", "pump_lag", "leak", "plugging"), named_only=True)
+    answer = diagnose(nominal_plant(), recorded(LAMINAR, 3), settings=settings)
     assert [(c.effect, c.location) for c in answer.causes] == [("laminar_flow", "P13")]
     return adopted(nominal_plant(), answer, constants=True)
 

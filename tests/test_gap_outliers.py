@@ -70,8 +70,8 @@ def test_outliers_are_masked_in_their_channel_only() -> None:
 
 
 def test_spikes_do_not_hide_a_cause_and_are_unknown_beside_it() -> None:
-    recording = with_spikes(recorded({"Q1.pump_gain.factor": 1.1}, 52), 2, 60)
-    holdout = with_spikes(recorded({"Q1.pump_gain.factor": 1.1}, 53), 0, 60)
+    recording = with_spikes(recorded({"Q1.pump_gain.factor": 1.1}, 52, samples=500), 2, 60)
+    holdout = with_spikes(recorded({"Q1.pump_gain.factor": 1.1}, 53, samples=500), 0, 60)
     answer = diagnose(nominal_plant(), recording, holdout, Settings(SMALL))
     both = [("pump_gain", "Q1"), ("unknown", nominal_plant().sensors[2].name)]
     assert answer.verdict == "unknown" and set(answer.certain) == set(both)
