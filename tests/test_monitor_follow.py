@@ -207,9 +207,10 @@ def test_ctrl_c_keeps_what_was_logged(tmp_path: Path, monkeypatch: pytest.Monkey
     assert "alarm" in [message.payload["event"] for message in read_run(path).messages(["/observer/alarm"])]
 
 
-def test_faults_may_be_named_by_a_pattern(tmp_path: Path) -> None:
-    run = load_monitor(config(tmp_path, faults=["T1.leak", "*.leak"]))
+def test_faults_and_constants_may_be_named_by_a_pattern(tmp_path: Path) -> None:
+    run = load_monitor(config(tmp_path, faults=["T1.leak", "*.leak"], calibrate=["*.discharge_coefficient"]))
     assert run.config.faults == ["T1.leak.size", "T2.leak.size", "T3.leak.size"]
+    assert run.config.calibrate == [f"{pipe}.discharge_coefficient" for pipe in ("P13", "P32", "OUT2")]
     with pytest.raises(ConfigError, match=r"faults: expected a pattern such as \*\.leak or P1\.\*, got '\*\.leek'"):
         load_monitor(config(tmp_path, faults=["*.leek"]))
 

@@ -45,7 +45,10 @@ class MonitorConfig(Strict):
     fault_free: tuple[Seconds, Seconds] = Field(
         description="interval from which the noise is estimated, as in [0 s, 300 s]"
     )
-    calibrate: list[str] = Field(default_factory=list, description="constants fitted to the fault-free part first")
+    calibrate: list[str] = Field(
+        default_factory=list,
+        description="constants fitted to the fault-free part first, or patterns such as '*.discharge_coefficient'",
+    )
     faults: list[str] = Field(
         default_factory=list,
         description="parameters that may change, or patterns such as '*.leak'; by default the usual ones",
@@ -104,11 +107,15 @@ def build_monitor(data: Mapping[str, Any], base: Path, source: str) -> MonitorRu
 
 
 def _in_full(config: MonitorConfig, plant: PlantDescription) -> MonitorConfig:
-    """Expand names of faults: 'T1.leak' means the leak's size, and a pattern such as '*.leak' all that it matches."""
+    """Expand names: 'T1.leak' means the leak's size, and a pattern such as '*.leak' all that it matches."""
     ranged = names_in_full(config.ranges, plant, "ranges")
     ranges = dict(zip(ranged, config.ranges.values(), strict=True))
-    with naming("faults"):
-        matched = [full for name in config.faults for full in matching_names(name, plant)]
-    faults = names_in_full(dict.fromkeys(matched), plant, "faults")
-    names_in_full(config.calibrate, plant, "calibrate")
-    return config.model_copy(update={"faults": faults, "ranges": ranges})
+    faults, calibrate = (_matched(getattr(config, field), plant, field) for field in ("faults", "calibrate"))
+    return config.model_copy(update={"faults": faults, "calibrate": calibrate, "ranges": ranges})
+
+
+def _matched(patterns: Iterable[str], plant: PlantDescription, field: str) -> list[str]:
+    """The full names that the patterns match, each once."""
+    with naming(field):
+        matched = [full for pattern in patterns for full in matching_names(pattern, plant)]
+    return names_in_full(dict.fromkeys(matched), plant, field)
