@@ -127,7 +127,7 @@ def test_flows_learnt_from_a_window_too_are_those_of_the_whole_recording(correla
     exact = residual.new_zeros(0, *residual.shape)
     further = noise.whitening.learning_from(residual[300:], exact[:, 300:], 300)[0]
     known = flows.reading_std, flows.start_std, 1.0
-    whole, _ = estimate_flow_filter(flows.linear, noise.gain, residual, exact, *known)
+    whole, _ = estimate_flow_filter(flows.linear, noise.gain, residual, exact, residual.new_zeros(0), *known)
     assert further.flows is not None
     found, expected = further.flows.noise, whole.noise
     assert found.correlation_time == pytest.approx(expected.correlation_time, rel=0.05)
@@ -236,7 +236,8 @@ def test_innovations_do_not_depend_on_the_gain_of_the_observer() -> None:
         gain = hand_gain(share * torch.eye(3, dtype=torch.float64))
         residual = Observer(NETWORK, gain).run(samples).steady_residual
         exact = residual.new_zeros(0, *residual.shape)
-        flows, _ = estimate_flow_filter(linear, gain, residual, exact, residual.std(dim=0), heights, 1.0)
+        known = exact, residual.new_zeros(0), residual.std(dim=0), heights, 1.0
+        flows, _ = estimate_flow_filter(linear, gain, residual, *known)
         whites.append(flows(residual)[0][100:])
     assert float((whites[0] - whites[1]).square().mean().sqrt()) < 0.02 * float(whites[0].square().mean().sqrt())
 

@@ -12,18 +12,20 @@ from fdi_torch.monitor.flow_noise_estimate import by_initial_levels, free_residu
 from fdi_torch.monitor.law_errors import ConstantErrors
 
 
-def constant_errors(columns: Sequence[int], effects: Tensor, flows: FlowFilter | None) -> ConstantErrors:
+def constant_errors(
+    columns: Sequence[int], effects: Tensor, flows: FlowFilter | None, expected: Tensor
+) -> ConstantErrors:
     """What is not known about constants in columns of a space: of the first ones, which are calibrated, what least
     squares on the fault-free part left unknown (nothing without a flow filter); of the others, their tolerances.
 
     effects (P, S, sensors): of the P calibrated ones on the residuals of the fault-free part, per standard deviation of
-    their priors.
+    their priors. expected: means of the priors of the others, in these standard deviations from the values in use.
     """
     covariance, count = torch.eye(len(columns), dtype=torch.float64), len(effects)
     covariance[:count] = 0.0
     if count and flows is not None:
         covariance[:count, :count] = covariance_of_least_squares(flows, effects)
-    return ConstantErrors(tuple(columns), covariance, count)
+    return ConstantErrors(tuple(columns), covariance, count, torch.cat([expected.new_zeros(count), expected]))
 
 
 def covariance_of_least_squares(flows: FlowFilter, effects: Tensor) -> Tensor:

@@ -42,8 +42,8 @@ class FlowFilter:
     observer's gain. start_std (tanks,): of the initial levels, m.
     interval: s. learnt (samples, sensors): what the residual that the noise was learnt from would have been without
     the observer's corrections, NaN where a reading is missing. by_constants (samples, sensors, P): its derivatives by
-    the errors of constants, in standard deviations of their priors. begins: number of samples that the observer had
-    processed before the filter starts, from unknown levels and flows.
+    the errors of constants, in standard deviations of their priors; expected (P,): the means of these priors. begins:
+    number of samples that the observer had processed before the filter starts, from unknown levels and flows.
     """
 
     linear: Linear
@@ -54,6 +54,7 @@ class FlowFilter:
     interval: float
     learnt: Tensor
     by_constants: Tensor
+    expected: Tensor
     begins: int = 0
     correlation: float = 0.0
 

@@ -30,6 +30,7 @@ def estimate_flow_filter(
     observer: Gain,
     residual: Tensor,
     effects: Tensor,
+    expected: Tensor,
     reading_std: Tensor,
     start_std: Tensor,
     interval: float,
@@ -37,7 +38,8 @@ def estimate_flow_filter(
 ) -> tuple[FlowFilter, float]:
     """The filter for the noise that is most likely with an observer's residuals (S, sensors), and its log-likelihood.
 
-    effects (P, S, sensors): of the errors of constants on the residuals, per standard deviation of their priors.
+    effects (P, S, sensors): of the errors of constants on the residuals, per standard deviation of their priors, the
+    means of which are `expected` (P,).
     reading_std (sensors,): first guess of the measurement noise. correlation: of its neighbouring values. Raises
     BuildError without a compiler.
     """
@@ -45,7 +47,7 @@ def estimate_flow_filter(
     free = free_residual(linear, observer, residual)
     by_constants = free_residual(linear, observer, effects).nan_to_num().permute(1, 2, 0)
     known = linear, first, reading_std, observer, start_std, interval
-    start = FlowFilter(*known, free, by_constants, correlation=correlation)
+    start = FlowFilter(*known, free, by_constants, expected, correlation=correlation)
     flows, likely = _likeliest(start, [(free, by_constants)], CORRELATION_TIMES)
     return flows, likely.log_likelihood
 
@@ -93,7 +95,7 @@ def _likeliest(
     sensors = SensorNoise(start.reading_std, torch.full_like(start.reading_std, start.correlation))
     columns = torch.cat([by_levels, by_constants], dim=-1)
     unit, ones = _usual_flow(linear, start.reading_std, start.start_std), free.new_ones(columns.shape[-1])
-    residual = free.nan_to_num()
+    residual = free.nan_to_num() - by_constants @ start.expected
 
     def solved(noise: StateNoise) -> Likelihood:
         priors = ones, 0.0 * ones

@@ -19,7 +19,7 @@ from fdi_torch.monitor.fault_free_checks import false_alarm_rate_text, fault_war
 from fdi_torch.monitor.hypothesis import SHAPE, faults_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
-from fdi_torch.monitor.noise_model import effects_of_constants, learn_noise
+from fdi_torch.monitor.noise_model import effects_of_constants, learn_beside_errors
 from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.samples import samples_of_recording, usual_interval
 from fdi_torch.monitor.stepper import usual_step
@@ -93,10 +93,10 @@ def prepare_monitor(
     believed = space.vector(values)
     samples = samples_of_recording(fault_free, plant)
     calibrated, others = ([space.index(name) for name in names] for names in (calibrate, uncertain))
-    noise, seen = learn_noise(learning, samples, space, believed, longest_step=step, uncertain=others)
+    noise, seen, believed, expected = learn_beside_errors(learning, samples, space, believed, others, step)
     observed = partial(Observer, learning, noise.gain, longest_step=step)
     effects = effects_of_constants(observed, samples, space, believed, calibrated)
-    constants = constant_errors([*calibrated, *others], effects, noise.whitening.flows)
+    constants = constant_errors([*calibrated, *others], effects, noise.whitening.flows, expected)
     noise = replace(noise, constants=constants)
     sampling = float(torch.diff(samples.time).median())
     generator = torch.Generator().manual_seed(seed)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from fdi_torch.monitor.flow_filter import FlowFilter
 from fdi_torch.monitor.flow_noise_estimate import estimate_flow_filter, likeliest_correlation
-from fdi_torch.monitor.law_errors import STEP, ConstantErrors, raised
+from fdi_torch.monitor.law_errors import STEP, ConstantErrors, prior_std, raised
 from fdi_torch.monitor.observer import Observation, Observer, bind_parameters, initial_levels
 from fdi_torch.monitor.observer_gain import (
     Gain,
@@ -61,12 +61,13 @@ def learn_noise(
     levels: Tensor | None = None,
     longest_step: float | None = None,
     uncertain: Sequence[int] = (),
+    expected: Tensor | None = None,
 ) -> tuple[NoiseModel, Observation]:
     """Identify the noise by maximum likelihood over the ratio of process to measurement noise, and run its observer.
 
-    fault_free: one recording. levels (tanks,): initial levels if known. uncertain: columns of `space` that are
-    constants with errors; the residuals of the run are without the most likely ones. All candidate ratios run in
-    parallel.
+    fault_free: one recording. levels (tanks,): initial levels if known. uncertain: columns of `space` that are P
+    constants with errors, beside which the noise is learnt. expected (P,): means of their priors, in standard
+    deviations of these from theta; zero by default. All candidate ratios run in parallel.
     """
     if fault_free.batch:
         raise ValueError(f"expected one fault-free recording, got a batch of {tuple(fault_free.batch)}")
@@ -87,11 +88,33 @@ def learn_noise(
     if uncertain and space is not None and theta is not None:
         observed = partial(Observer, network, gain, longest_step=longest_step)
         effects = effects_of_constants(observed, fault_free, space, theta, uncertain, levels)
-    noise = replace(_noise(network, linear, gain, best, effects), interval=usual_interval(fault_free.time))
-    if flows := noise.whitening.flows:
-        explained = _likely_errors(flows, seen.steady_residual, effects)
-        seen = replace(seen, residual=seen.residual - seen.inflation * explained)
-    return noise, seen
+    expected = effects.new_zeros(len(effects)) if expected is None else expected
+    noise = _noise(network, linear, gain, best, effects, expected)
+    return replace(noise, interval=usual_interval(fault_free.time)), seen
+
+
+def learn_beside_errors(
+    network: TankNetwork,
+    samples: Samples,
+    space: ParameterSpace,
+    theta: Tensor,
+    uncertain: Sequence[int],
+    step: float,
+) -> tuple[NoiseModel, Observation, Tensor, Tensor]:
+    """The noise beside errors of constants, the run of its observer, theta with the most likely values of these, and
+    the means of their priors, in standard deviations of these from there.
+
+    About the most likely values their effects are linear enough: one Gauss-Newton step from the values of theta.
+    """
+    noise, seen = learn_noise(network, samples, space, theta, longest_step=step, uncertain=uncertain)
+    if not uncertain or noise.whitening.flows is None:
+        return noise, seen, theta, theta.new_zeros(len(uncertain))
+    observed = partial(Observer, network, noise.gain, longest_step=step)
+    effects = effects_of_constants(observed, samples, space, theta, uncertain)
+    errors = _likely_errors(noise.whitening.flows, seen.steady_residual, effects)
+    likeliest = theta.clone()
+    likeliest[list(uncertain)] -= errors * prior_std(space)[list(uncertain)]
+    return *learn_noise(network, samples, space, likeliest, None, step, uncertain, -errors), likeliest, -errors
 
 
 def effects_of_constants(
@@ -111,12 +134,18 @@ def effects_of_constants(
 
 
 def _likely_errors(flows: FlowFilter, residual: Tensor, effects: Tensor) -> Tensor:
-    """The most likely sum (S, sensors) of effects (P, S, sensors) with standard normal coefficients in residuals."""
+    """The most likely coefficients (P,) of effects (P, S, sensors) in residuals, beside random flows. They are normal
+    with the means `flows.expected` and unit variance."""
     std = flows.innovation_std
-    x, y = ((flows(values)[0] / std).nan_to_num() for values in (effects, residual))
+    rest = residual - _sum(effects, flows.expected)
+    x, y = ((flows(values)[0] / std).nan_to_num() for values in (effects, rest))
     x, y = x.flatten(1), y.flatten()
-    likely = torch.linalg.solve(x @ x.mT + torch.eye(len(x), dtype=x.dtype), x @ y)
-    return torch.tensordot(likely, effects.nan_to_num(), 1)
+    return flows.expected + torch.linalg.solve(x @ x.mT + torch.eye(len(x), dtype=x.dtype), x @ y)
+
+
+def _sum(effects: Tensor, coefficients: Tensor) -> Tensor:
+    """Sum (S, sensors) of effects (P, S, sensors) with these coefficients (P,)."""
+    return torch.tensordot(coefficients, effects.nan_to_num(), 1)
 
 
 @dataclass(frozen=True)
@@ -154,18 +183,22 @@ def _gain(network: TankNetwork, linear: Linear, exponents: Tensor) -> Gain:
     return kalman_gain(linear, shares.expand(-1, len(start_std)), unit.expand(len(exponents), -1), start_std)
 
 
-def _noise(network: TankNetwork, linear: Linear, gain: Gain, best: _Candidate, effects: Tensor) -> NoiseModel:
+def _noise(
+    network: TankNetwork, linear: Linear, gain: Gain, best: _Candidate, effects: Tensor, expected: Tensor
+) -> NoiseModel:
     """The measurement noise from the innovations' covariance, H P H' + R, at the best ratio."""
     unit, ratio = torch.linalg.vector_norm(linear.output, dim=-1), network.nominal.new_tensor(10.0**best.exponent)
     process = with_effects(ratio.expand(len(network.description.tanks)), network.order)
     predicted = riccati(linear, torch.diag_embed(process**2), torch.diag(unit**2))
     variance = torch.diagonal(linear.output @ predicted @ linear.output.mT) + unit**2
     reading_std = torch.sqrt(best.seen.steady_residual.square().nanmean(dim=0) / variance) * unit
-    whitening = _whitening(network, linear, gain, best.seen, effects)
+    whitening = _whitening(network, linear, gain, best.seen, effects, expected)
     return NoiseModel(reading_std, float(ratio), whitening, gain)
 
 
-def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observation, effects: Tensor) -> Whitening:
+def _whitening(
+    network: TankNetwork, linear: Linear, gain: Gain, seen: Observation, effects: Tensor, expected: Tensor
+) -> Whitening:
     """Whitening of an observer's residuals: random flows by their Kalman filter, what remains by an autoregression.
 
     First the noise of the sensors is taken as white. If the residuals remain correlated, or if the random flows are
@@ -174,7 +207,7 @@ def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observati
     """
     residual, interval = seen.steady_residual, usual_interval(seen.time)
     std, start = residual.square().nanmean(dim=0).sqrt(), start_uncertainty(network.description, residual)
-    estimate = partial(estimate_flow_filter, linear, gain, residual, effects, std, start, interval)
+    estimate = partial(estimate_flow_filter, linear, gain, residual, effects, expected, std, start, interval)
     try:
         flows, log_likelihood = estimate(0.0)
     except BuildError:
@@ -190,7 +223,7 @@ def _whitening(network: TankNetwork, linear: Linear, gain: Gain, seen: Observati
 def _scored(flows: FlowFilter, log_likelihood: float, residual: Tensor, effects: Tensor) -> tuple[float, Whitening]:
     """-2 log-likelihood with the penalty for what whitens the innovations of a flow filter, without the most likely
     errors of constants, and that whitening."""
-    fits = score_whitenings(flows(residual - _likely_errors(flows, residual, effects))[0])
+    fits = score_whitenings(flows(residual - _sum(effects, _likely_errors(flows, residual, effects)))[0])
     without = next(score for score, whitening in fits if not whitening.order and not bool(whitening.mean.any()))
     return fits[0][0] - without - 2.0 * log_likelihood, replace(fits[0][1], flows=flows)
 
