@@ -212,6 +212,19 @@ def test_errors_of_constants_hide_no_fault_beyond_their_tolerance(calibrate: Seq
     assert 600.0 < next(event.time for event in events if event.kind == "alarm") <= 620.0
 
 
+def test_effects_of_constants_are_linear_about_their_most_likely_values() -> None:
+    """Coefficients that are 2.5 tolerances off, in a recording that determines them to a tenth of a tolerance."""
+    generator = torch.Generator().manual_seed(20261573)
+    off = OF_CONSTANTS.std()[:-1] * torch.tensor([2.5, -2.5, 2.5], dtype=DTYPE)
+    sound = OF_CONSTANTS.nominal() + torch.cat([off, off.new_zeros(1)])
+    inputs = (3e-5 + 4e-5 * torch.rand(8, 2, generator=generator, dtype=DTYPE)).repeat_interleave(200, 0)
+    samples = recorded(lambda time: sound, len(inputs), NETWORK, OF_CONSTANTS, seed=20261573, inputs=inputs)
+    whole = replace(blank_recording(PLANT, inputs, samples.time), outputs=samples.readings, mask=None)
+    prepared = prepare_monitor(PLANT, fault_free_part(whole, 0.0, 1000.0), ["T1.leak.size"])
+    columns = [prepared.monitor.space.index(name) for name in CONSTANTS]
+    assert bool(((prepared.believed[columns] - sound[:-1]).abs() < 0.2 * OF_CONSTANTS.std()[:-1]).all())
+
+
 def test_the_covariance_of_least_squares_is_that_of_estimates_from_drawn_flows_and_noise() -> None:
     """Weighted sums of 4000 simulated free runs."""
     flows = learn_noise(NETWORK, recorded(lambda t: SPACE.nominal(), 120))[0].whitening.flows

@@ -62,10 +62,9 @@ def prepare_monitor(
     not among them are causes that are not on the list.
 
     calibrate: constants that are first fitted to the fault-free recording, with their tolerances as priors. All others
-    with a tolerance keep their values and are uncertain by it. start:
-    knowledge of the initial levels. step: longest integration step, s; by default `usual_step`, or the fraction of the
-    sampling interval next to it. ranges: replace the usual ranges of faults.
-    Raises ValueError.
+    with a tolerance are estimated beside the random flows. start: knowledge of the initial levels. step: longest
+    integration step, s; by default `usual_step`, or the fraction of the sampling interval next to it. ranges: replace
+    the usual ranges of faults. Raises ValueError.
     """
     # The step is at most the usual sampling interval, because it also sets how sharply square roots and rims are
     # resolved.
