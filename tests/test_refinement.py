@@ -97,3 +97,14 @@ def test_a_constant_within_its_tolerance_is_no_fault_of_a_pair_that_is_determine
     assert value["T2.leak.size"] == pytest.approx(-value["out.plugging.size"], abs=0.01)
     assert combination.std > 0.02 and abs(combination.value) < 3.0 * combination.std
     assert done.result.diagnosis.statement == "single fault: leak at T1"
+
+
+def test_a_constant_far_outside_its_tolerance_is_estimated_there(tmp_path: Path) -> None:
+    """An outlet 21 % below the plant file, seven standard deviations of its tolerance: the readings deny the prior."""
+    (tmp_path / "rig.yaml").write_text(RIG)
+    (tmp_path / "run.yaml").write_text(SIMULATED.replace("out.plugging: -0.033", "out.discharge_coefficient: 0.474"))
+    recording = fdi_torch.simulate(fdi_torch.load_run(tmp_path / "run.yaml"))
+    found = fdi_torch.train(tmp_path / "rig.yaml", recording, ["T1.leak"], output={"folder": str(tmp_path)}).estimate
+    for name, truth in (("out.discharge_coefficient", 0.474), ("T1.leak.size", 0.2)):
+        k = found.names.index(name)
+        assert abs(float(found.value[k]) - truth) < 3.5 * float(found.std[k])

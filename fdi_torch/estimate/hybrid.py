@@ -85,6 +85,7 @@ def estimate_parameters(
     cost, box = fitting.problem(coarse, settings.objectives[0]).cost, (low[None], high[None])
     result = evolve(cost, *box, settings.search, seed, on_generation=on_generation, resume=resume)
     starts = starting_points(result, low, high, settings.starts)
+    low, high = fitting.space.low(), fitting.space.high()  # only the search needs a box about the priors
     if settings.method == "none":
         refinement = unrefined(fitting, settings, starts, low, high, fine)
     elif settings.adaptive:
