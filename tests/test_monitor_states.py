@@ -255,14 +255,15 @@ def test_a_recovery_is_told_once_beside_a_fault_whose_end_the_readings_would_not
         Hypothesis((leak, bias), recovered=(leak, bias)), SPACE.nominal(), none, 30.0, 0.5, 9.0, 1.0, 2.0, 3.0
     )
     change = DetectedChange(2, SPACE.nominal() + 0.1, 5.0, (fit,), 35.0, 99.0, tuple(tracks))
+    sharp = dict.fromkeys((leak, bias))
     state = replace(
         watch.start(samples), hidden=(hidden,), alarms=(Alarm(1, 10.0, 10.0).with_state(State.CANNOT_TELL),)
     )
-    state, events = end_recovered(watch.writer, state, change, [fit], None, tracks[:1])
+    state, events = end_recovered(watch.writer, state, change, [fit], sharp, tracks[:1])
     assert [(e.kind, e.alarm, e.state) for e in events] == [("recovered", 1, State.CANNOT_TELL)]
     assert events[0].text.startswith("sensor bias at h3: back to nominal, since 30.0")
-    assert not end_recovered(watch.writer, state, change, [fit], None, tracks)[1], "both are told"
-    shown, events = end_recovered(watch.writer, replace(state, hidden=()), change, [fit], None, tracks)
+    assert not end_recovered(watch.writer, state, change, [fit], sharp, tracks)[1], "both are told"
+    shown, events = end_recovered(watch.writer, replace(state, hidden=()), change, [fit], sharp, tracks)
     assert shown.alarm(1).state is State.RECOVERED and [e.kind for e in events] == ["recovered"]
 
 
@@ -289,5 +290,5 @@ def test_another_fault_does_not_tell_when_a_drain_ended_in_a_dry_tank(tmp_path: 
     )
     (track,) = state.tracks
     assert track.column == drain
-    ends = possible_ends(watch.observer, state, replace(change, ended=(track,)), 60.0)
+    ends = possible_ends(watch.observer, state, replace(change, ended=(track,)), 60.0)[drain]
     assert ends is not None and ends[0] < 450.0 and 510.0 < ends[1] < 520.0

@@ -277,8 +277,7 @@ class AlarmHandler:
             ],
         )
         ends = possible_ends(self.observer, state, change, self.settings.lookback)
-        earliest_end = change.best.onset if ends is None else ends[0]
-        state = with_hidden(self.observer, state, change, earliest_end, self.settings.confirm)
+        state = with_hidden(self.observer, state, change, ends, self.settings.confirm)
         state, events = end_recovered(self.writer, state, change, reported, ends, told)
         present = [c for c in best.hypothesis.sizes if c not in back]
         if not present:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -29,6 +29,10 @@ from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.effect import Stage
 
 FORECAST_WINDOWS = 4.0  # horizon of the level forecast, in longest windows
+
+
+Ends = Mapping[int, tuple[float, float] | None]
+"""First and last time at which a fault may have ended, s, by the column of its size; None: at the onset of the fit."""
 
 
 class EventWriter:
@@ -92,27 +96,36 @@ class EventWriter:
         change: DetectedChange,
         fits: Sequence[HypothesisFit],
         number: int,
-        names: Sequence[str],
+        columns: Sequence[int],
         observable: bool,
-        ends: tuple[float, float] | None,
+        ends: Ends,
     ) -> Event:
-        """Recovery of the faults of one alarm. observable: whether the readings would show them if still present.
-
-        ends: first and last time at which they may have ended, s; None if the fit's onset says it.
+        """Recovery of the faults of one alarm. columns: of their sizes. observable: whether the readings would show
+        them if still present.
         """
         explanations = tuple(self.explanation(f, state, change) for f in fits)
-        faults, when = ", ".join(map(parameter_words, names)), _onset_text(fits[0], fits[0].hypothesis.incipient)
-        if ends is not None:
-            when = f"between {ends[0]:.1f} s and {ends[1]:.1f} s"
-            explanations = (_at_any_time(explanations[0], *ends), *explanations[1:])
-        text = f"{faults}: back to nominal, {when}"
+        intervals = [interval for c in columns if (interval := ends[c]) is not None]
+        uncertain, certain = [c for c in columns if ends[c] is not None], [c for c in columns if ends[c] is None]
+        said = []
+        if intervals:
+            first, last = min(first for first, _ in intervals), max(last for _, last in intervals)
+            said.append(f"{self._faults(uncertain)}: back to nominal, between {first:.1f} s and {last:.1f} s")
+            explanations = (_at_any_time(explanations[0], first, last), *explanations[1:])
+        if certain:
+            when = _onset_text(fits[0], fits[0].hypothesis.incipient)
+            said.append(f"{self._faults(certain)}: back to nominal, {when}")
         if " or " in headline(explanations):
-            text += f"; {headline(explanations)}"
+            said.append(headline(explanations))
+        text = "; ".join(said)
         if not observable:
-            text = f"{faults}: the readings since {fits[0].onset:.1f} s would not show whether it still stands"
+            hidden = f"the readings since {fits[0].onset:.1f} s would not show whether it still stands"
+            text = f"{self._faults(columns)}: {hidden}"
         kind: Kind = "recovered" if observable else "cannot tell"
         delay = change.alarm_time - (fits[0].onset if explanations[0].onset is None else explanations[0].onset)
         return self._event(state, kind, text, state.alarm(number), explanations=explanations, delay=delay)
+
+    def _faults(self, columns: Sequence[int]) -> str:
+        return ", ".join(parameter_words(self.space.names[c]) for c in columns)
 
     def end_shown(self, state: MonitorState, number: int, faults: Sequence[HiddenFault]) -> Event:
         """The end of hidden faults of one alarm, once the readings have shown it."""

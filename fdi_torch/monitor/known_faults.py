@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.monitor.alarm_state import State
-from fdi_torch.monitor.event_text import EventWriter
+from fdi_torch.monitor.event_text import Ends, EventWriter
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit
 from fdi_torch.monitor.hypothesis_fit import changes_of
@@ -149,34 +149,36 @@ def _law_error(track: FaultTrack) -> float:
     return 3.0 * FAULT_MODEL_ERROR * track.effect_rms
 
 
-def possible_ends(
-    observer: ObserverBank, state: MonitorState, change: DetectedChange, lookback: float
-) -> tuple[float, float] | None:
-    """Interval in which the faults of a change may have ended, s; None if the standard deviation of the fitted onset
-    describes it.
+def possible_ends(observer: ObserverBank, state: MonitorState, change: DetectedChange, lookback: float) -> Ends:
+    """For each fault that ended at a change, the interval in which it may have ended, s; None if the standard deviation
+    of the fitted onset describes it.
 
     In a dry tank the readings determine no onset, and the fitted one may be the time from which the fault's law is
     wrong. Another onset is possible if its misfit is at most that of three standard deviations larger, or if it changes
     the white innovations by less than the error of the fault's law, which is no larger than the noise if the fit leaves
-    no more than that. Only the ends move: what else changed keeps its onset, and to first order its effect.
+    no more than that. What else changed keeps its onset, and to first order its effect.
     """
-    best = change.best
-    if not change.ended or best.hypothesis.incipient:
-        return None
-    window = state.window(max(best.onset - lookback, change.since))
+    if change.best.hypothesis.incipient:
+        return {track.column: None for track in change.ended}
+    return {track.column: _possible_end(observer, state, change, track, lookback) for track in change.ended}
+
+
+def _possible_end(
+    observer: ObserverBank, state: MonitorState, change: DetectedChange, ended: FaultTrack, lookback: float
+) -> tuple[float, float] | None:
+    best, window = change.best, state.window(max(change.best.onset - lookback, change.since))
     times = window.samples.time[:: max(len(window) // END_CANDIDATES, 1)]
     onsets = torch.cat([times, times.new_tensor([best.onset])])
     sudden = torch.zeros(len(onsets), dtype=torch.bool)
-    columns = [track.column for track in change.ended]
     after = change.before.clone()
-    after[columns] = best.value[columns]
+    after[ended.column] = best.value[ended.column]
     blocks = observer.in_blocks(window, ChangeHypotheses(after.repeat(len(onsets), 1), onsets, sudden))
     white = torch.cat([observer.white_innovations(window, change.before, block) for block in blocks])
     white = white + (observer.white_innovations(window, change.before, changes_of([best])) - white[-1])
     misfits = 0.5 * white.square().sum((1, 2)) / best.misfit_ratio
     between = ((window.times > times[:, None]) != (window.times > best.onset)).to(white.dtype)
     moved = ((white[:-1] - white[-1]).square().mean(-1) * between).sum(-1) / between.sum(-1).clamp(min=1.0)
-    law_error = min(max(map(_law_error, change.ended)), 1.0 if best.fits else math.inf)
+    law_error = min(_law_error(ended), 1.0 if best.fits else math.inf)
     possible = (misfits[:-1] - misfits[-1] <= 4.5) | (moved.sqrt() < law_error)
     earlier, later = times <= best.onset, times > best.onset
     first = min([best.onset, *_while(times[earlier].flip(0), possible[earlier].flip(0))])
@@ -227,7 +229,7 @@ def _is_recovered(space: ParameterSpace, change: DetectedChange, column: int) ->
 
 
 def with_hidden(
-    observer: ObserverBank, state: MonitorState, change: DetectedChange, earliest_end: float, latest: float
+    observer: ObserverBank, state: MonitorState, change: DetectedChange, ends: Ends, latest: float
 ) -> MonitorState:
     """The state with the faults that recovered at a change but that the readings since would not show.
 
@@ -235,7 +237,8 @@ def with_hidden(
     have run only in these.
     """
     best, starts = change.best, (change.best.onset, state.now - latest)
-    ended = [HiddenFault(t, float(change.before[t.column]), earliest_end, state.now) for t in change.ended]
+    earliest = {t.column: (ends[t.column] or (best.onset,))[0] for t in change.ended}
+    ended = [HiddenFault(t, float(change.before[t.column]), earliest[t.column], state.now) for t in change.ended]
     new = [h for h in ended if not any(_end_is_shown(observer, state, h, max(s, best.onset)) for s in starts)]
     judged = {*best.hypothesis.columns, *state.off_nominal.nonzero().flatten().tolist()}
     return replace(state, hidden=(*(h for h in state.hidden if h.track.column not in judged), *new))
@@ -264,7 +267,7 @@ def end_recovered(
     state: MonitorState,
     change: DetectedChange,
     reported: Sequence[HypothesisFit],
-    ends: tuple[float, float] | None,
+    ends: Ends,
     told: Sequence[FaultTrack],
 ) -> tuple[MonitorState, list[Event]]:
     """End the alarms of recovered faults; "cannot tell" if the readings would not show one of them any more.
@@ -280,6 +283,6 @@ def end_recovered(
         for kind in (State.CANNOT_TELL, State.RECOVERED):
             alike = [t for t in ended if (t.column in unseen) == (kind is State.CANNOT_TELL)]
             if any(t not in told for t in alike) or (alike and differs and kind is answer):
-                names = [writer.space.names[t.column] for t in alike]
-                events.append(writer.ended(state, change, reported, number, names, kind is State.RECOVERED, ends))
+                columns = [t.column for t in alike]
+                events.append(writer.ended(state, change, reported, number, columns, kind is State.RECOVERED, ends))
     return state, events
