@@ -101,9 +101,12 @@ class EventWriter:
         ends: Ends,
     ) -> Event:
         """Recovery of the faults of one alarm. columns: of their sizes. observable: whether the readings would show
-        them if still present.
+        them if still present. The likeliest explanation leaves the recovered faults of other alarms to their events.
         """
         explanations = tuple(self.explanation(f, state, change) for f in fits)
+        others = {self.space.names[t.column] for t in change.ended if t.column not in columns}
+        kept = [name for name in explanations[0].names if name not in others]
+        explanations = (explanations[0].restricted_to(kept), *explanations[1:])
         intervals = [interval for c in columns if (interval := ends[c]) is not None]
         uncertain, certain = [c for c in columns if ends[c] is not None], [c for c in columns if ends[c] is None]
         said = []
