@@ -130,7 +130,7 @@ def test_an_array_whose_header_lies_is_refused(member: bytes, tmp_path: Path) ->
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         archive.writestr("x.npy", member)
-    with pytest.raises(LogError, match=r"results\.npz is no \.npz of plain arrays"):
+    with pytest.raises(LogError, match=r"results\.npz is not an \.npz file of plain arrays"):
         arrays(read_run(log_with(tmp_path / "a.mcap", results__npz=buffer.getvalue())))
 
 

@@ -110,7 +110,7 @@ def test_pickled_arrays_are_refused(tmp_path: Path) -> None:
     sink.attachment("torn.npz", "", buffer.getvalue()[:50])
     sink.finish()
     for name in ("results.npz", "torn.npz"):
-        with pytest.raises(LogError, match=r"is no \.npz of plain arrays"):
+        with pytest.raises(LogError, match=r"is not an \.npz file of plain arrays"):
             arrays(read_run(tmp_path / "a.mcap"), name)
 
 
