@@ -17,7 +17,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant_file import chosen_plant, placeholders
 from fdi_torch.config.yaml_files import find_plant
 from fdi_torch.names import counted
-from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, PlantDescription
+from fdi_torch.plant.description import OUTSIDE, PlantDescription
 from fdi_torch.plant.scales import emptying_time
 from fdi_torch.quantities import display_unit, significant
 from fdi_torch.recordings.csv_writing import header_of
@@ -93,11 +93,7 @@ def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[Recor
 
 
 def _show_plant(plant: PlantDescription, screen: Screen) -> None:
-    flows = [(getattr(plant, kind.part()), kind.__name__.lower()) for kind in FLOW_KINDS]
-    always = ("tank", "pipe", "pump", "sensor")
-    counts = [(plant.tanks, "tank"), *flows, (plant.sensors, "sensor")]
-    parts = ", ".join(counted(len(c), what) for c, what in counts if c or what in always)
-    screen.say(f"{plant.title}: {parts}, {counted(len(plant.tolerances), 'constant')} with a tolerance")
+    screen.say(f"{plant.title}: {plant.counts}, {counted(len(plant.tolerances), 'constant')} with a tolerance")
     (area, per_area), (height, per_height) = display_unit("m^2"), display_unit("m")
     rows = []
     for tank in plant.tanks:

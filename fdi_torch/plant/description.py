@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from fdi_torch.names import nearest
+from fdi_torch.names import counted, nearest
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.components import COMMAND_UNITS, OUTSIDE, READING_UNITS, Component, Sensor, Tank
 from fdi_torch.plant.description_checks import check_names, check_numbers, check_references
@@ -77,7 +77,7 @@ class FaultPriority:
     urgency: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PlantDescription:
     """A rig: its components, known effects and prior knowledge; gravity m/s^2.
 
@@ -106,6 +106,17 @@ class PlantDescription:
         check_names(self)
         check_references(self)
         check_numbers(self)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name}: {self.counts}>"
+
+    @property
+    def counts(self) -> str:
+        """'3 tanks, 3 pipes, 2 pumps, 3 sensors': kinds beyond these only if there are any."""
+        parts = [(self.tanks, "tank"), *((getattr(self, kind.part()), kind.__name__.lower()) for kind in FLOW_KINDS)]
+        parts.append((self.sensors, "sensor"))
+        always = ("tank", "pipe", "pump", "sensor")
+        return ", ".join(counted(len(each), noun) for each, noun in parts if each or noun in always)
 
     @property
     def title(self) -> str:
