@@ -10,7 +10,8 @@ from fdi_torch.names import listed
 from fdi_torch.parameters import ParameterName
 from fdi_torch.quantities import display_unit, displayed_words, significant
 
-RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+_DIGITS, _RAISED_DIGITS = "0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻"
+RAISED, LOWERED = str.maketrans(_DIGITS, _RAISED_DIGITS), str.maketrans(_RAISED_DIGITS, _DIGITS)
 
 
 def effect_words(effect: str, place: str) -> str:

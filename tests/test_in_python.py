@@ -171,7 +171,7 @@ def test_every_job_takes_a_run_as_a_mapping_or_a_file(tmp_path: Path) -> None:
     assert fdi_torch.refit(real).fit.fitted == fdi_torch.refit(RIG, recording).fit.fitted
     library = {"library": "leak", "out": tmp_path}
     assert fdi_torch.gap(real, **library).headline == fdi_torch.gap(RIG, recording, **library).headline  # type: ignore[arg-type]
-    with pytest.raises(fdi_torch.ConfigError, match=r"simulate.inputs: expected every channel of the plant, .* for Q"):
+    with pytest.raises(fdi_torch.ConfigError, match=r"simulate: inputs: expected every channel of the plant, .* for Q"):
         fdi_torch.simulate(RIG)
     with pytest.raises(TypeError, match=r"simulate: expected either a run or a plant with .* of simulate, got both"):
         fdi_torch.simulate(run, duration="100 s")
@@ -299,6 +299,37 @@ def test_a_plant_prints_as_its_file() -> None:
     assert build_plant(yaml.safe_load(str(in_code())), "text") == in_code()
 
 
+def test_a_plant_shows_its_name_and_the_number_of_its_components() -> None:
+    assert repr(fdi_torch.load_plant("three_tank")) == "<Plant three_tank: 3 tanks, 3 pipes, 2 pumps, 3 sensors>"
+
+
+def test_a_wrong_argument_of_simulate_is_named_as_an_argument() -> None:
+    for arguments, problem in (
+        ({"inputs": {"Q": "3 bananas"}}, r"inputs\.Q: expected a quantity in m\^3/s"),
+        ({"duration": "3 m"}, "duration: expected a quantity in s"),
+        ({"inputs": {"Q": "3 l/min"}, "faults": {"X.leak": 0.3}}, r"faults: plant .*: expected one of .*, got X"),
+    ):
+        wrong: Any = arguments
+        with pytest.raises(fdi_torch.ConfigError, match=f"^simulate: {problem}"):
+            fdi_torch.simulate(RIG, **wrong)
+
+
+def test_shares_of_progress_have_three_decimals(tmp_path: Path) -> None:
+    shares: list[float] = []
+    run = simulated()
+    fdi_torch.train(
+        RIG, run, ["A.leak"], output={"folder": str(tmp_path)}, tell=lambda share, text: shares.append(share)
+    )
+    assert len(set(shares)) > 3 and shares == [round(share, 3) for share in shares]
+
+
+def test_an_integration_step_with_a_unit_is_refused_in_a_sentence() -> None:
+    fitting: Any = fdi_torch.set_up(RIG, [simulated()], ["A.leak"], "equilibrium")
+    for method in (fitting.engines, fitting.problem):
+        with pytest.raises(ValueError, match=r"expected the integration step as a number of seconds, got '1 s'"):
+            method("1 s")
+
+
 def test_arguments_of_another_kind_are_named() -> None:
     blank: Any = simulated()
     for function in (fdi_torch.train, fdi_torch.monitor, fdi_torch.study):
@@ -315,7 +346,7 @@ def test_arguments_of_another_kind_are_named() -> None:
     ):
         late: dict[str, Any] = {"A.leak": 0.2, "A.leak.onset": "200 s"}
         fdi_torch.simulate(RIG, inputs={"Q": "3 l/min"}, duration="100 s", faults=late)
-    with pytest.raises(fdi_torch.ConfigError, match=r"simulate.noise: expected \{std: .*, got 1 mm"):
+    with pytest.raises(fdi_torch.ConfigError, match=r"simulate: noise: expected \{std: .*, got '1 mm'"):
         fdi_torch.simulate(RIG, inputs={"Q": "3 l/min"}, noise="1 mm")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"start level of A: expected equilibrium, free or a level in m, got 'eq'"):
         fdi_torch.set_up(RIG, [simulated()], ["A.leak"], "eq")  # type: ignore[arg-type]

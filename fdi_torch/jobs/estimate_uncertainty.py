@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 
 import torch
@@ -17,6 +17,7 @@ from fdi_torch.estimate.hybrid import HybridResult
 from fdi_torch.estimate.objectives import Problem
 from fdi_torch.estimate.posterior_draws import MOST_POINTWISE, draw_posterior
 from fdi_torch.estimate.profile import Profile, profile_likelihood
+from fdi_torch.jobs.progress import Tell, silent
 from fdi_torch.names import unknown
 from fdi_torch.parameters import ParameterSpace
 
@@ -47,7 +48,7 @@ def with_draws(
     draws: int,
     seed: int,
     most_steps: int = 16_000,
-    tell: Callable[[float, str], None] = lambda share, text: None,
+    tell: Tell = silent,
 ) -> HybridResult:
     """The result whose estimate holds draws from the posterior, with the noise levels of the standard errors."""
     theta, likelihood = result.estimate.value, result.likelihood

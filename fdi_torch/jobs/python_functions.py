@@ -6,7 +6,7 @@ the plant's name and a `Recording` the recording's file name.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings, read_recording
 from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monitor
 from fdi_torch.config.plant_file import AnyPlant, chosen_plant
+from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.study_file import Study, build_study, load_study
 from fdi_torch.effects.catalogue import Catalogue
@@ -29,6 +30,7 @@ from fdi_torch.jobs.gap import library_entries, one_thread, run_gap
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
+from fdi_torch.jobs.progress import Tell, TellEndless, rounded, silent
 from fdi_torch.jobs.python_results import FreeRun, GapResult, MonitorResult, RefitResult
 from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.monitor.events import Event
@@ -36,13 +38,8 @@ from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 
-Tell = Callable[[float, str], None]
 AnyRecording = Recording | Mapping[str, Any] | str | Path
 AnyRun = Run | Mapping[str, Any] | str | Path
-
-
-def silent(share: float | None, text: str) -> None:
-    """Ignore progress messages."""
 
 
 def _keys(run: Any, advice: str = "name its recordings as the next argument; ") -> Mapping[str, Any]:
@@ -105,7 +102,11 @@ def simulate(
     if isinstance(plant, Run | Mapping):
         raise TypeError("simulate: expected either a run or a plant with the keys of simulate, got both; keep one")
     named = {} if plant is None else {"plant": plant}
-    return simulate_recording(build_run({**named, "simulate": given}, Path.cwd(), "arguments"))
+    try:
+        return simulate_recording(build_run({**named, "simulate": given}, Path.cwd(), "simulate"))
+    except ConfigError as error:  # in a run file, the arguments are the keys of simulate
+        problems = [problem.removeprefix("simulate: ").removeprefix("simulate.") for problem in error.problems]
+        raise ConfigError([f"simulate: {problem}" for problem in problems]) from None
 
 
 def train(
@@ -135,7 +136,7 @@ def train(
     elif parameters is not None or keys:
         given = ", ".join(["the parameters"] * (parameters is not None) + [*keys])
         raise TypeError(f"train: expected recordings beside {given}, got none; name them, or give a run alone")
-    return train_job.train(_run_of(run, "train"), tell, resume, listener)
+    return train_job.train(_run_of(run, "train"), rounded(tell), resume, listener)
 
 
 def gap(
@@ -166,7 +167,7 @@ def gap(
         settings["library"] = library_entries(settings["library"])
     plant, segments = _plant_and_recordings(plant, recordings, "gap")
     log = free_path(Path(out), "gap")
-    answer = run_gap(log, plant, segments, recordings_of(holdouts, plant), Settings(**settings), tell)
+    answer = run_gap(log, plant, segments, recordings_of(holdouts, plant), Settings(**settings), rounded(tell))
     return GapResult(answer, plant, log)
 
 
@@ -174,7 +175,7 @@ def monitor(
     plant: AnyPlant | MonitorRun | Mapping[str, Any],
     recording: AnyRecording | None = None,
     *,
-    tell: Callable[[float | None, str], None] = silent,
+    tell: TellEndless = silent,
     **keys: Any,
 ) -> MonitorResult:
     """Run a monitor along a recording, as `fdi monitor` does.
@@ -194,7 +195,7 @@ def monitor(
     elif not isinstance(run, MonitorRun):
         run = build_monitor(_keys(run), Path.cwd(), "monitor")
     events: list[Event] = []
-    summary = run_monitor(run, MonitorCallbacks(tell, events.append, lambda prepared: None))
+    summary = run_monitor(run, MonitorCallbacks(rounded(tell), events.append, lambda prepared: None))
     return MonitorResult(tuple(events), summary.lasted, summary.spent, summary.log)
 
 
@@ -224,7 +225,7 @@ def predict(
             "cut one with Recording.known_segments()"
         )
     with one_thread():
-        prediction = run_freely(plant, parts[0], start_samples, step, settle, vary, tell)
+        prediction = run_freely(plant, parts[0], start_samples, step, settle, vary, rounded(tell))
     return FreeRun(plant, parts[0], prediction)
 
 
@@ -244,7 +245,7 @@ def refit(
     """
     plant, segments = _plant_and_recordings(plant, recordings, "refit")
     with one_thread():
-        fit = refitted(plant, segments, step=step, tell=tell, **choices)
+        fit = refitted(plant, segments, step=step, tell=rounded(tell), **choices)
     return RefitResult(fit, misfit_of(fit.rmse, segments, plant))
 
 
@@ -265,7 +266,7 @@ def study(
         study = load_study(study)
     elif not isinstance(study, Study):
         study = build_study(_keys(study, advice=""), Path.cwd(), "study")
-    return study_job.run_study(study, resume, cluster, tell)
+    return study_job.run_study(study, resume, cluster, rounded(tell))
 
 
 def effects(plant: AnyPlant | None = None) -> Catalogue:

@@ -19,6 +19,7 @@ from fdi_torch.jobs.gap import groups, run_gap
 from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.logged_recordings import logged_recording
 from fdi_torch.jobs.monitor_rows import fault_free_recording, logged_items, rows_in
+from fdi_torch.jobs.progress import TellEndless, silent
 from fdi_torch.jobs.run_setup import fitting_of, requested_space
 from fdi_torch.jobs.study import TRIAL, log_summary, log_trials
 from fdi_torch.jobs.train import STATE, estimate_logged, log_recordings, state_is_due
@@ -27,13 +28,16 @@ from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook.replay import Select
 from fdi_torch.study.monte_carlo import Trial, run_blocks
 
-Tell = Callable[[float | None, str], None]
 # A replay uses the log's data, so configuration keys of the data cannot be changed.
 _DATA_KEYS = ("simulate", "recordings")
 
 
 def repeat_run(
-    log: LoggedRun, path: Path, overrides: Iterable[str] = (), trials: Sequence[int] = (), tell: Tell | None = None
+    log: LoggedRun,
+    path: Path,
+    overrides: Iterable[str] = (),
+    trials: Sequence[int] = (),
+    tell: TellEndless = silent,
 ) -> Path:
     """Repeat the run of a log of `fdi train`, `fdi study`, `fdi gap` or `fdi monitor`, and log it at `path`.
 
@@ -42,10 +46,9 @@ def repeat_run(
     """
     about = log.about("run")
     kind, parent = about.get("kind", ""), about.get("run_id", "")
-    tell = tell or (lambda share, text: None)
     if trials and kind != "study":
         raise ValueError(f"--trial: expected a study's log, got one of fdi {kind}: {log.path}; leave --trial out")
-    replays: dict[str, Callable[[LoggedRun, Path, Sequence[str], Tell, str], None]] = {
+    replays: dict[str, Callable[[LoggedRun, Path, Sequence[str], TellEndless, str], None]] = {
         "train": replay_estimate,
         "study": partial(replay_study, trials=trials),
         "gap": replay_gap,
@@ -58,7 +61,7 @@ def repeat_run(
     return path
 
 
-def replay_estimate(log: LoggedRun, path: Path, overrides: Sequence[str], tell: Tell, parent: str) -> None:
+def replay_estimate(log: LoggedRun, path: Path, overrides: Sequence[str], tell: TellEndless, parent: str) -> None:
     """Repeat an estimation from the recordings in the log."""
     run = logged_run(log, overrides)
     if run.config.estimate.windows is not None:
@@ -77,7 +80,7 @@ def replay_estimate(log: LoggedRun, path: Path, overrides: Sequence[str], tell: 
         estimate_logged(run, fitting, again, tell)
 
 
-def replay_monitor(log: LoggedRun, path: Path, overrides: Sequence[str], tell: Tell, parent: str) -> None:
+def replay_monitor(log: LoggedRun, path: Path, overrides: Sequence[str], tell: TellEndless, parent: str) -> None:
     """Repeat a monitor run along the samples in the log."""
     _expect_no_data(overrides, ("recording",))
     run = build_monitor(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
@@ -94,7 +97,7 @@ def replay_monitor(log: LoggedRun, path: Path, overrides: Sequence[str], tell: T
 
 
 def replay_study(
-    log: LoggedRun, path: Path, overrides: Sequence[str], tell: Tell, parent: str, *, trials: Sequence[int]
+    log: LoggedRun, path: Path, overrides: Sequence[str], tell: TellEndless, parent: str, *, trials: Sequence[int]
 ) -> None:
     """Repeat trials of a study, and its summary if all trials are repeated."""
     study = build_study(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
@@ -181,7 +184,7 @@ def start_levels(run: Run, count: int, path: Path) -> list[Any]:
     return [{t: w.get(t, "free") if isinstance(w, dict) else w for t in tanks} for w in wanted]
 
 
-def replay_gap(log: LoggedRun, path: Path, overrides: Sequence[str], tell: Tell, parent: str) -> None:
+def replay_gap(log: LoggedRun, path: Path, overrides: Sequence[str], tell: TellEndless, parent: str) -> None:
     """Repeat a diagnosis into the log `path`.
 
     overrides: changed settings, such as library=pump_lag,leak@T1, leave_out=pump_lag, step=0.5, named_only=true.

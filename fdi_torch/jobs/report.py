@@ -4,26 +4,26 @@ compare` prints and `fdi_torch.compare` returns.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from fdi_torch import logbook
 from fdi_torch.config.logged_config import logged_plant
 from fdi_torch.disk import write_text
+from fdi_torch.jobs.progress import Tell, rounded, silent
 from fdi_torch.logbook import Comparison, Run, read_run
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.report.comparison import comparison_section, in_words, result_table
 from fdi_torch.report.comparison_headline import comparison_headline, setting_differences
 from fdi_torch.report.html import Markup
 from fdi_torch.report.material import Material, gather
+from fdi_torch.report.numbers import lowered
 from fdi_torch.report.page import RunReport, page, report_of, write_pictures
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.style import notebook_svg
 from fdi_torch.report.verdict import headline
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
-
-Tell = Callable[[float, str], None]
 
 
 @dataclass(frozen=True, repr=False)
@@ -49,7 +49,7 @@ def report(
     out: str | Path | None = None,
     *,
     pictures: bool = False,
-    tell: Tell = lambda share, text: None,
+    tell: Tell = silent,
 ) -> Report:
     """Write one page for the logs; several logs are also compared.
 
@@ -64,14 +64,14 @@ def report(
     notes: list[str] = []
     for k, path in enumerate(paths):
         reports.append(report_of_log(path, notes))
-        tell((k + 1) / (len(paths) + 1), path.name)
+        rounded(tell)((k + 1) / (len(paths) + 1), path.name)
     write_text(target, page_of(reports))
     written: list[Path] = []
     for k, each in enumerate(reports if pictures else ()):
         several = f"{k + 1}_" if len(reports) > 1 else ""
         written += write_pictures(each, target.with_suffix("") / several if several else target.with_suffix(""))
     tell(1.0, "done")
-    headlines = {str(each.material.run.path): headline(each.material) for each in reports}
+    headlines = {str(each.material.run.path): lowered(headline(each.material)) for each in reports}
     return Report(target, tuple(written), headlines, tuple(notes))
 
 
@@ -175,5 +175,5 @@ def compare(logs: Sequence[str | Path]) -> ComparisonResult:
     comparison = logbook.compare(logs)
     runs = tuple(gather(log, plant_of(log, [])) for log in map(read_run, logs))
     with runs[0].in_its_units():
-        sentences = (*comparison_headline(comparison, runs), *in_words(comparison))
+        sentences = tuple(lowered(s) for s in (*comparison_headline(comparison, runs), *in_words(comparison)))
         return ComparisonResult(comparison, runs, sentences)

@@ -64,7 +64,8 @@ def simulate_recording(run: Run) -> Recording:
         raise ValueError(f"{run.source}: expected simulate, got none; fdi new run writes a file that shows its keys")
     with naming_source(run.source):
         planned = planned_recording(config, run.plant)
-        placements = placements_of(config.faults, run.plant)
+        with naming("simulate.faults"):
+            placements = placements_of(config.faults, run.plant)
     network = build_network(run.plant, placements)
     levels, _ = start_levels(run.plant, network, planned, config.start_levels)
     tanks = tuple(replace(t, start_level=float(h)) for t, h in zip(run.plant.tanks, levels, strict=True))

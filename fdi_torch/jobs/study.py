@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from typing import Any
 from fdi_torch.config.rehearsal_file import Rehearsal
 from fdi_torch.config.study_file import Study
 from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
+from fdi_torch.jobs.progress import Tell, silent
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.logbook.reader import Run as LoggedRun
 from fdi_torch.monitor.monte_carlo.simulated_runs import ResultTable
@@ -24,8 +25,6 @@ from fdi_torch.study.monte_carlo import Trial, run_blocks
 from fdi_torch.study.study_plan import Plan
 from fdi_torch.study.summary import Score, Summary, summarise
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
-
-Tell = Callable[[float, str], None]
 
 TRIAL = "/study/trial"
 _ENVELOPE = ("t", "trial", "group", "seed", "status")
@@ -73,7 +72,7 @@ def run_study(
 
     cluster: address of a Dask scheduler, or 'local'; None: this process. listener: receives every log message.
     """
-    tell = tell or (lambda share, text: None)
+    tell = tell or silent
     output = study.run.config.output
     path, before = new_and_unfinished_log(Path(output.folder), study.run.name, study.text, resume)
     with RunLog(path, "study", **origin_of(study), listener=listener, after_interruption=RESUMES) as log:
@@ -169,7 +168,7 @@ class RehearsalResult:
 def rehearse(
     rehearsal: Rehearsal,
     resume: bool = False,
-    tell: Callable[[float, str], None] = lambda share, text: None,
+    tell: Tell = silent,
     listener: Listener | None = None,
 ) -> RehearsalResult:
     """Compute every task that the log does not have yet. tell(share, text): progress, called before each task."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from fdi_torch.estimate.uncertainty import Estimate
 from fdi_torch.jobs.estimate_uncertainty import profiled_names, profiles_of, with_draws
 from fdi_torch.jobs.log_paths import RESUMES, free_path, unfinished_search
 from fdi_torch.jobs.logged_recordings import log_prediction, log_recording
+from fdi_torch.jobs.progress import Tell, rounded, silent
 from fdi_torch.jobs.run_setup import (
     fitting_of,
     hybrid_settings,
@@ -36,7 +37,6 @@ from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import notebook_svg, save
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
 
-Tell = Callable[[float, str], None]
 STATE = "/estimator/de/population"
 GENERATION, ITERATION = "/estimator/de/generation", "/estimator/refine/iteration"
 
@@ -95,10 +95,10 @@ class TrainResult(Shown):
         draws: int = 1000,
         seed: int = 0,
         most_steps: int = 16_000,
-        tell: Tell = lambda share, text: None,
+        tell: Tell = silent,
     ) -> Draws:
         """Draws from the posterior (extra `draws`); see `draw_posterior`. tell: as of `train`; it may take minutes."""
-        drawn = with_draws(self.fitting, self.result, draws, seed, most_steps, tell).estimate.draws
+        drawn = with_draws(self.fitting, self.result, draws, seed, most_steps, rounded(tell)).estimate.draws
         assert drawn is not None
         return drawn
 
@@ -114,7 +114,7 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False, listener: Li
     last generation in the log of a killed or interrupted run of the same file; the result is the same as without the
     interruption. listener: receives every log message.
     """
-    tell = tell or (lambda share, text: None)
+    tell = tell or silent
     space = requested_space(run)
     tell(0.0, "reading" if run.config.recordings else "simulating the recording")
     loaded = recordings_of(run)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from fdi_torch.config.run_file import Run
 from fdi_torch.effects import without_startup_effects
 from fdi_torch.estimate.windows import Stretch, Window, cut_up, noise_of, stretches_of, window_of, window_step
 from fdi_torch.jobs.log_paths import STARTS_OVER, free_path
+from fdi_torch.jobs.progress import Tell, silent
 from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, requested_space
 from fdi_torch.jobs.train import log_recordings
 from fdi_torch.logbook import RunLog
@@ -32,7 +32,7 @@ class WindowedFit:
     log: Path
 
 
-def fit_windows(run: Run, tell: Callable[[float, str], None] = lambda share, text: None) -> WindowedFit:
+def fit_windows(run: Run, tell: Tell = silent) -> WindowedFit:
     """Cut the recordings of a run file into windows of `estimate.windows` s, and fit the suspected faults in each.
 
     The initial levels of each window are free, and constants to calibrate have their tolerances as priors in each

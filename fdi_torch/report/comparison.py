@@ -16,7 +16,7 @@ from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.comparison_headline import comparison_headline, left_out_words, setting_differences
 from fdi_torch.report.html import folded, short, table, tag
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import axis, number, shown_unit, with_error
+from fdi_torch.report.numbers import axis, number, plain_unit, raised, shown_unit, with_error
 from fdi_torch.report.predictions import residuals
 from fdi_torch.report.section import Picture, Section, signals
 from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT
@@ -40,7 +40,8 @@ def _section(compared: Comparison, runs: Sequence[Material]) -> Section:
     first, *sentences = comparison_headline(compared, runs)
     blocks: list[Any] = [tag("h3", first), *(tag("p", sentence) for sentence in (*sentences, *in_words(compared)))]
     if compared.results:
-        blocks.append(table(*result_table(compared), left=2))
+        header, rows = result_table(compared)
+        blocks.append(table(header, [[name, raised(unit), *cells] for name, unit, *cells in rows], left=2))
     pictures = [*_convergence(compared, runs), *_residuals(compared, runs)]
     blocks += [pictures] if pictures else []
     settings, left_out = setting_differences(compared, runs)
@@ -84,7 +85,7 @@ def result_table(compared: Comparison) -> tuple[list[str], list[list[str]]]:
     verdicts = {True: "yes", False: "no", None: ""}
     rows = []
     for result in compared.results:
-        unit, scale = shown_unit(result.unit, result.name)
+        unit, scale = plain_unit(result.unit, result.name)
         values = [with_error(scale * v, scale * s) for v, s in zip(result.values, result.std, strict=True)]
         p_value = "< 0.0001" if result.p_value < 1e-4 else number(result.p_value, 2)
         rows.append([result.name, unit or "1", *values, p_value, verdicts[result.agree]])

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from fdi_torch import amounts
-from fdi_torch.amounts import RAISED
+from fdi_torch.amounts import LOWERED, RAISED
 from fdi_torch.quantities import display_unit, significant
 
+_RAISED_POWER = re.compile(rf"(?<=[^\W\d])[{''.join(map(chr, LOWERED))}]+")
 _NEGATIVE = re.compile(r"(?<![\w.])-(?=\d)")
 
 
@@ -22,11 +23,16 @@ def shown_unit(si_unit: str, name: str = "") -> tuple[str, float]:
     """'m^3/s' -> ('cm³/s', 1e6): display unit and scale factor from SI; unknown units are unchanged. name: of a channel
     or sensor, which may have a unit of its own.
     """
-    try:
-        unit, scale = display_unit(si_unit, name)
-    except ValueError:
-        unit, scale = si_unit, 1.0
+    unit, scale = plain_unit(si_unit, name)
     return raised(unit), scale
+
+
+def plain_unit(si_unit: str, name: str = "") -> tuple[str, float]:
+    """As `shown_unit`, with the unit as on a terminal: ('cm^3/s', 1e6)."""
+    try:
+        return display_unit(si_unit, name)
+    except ValueError:
+        return si_unit, 1.0
 
 
 def raised(unit: str) -> str:
@@ -36,6 +42,11 @@ def raised(unit: str) -> str:
         digits = len(part) - len(part.lstrip("0123456789-"))
         head += part[:digits].translate(RAISED) + part[digits:]
     return head
+
+
+def lowered(text: str) -> str:
+    """'33.1 cm³/s' -> '33.1 cm^3/s': words of a page as on a terminal."""
+    return _RAISED_POWER.sub(lambda power: f"^{power[0].translate(LOWERED)}", text)
 
 
 def sentence(message: str) -> str:

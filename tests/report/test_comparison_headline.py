@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sample_runs import write_train
 
 from fdi_torch import cli
 from fdi_torch.jobs.report import report
 from fdi_torch.logbook import Comparison, RunLog, compare, read_run
 from fdi_torch.logbook.compare import Result
-from fdi_torch.report.comparison import in_words
+from fdi_torch.report.comparison import in_words, result_table
 from fdi_torch.report.comparison_headline import comparison_headline, plain_text, setting_differences
 from fdi_torch.report.material import gather
 from fdi_torch.report.predictions import residual_size
@@ -212,6 +213,16 @@ def test_terminal_and_page_lead_with_the_headline(tmp_path: Path, capsys: pytest
     assert said.startswith("b explains the recording best") and "sha256" not in said
     page = report(logs).page.read_text()
     assert page.index("b explains the recording best") < page.index("<svg")
+
+
+def test_units_on_the_terminal_are_written_as_in_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = write_train(tmp_path / "a.mcap")
+    assert cli.main(["report", str(log)]) == cli.DONE
+    assert "30 cm^3/s" in capsys.readouterr().out
+    assert "30 cm³/s" in (tmp_path / "a.html").read_text()
+    offset = Result("Q1.pump_offset.size", "m^3/s", (1e-6, 1.1e-6), (1e-8, 1e-8), 0.5)
+    _, (row,) = result_table(Comparison(("a", "b"), {}, (offset,), False, True))
+    assert row[1] == "cm^3/s"
 
 
 @pytest.mark.parametrize(
