@@ -350,8 +350,10 @@ def test_shipped_runs_on_real_data_read_their_recordings(real_data: Path, monkey
         ("estimate: {seed: 3}", "got 'seed'.*; there is simulate.seed and seed"),
         ("recordings: [{file:run.csv}]", "got 'file:run.csv'.*; separate key and value by a colon and a space"),
         ("estimate: {step: 0,5 s}", "got '5 s'; a comma ends a value: write 10.5 for decimals, and 10000 "),
-        ("simulate: {inputs: {Q1: 1,5 l/min}}", "inputs.5 l/min: .* got None; a comma ends a value: write 10.5"),
+        ("simulate: {inputs: {Q1: 1,5 l/min}}", "inputs.5 l/min: .* got nothing; a comma ends a value: write 10.5"),
         ("simulate: {inputs: {Q1: {steps: [[0 s, 1,5 l/min]]}}}", "steps.0: expected 2 values, got .*; a comma ends"),
+        ("simulate: {inputs: {Q1: }}", "inputs.Q1: expected a value such as .*, got nothing$"),
+        ("simulate: {duration: }", "duration: expected a quantity in s, got nothing$"),
         ("simulate: {noise: {std: 1 mm}}", "noise.std: expected keys with values, as in {NAME: 1 mm}, got '1 mm'"),
         ("recordings: run.csv", r"recordings: expected a list, as in \[run.csv\]"),
         ("plant: {tanks: {T: {area: 1 m^2, height: 1 m}}, pipes: {P: {source: T, area: 1 cm^2, "

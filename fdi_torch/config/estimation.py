@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from fdi_torch.config.problems import ConfigError, naming
+from fdi_torch.config.problems import ConfigError, naming, shown
 from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity, quantity_at
 from fdi_torch.effects import all_placements, build_network, full_name, placements_for, unknown_parameter
 from fdi_torch.estimate.evolution_settings import STRATEGIES, EvolutionSettings
@@ -36,7 +36,7 @@ def _parameter(value: Any) -> Any:
 def _auto_or_names(value: Any) -> Any:
     if value == "auto" or (isinstance(value, list) and all(isinstance(name, str) for name in value)):
         return value
-    raise ValueError(f"expected auto or a list of names, got {value!r}")
+    raise ValueError(f"expected auto or a list of names, got {shown(value)}")
 
 
 def _auto_or_seconds(value: Any) -> Any:

@@ -68,17 +68,17 @@ def _sentence(finding: Any, known: Mapping[str, str]) -> str:
         values = ", ".join(map(str, given.values())) if isinstance(given, dict) else str(given).partition("\n")[0]
         meaning = known.get(".".join(map(str, finding["loc"])), "")
         example = "" if "as in [" in meaning else f", as in [{values}]"
-        return f"expected a list{example}, got {_shown(given)}" + (f" ({meaning})" if meaning else "")
+        return f"expected a list{example}, got {shown(given)}" + (f" ({meaning})" if meaning else "")
     if finding["type"] in ("dict_type", "model_type"):
         given = finding["input"]
         example = f", as in {{NAME: {given}}}" if finding["type"] == "dict_type" and isinstance(given, str) else ""
-        return f"expected keys with values{example}, got {_shown(given)}"
+        return f"expected keys with values{example}, got {shown(given)}"
     if finding["type"] == "too_long":
         return (
-            f"expected {finding['ctx']['max_length']} values, got {_shown(finding['input'])}{_comma(finding['input'])}"
+            f"expected {finding['ctx']['max_length']} values, got {shown(finding['input'])}{_comma(finding['input'])}"
         )
     expected = finding["msg"].replace("Input should be", "expected").replace("Input should have", "expected")
-    return f"{expected}, got {_shown(finding['input'])}"
+    return f"{expected}, got {shown(finding['input'])}"
 
 
 def _elsewhere(error: Exception, known: Mapping[str, str]) -> str:
@@ -98,6 +98,7 @@ def _comma(parts: Sequence[Any]) -> str:
     return f"; a comma ends a value: {NO_COMMAS}" if isinstance(last, str) and last[:1].isdigit() else ""
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """A given value in a message, on one line."""
     text = "nothing" if value is None else repr(value).partition("\n")[0]
     return text if len(text) < 60 else text[:57] + "..."

@@ -11,7 +11,7 @@ from zoneinfo import ZoneInfo
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
 
-from fdi_torch.config.problems import explain
+from fdi_torch.config.problems import explain, shown
 from fdi_torch.config.strict import Amount, HeldFor, Seconds, Strict, quantity
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.database import expect_no_password, is_query
@@ -28,7 +28,7 @@ def _start_level(value: Any) -> StartLevel:
     try:
         return quantity(value, "m")
     except ValueError:
-        raise ValueError(f"expected free, equilibrium or a level such as '50 cm', got {value!r}") from None
+        raise ValueError(f"expected free, equilibrium or a level such as '50 cm', got {shown(value)}") from None
 
 
 def _start_levels(value: Any) -> Any:

@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError, field_validator
 from fdi_torch.config.key_reference import meanings
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
-from fdi_torch.config.problems import ConfigError, explain
+from fdi_torch.config.problems import ConfigError, explain, shown
 from fdi_torch.config.strict import Config, Strict, scaled_to_plant
 from fdi_torch.config.yaml_files import expect_kind, find_file, read_extended, with_overrides, write_yaml
 from fdi_torch.effects import units_for_display
@@ -115,4 +115,4 @@ def plant_of(entry: Any, base: Path, source: str) -> PlantDescription:
         return load_plant(entry, base)
     if isinstance(entry, dict):
         return build_plant({"name": "plant", **entry}, f"{source}: plant")
-    raise ConfigError([f"{source}: plant: expected a shipped plant, a plant file or a plant, got {entry!r}"])
+    raise ConfigError([f"{source}: plant: expected a shipped plant, a plant file or a plant, got {shown(entry)}"])

@@ -13,10 +13,10 @@ from pydantic import BeforeValidator, Field
 from torch import Tensor
 
 from fdi_torch.capacity import expect_room
-from fdi_torch.config.problems import ConfigError, naming
+from fdi_torch.config.problems import ConfigError, naming, shown
 from fdi_torch.config.recording_config import StartLevels
 from fdi_torch.config.strict import Amount, Decibel, Seconds, Strict, quantity_at
-from fdi_torch.names import shortened, unknown
+from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription, Sensor
 from fdi_torch.quantities import parse_quantity
 from fdi_torch.recording import Recording
@@ -36,7 +36,7 @@ def _input(value: Any) -> Any:
         return {"value": value}
     if not isinstance(value, Mapping | InputConfig):
         example = "{steps: [[0 s, 50 cm^3/s], [200 s, 60 cm^3/s]]}"
-        raise ValueError(f"expected a value such as 50 cm^3/s, or {example}, got {shortened(str(value))}")
+        raise ValueError(f"expected a value such as 50 cm^3/s, or {example}, got {shown(value)}")
     return value
 
 
@@ -53,7 +53,7 @@ def flat_names(value: Any, prefix: str = "") -> Any:
 
 def _noise(value: Any) -> Any:
     if not isinstance(value, Mapping | NoiseConfig):
-        raise ValueError(f"expected {{std: {{h1: 1 mm}}}} or {{snr_db: 30}}, got {shortened(str(value))}")
+        raise ValueError(f"expected {{std: {{h1: 1 mm}}}} or {{snr_db: 30}}, got {shown(value)}")
     return value
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AllowInfNan, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 from pydantic.fields import FieldInfo
 
-from fdi_torch.config.problems import UnknownKeyError, naming
+from fdi_torch.config.problems import UnknownKeyError, naming, shown
 from fdi_torch.names import unknown
 from fdi_torch.quantities import display_unit, parse_quantity
 from fdi_torch.recording import LARGEST
@@ -35,7 +35,7 @@ def quantity(value: Any, unit: str) -> float:
     Raises ValueError for anything that is not a finite quantity in that unit.
     """
     if isinstance(value, bool) or not isinstance(value, int | float | str):
-        raise ValueError(f"expected a quantity in {unit}, got {value!r}")
+        raise ValueError(f"expected a quantity in {unit}, got {shown(value)}")
     if isinstance(value, str):
         number = parse_quantity(value, unit)
     elif unit == "1":

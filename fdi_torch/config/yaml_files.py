@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.problems import ConfigError, shown
 from fdi_torch.names import nearest, shortened, unknown
 from fdi_torch.untrusted_input import MOST_DIGITS, MOST_YAML_BYTES, MOST_YAML_VALUES
 
@@ -173,7 +173,9 @@ def _set(node: Any, keys: Sequence[str], value: Any, override: str) -> None:
         index: Any = key
         place = ".".join(keys[:i])
         if not isinstance(node, dict | list):
-            raise ConfigError([f"--set {override}: {place}: expected keys or a list there, got {node!r}; set it whole"])
+            raise ConfigError(
+                [f"--set {override}: {place}: expected keys or a list there, got {shown(node)}; set it whole"]
+            )
         if isinstance(node, list):
             if not (key.isdecimal() and key.isascii() and len(key) < 10 and int(key) < len(node)):
                 raise ConfigError([f"--set {override}: {place}: expected an index below {len(node)}, got '{key}'"])
