@@ -24,7 +24,7 @@ from fdi_torch.recording import Recording
 from fdi_torch.simulate.engine import Engine, Readings
 from fdi_torch.simulate.engine_choice import adaptive_engine, make_engine
 from fdi_torch.simulate.equilibrium import equilibrium
-from fdi_torch.simulate.experiment import Experiment, lay_out
+from fdi_torch.simulate.experiment import Experiment, expect_step, lay_out
 from fdi_torch.simulate.resampling import step_means
 from fdi_torch.simulate.step_control import StepControl
 from fdi_torch.simulate.step_length import commensurate_step
@@ -96,8 +96,7 @@ class Fitting:
 
     def _experiment(self, k: int, step: float, adaptive: bool) -> Experiment:
         """Recording k on the grid of its simulation."""
-        if not step > 0.0:
-            raise ValueError(f"expected a positive integration step, got {step:g} s")
+        expect_step(step)
         recording = self.recordings[k]
         uses_own_steps = not adaptive and self._takes_own_steps(k, step)
         input_step = commensurate_step(INPUT_STEP * time_scale(self.plant), recording.interval)

@@ -75,8 +75,7 @@ def lay_out(
     channels: names of the plant's input channels. Raises ValueError if the recording lacks one or has unknown values in
     it.
     """
-    if not step > 0:
-        raise ValueError(f"expected a positive integration step, got {step} s")
+    expect_step(step)
     if len(recording) < 2:
         raise ValueError(f"{recording.source}: expected at least two samples, got {len(recording)}")
     inputs = _select(recording, channels)
@@ -85,6 +84,14 @@ def lay_out(
     longest = torch.diff(nodes).max()
     resolution = longest if step_control is None else longest.new_tensor(step_control.resolution)
     return _on_nodes(nodes, CumulativeSignal(time, inputs, recording.hold), time, resolution, step_control)
+
+
+def expect_step(step: float) -> None:
+    """Raises ValueError unless an integration step, s, is a positive number."""
+    if isinstance(step, str):
+        raise ValueError(f"expected the integration step as a number of seconds, got '{step}'; leave out the unit")
+    if not step > 0:
+        raise ValueError(f"expected a positive integration step, got {step} s")
 
 
 def divided(experiment: Experiment, counts: Int[Tensor, " K"]) -> Experiment:
