@@ -17,7 +17,8 @@ from fdi_torch.cli import MISUSE, NOT_EXPLAINED, main
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_in
-from fdi_torch.recordings.plant_units import wrong_units
+from fdi_torch.recordings.check import data_warnings
+from fdi_torch.recordings.plant_units import doubtful_units, wrong_units
 from fdi_torch.recordings.volume_balance import balance_along
 
 PLANT = """
@@ -170,8 +171,8 @@ def test_a_steady_state_without_noise_is_no_wrong_unit(tmp_path: Path, flow: str
 @pytest.mark.parametrize(
     ("sensor", "written", "sentence"),
     [
-        ("hA: {tank: A}", "mm", "the levels hA are 10 times too large (write mm in place of cm)"),
-        ("hA: {tank: A, gain: 98.1 mbar/m, offset: 5 mbar}", "mbar", "the pressures hA are 10 times too large"),
+        ("hA: {tank: A}", "mm", "the level hA is 10 times too large (write mm in place of cm)"),
+        ("hA: {tank: A, gain: 98.1 mbar/m, offset: 5 mbar}", "mbar", "the pressure hA is 10 times too large"),
     ],
 )
 def test_a_wrong_unit_concerns_the_sensors_of_its_kind(
@@ -187,6 +188,41 @@ def test_a_wrong_unit_concerns_the_sensors_of_its_kind(
     wrong = replace(run, outputs=run.outputs * torch.tensor([10.0, 1.0]), written={"hA": unit})
     assert wrong_units(plant, run) == ""
     assert sentence in wrong_units(plant, wrong)
+
+
+STEADY: dict[str, Any] = {"inputs": {"Q1": "50 cm^3/s", "Q2": "50 cm^3/s"}, "duration": "600 s"}
+STEADY |= {"noise": {"std": {"h1": "1 mm", "h2": "1 mm", "h3": "1 mm"}}}
+
+
+@pytest.mark.parametrize("faults", [{}, {"T1.leak": 0.3}, {"P13.plugging": 0.5}])
+@pytest.mark.parametrize("start", ["equilibrium", "20 cm"])
+@pytest.mark.parametrize("column", [0, 1, 2])
+def test_one_level_in_a_wrong_unit_is_found_under_constant_inputs(
+    faults: dict[str, float], start: str, column: int
+) -> None:
+    plant = load_plant("three_tank")
+    run = fdi_torch.simulate(plant, faults=faults, start_levels=start, **STEADY)
+    assert doubtful_units(plant, run) == []
+    factors = torch.ones(3, dtype=torch.float64)
+    factors[column], name = 0.1, f"h{column + 1}"
+    ((columns, sentence),) = doubtful_units(plant, replace(run, outputs=factors * run.outputs, written={name: "mm"}))
+    assert columns == name
+    assert sentence == (
+        f"by the volume balance of the tanks, the level {name} is 10 times too small (write cm in place of mm), unless "
+        "it is stuck"
+    )
+
+
+def test_an_unusual_level_at_rest_is_no_wrong_unit() -> None:
+    """A sensor that is stuck, or off by half of the level, is no factor of ten of what the flows make it."""
+    plant = load_plant("three_tank")
+    run = fdi_torch.simulate(plant, start_levels="equilibrium", **STEADY)
+    for factor in (0.5, 0.3):
+        outputs = run.outputs * torch.tensor([factor, 1.0, 1.0])
+        assert doubtful_units(plant, replace(run, outputs=outputs)) == []
+    for trusted in (False, True):
+        wrong = replace(run, outputs=run.outputs * torch.tensor([0.1, 1.0, 1.0]), trusted=trusted)
+        assert any("h1 is 10 times too small" in warning for warning in data_warnings(wrong, plant)) is not trusted
 
 
 def test_flows_follow_from_levels_not_from_readings(folder: Path) -> None:

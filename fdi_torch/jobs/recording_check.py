@@ -37,8 +37,8 @@ def checked(config: RecordingConfig, plant: PlantDescription, base: Path) -> tup
         )
         problems.append(ChannelFinding("few", ", ".join(few), text, {"count": min(few.values())}))
     refused = {channel for e in examinations if e.fault for channel in e.fault.channels}
-    doubts = [f for f in check.findings if not (f.kind == "undersampled" and f.channel in refused)]
-    beyond = [f for f in doubts if f.kind == "range"]
+    doubts = [f for f in check.findings if not (f.kind in ("undersampled", "unit") and f.channel in refused)]
+    beyond = [f for f in doubts if f.kind in ("range", "unit")]
     problems = [p for p in problems if not any(f.text in p.text for f in beyond)]
     return whole, replace(check, findings=(*beyond, *problems, *(f for f in doubts if f not in beyond)))
 

@@ -17,6 +17,7 @@ from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.input_sampling import undersampled_inputs
 from fdi_torch.recordings.plant_limits import ChannelFinding, plant_limit_findings
+from fdi_torch.recordings.plant_units import doubtful_units
 from fdi_torch.recordings.repeated_readings import resolution
 
 MANY_RUNS = 5
@@ -76,9 +77,17 @@ def check_recording(recording: Recording, plant: PlantDescription) -> RecordingC
             *undersampled_inputs(recording, plant),
             *_missing_readings(recording),
             *reading_findings(recording),
-            *plant_limit_findings(recording, plant),
+            *_against_the_plant(recording, plant),
         ),
     )
+
+
+def _against_the_plant(recording: Recording, plant: PlantDescription) -> list[ChannelFinding]:
+    """Findings by the plant's limits and, where these call no unit wrong, by the volume balance of its tanks."""
+    findings = list(plant_limit_findings(recording, plant))
+    settled = recording.trusted or any(finding.kind == "unit" for finding in findings)
+    doubts = [] if settled else doubtful_units(plant, recording)
+    return findings + [ChannelFinding("unit", columns, text) for columns, text in doubts]
 
 
 def data_warnings(recording: Recording, plant: PlantDescription) -> list[str]:

@@ -13,15 +13,16 @@ factor, but rarely by one that is close to the ratio of two units. What has one 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 
-from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.description import PlantDescription, Sensor
 from fdi_torch.quantities import display_unit, unit_factor
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.volume_balance import DEVIATION, Balance, balance_along
+from fdi_torch.recordings.volume_balance import DEVIATION, UNRELATED, Balance, balance_along
 from fdi_torch.units import same_kind
 
 UNITS = {
@@ -41,13 +42,15 @@ CONFIDENCE = 0.95
 @dataclass(frozen=True)
 class Correction:
     """A probable mistake of units. names: the numbers concerned. written, right: the unit they have, and the one they
-    should have. ratio: of these units. balance: of the plant with the numbers in the right unit."""
+    should have. ratio: of these units. balance: of the plant with the numbers in the right unit. columns: of sensors
+    concerned."""
 
     names: str
     written: str
     right: str
     ratio: float
     balance: Balance
+    columns: tuple[str, ...] = ()
 
     @property
     def text(self) -> str:
@@ -58,21 +61,52 @@ class Correction:
 
 def wrong_units(plant: PlantDescription, recording: Recording) -> str:
     """A sentence on numbers that are probably in a wrong unit, and the unit to write; empty if there are none."""
-    if not plant.metered_flows():
-        return ""
-    as_is = balance_along(plant, recording)
-    if not as_is.is_metered:
-        return ""
-    corrections = list(_corrections(plant, recording, as_is))
-    # A correction that puts a level above a pump's cut-out leaves no flow, hence no balance: it is no better for that.
-    leads = torch.stack([each.balance.log_evidence() for each in corrections]) - as_is.log_evidence()
-    evidence = torch.cat([leads.new_zeros(1), leads.nansum(dim=1)])
-    prior = torch.tensor([1.0 - PRIOR, *(PRIOR / len(corrections) for _ in corrections)])
+    as_is = balance_along(plant, recording) if plant.metered_flows() else Balance(())
+    corrections = list(_corrections(plant, recording, as_is)) if as_is.is_metered else []
+    credible = _credible(as_is, corrections, UNRELATED)
+    return f"units: by the volume balance of the tanks, {_alternatives(credible)}" if credible else ""
+
+
+def doubtful_units(plant: PlantDescription, recording: Recording) -> list[tuple[str, str]]:
+    """Sensors whose unit alone is probably wrong, if their readings depend on the flows: columns and a sentence.
+
+    Where all levels rest, readings that do not depend on the flows explain the balance as well as a wrong unit does:
+    those of a stuck sensor, for example. A unit that explains the balance less well than these is left out.
+    """
+    recorded = set(plant.channels()) <= set(recording.input_names)
+    as_is = balance_along(plant, recording) if plant.metered_flows() and recorded else Balance(())
+    sensors = [(s,) for s in plant.sensors if s.column in recording.output_names]
+    corrections = list(_reading_corrections(plant, recording, sensors)) if as_is.is_metered else []
+    credible = _credible(as_is, corrections, 0.0)
+    worse = math.log(1.0 / CONFIDENCE - 1.0)
+    if not credible or any(_lead(each, as_is, UNRELATED) < worse for each in credible) or wrong_units(plant, recording):
+        return []
+    columns = ", ".join(dict.fromkeys(column for each in credible for column in each.columns))
+    return [(columns, f"by the volume balance of the tanks, {_alternatives(credible)}, unless it is stuck")]
+
+
+def _credible(as_is: Balance, corrections: list[Correction], unrelated: float) -> list[Correction]:
+    """The likeliest corrections with the probability CONFIDENCE together; none if the unchanged file is among them.
+
+    unrelated: probability that readings do not depend on the flows.
+    """
+    evidence = torch.tensor([0.0, *(_lead(each, as_is, unrelated) for each in corrections)], dtype=torch.float64)
+    prior = torch.tensor([1.0 - PRIOR, *(PRIOR / len(corrections) for _ in corrections)], dtype=torch.float64)
     probability, order = torch.softmax(evidence + prior.log(), dim=0).sort(descending=True)
     credible = order[probability.cumsum(0) - probability < CONFIDENCE].tolist()
-    if 0 in credible:
-        return ""
-    return f"units: by the volume balance of the tanks, {' or '.join(corrections[i - 1].text for i in credible)}"
+    return [] if 0 in credible else [corrections[i - 1] for i in credible]
+
+
+def _lead(correction: Correction, as_is: Balance, unrelated: float) -> float:
+    """Gain in log evidence by a correction.
+
+    One that puts a level above a pump's cut-out leaves no flow, hence no balance: it is no better for that.
+    """
+    return float((correction.balance.log_evidence(unrelated) - as_is.log_evidence(unrelated)).nansum())
+
+
+def _alternatives(corrections: list[Correction]) -> str:
+    return " or ".join(each.text for each in corrections)
 
 
 def expect_right_units(plant: PlantDescription, recording: Recording) -> None:
@@ -103,27 +137,45 @@ def _corrections(plant: PlantDescription, recording: Recording, as_is: Balance) 
     for right, ratio in _other_units("m^3/s", written):
         slower = as_is.scaled(metered=all_tanks / ratio, by_laws=all_tanks)
         yield Correction(f"the flows of {', '.join(channels)} are", written, right, ratio, slower)
-    first = {s.tank: s for s in reversed(plant.sensors) if s.column in recording.output_names}  # gives the tank's level
-    for kind, numbers in (("m", "levels"), ("Pa", "pressures")):
-        columns = [sensor.column for sensor in plant.sensors if sensor.unit == kind]
-        written = _written(kind, columns[0], recording) if columns else ""
-        for right, ratio in _other_units(kind, written) if columns else ():
-            sensors = (
-                replace(s, gain=ratio * s.gain, offset=ratio * s.offset) if s.unit == kind else s for s in plant.sensors
-            )
-            corrected = replace(plant, sensors=tuple(sensors))
-            if _fits_into_tanks(corrected, recording):
-                units = {tank: 1.0 / ratio for tank, sensor in first.items() if sensor.unit == kind}
-                lower = balance_along(corrected, recording, units)
-                yield Correction(f"the {numbers} {', '.join(columns)} are", written, right, ratio, lower)
+    kinds = [[s for s in plant.sensors if s.unit == kind] for kind in ("m", "Pa")]
+    yield from _reading_corrections(plant, recording, [sensors for sensors in kinds if sensors])
     written = recording.written.get("t", "")  # none: the clock has dates, or is that of a simulation
     for right, ratio in _other_units("s", written) if written else ():
         yield Correction("the times are", written, right, ratio, as_is.scaled(all_tanks / ratio, all_tanks / ratio))
 
 
+def _reading_corrections(
+    plant: PlantDescription, recording: Recording, groups: Iterable[Sequence[Sensor]]
+) -> Iterator[Correction]:
+    """Corrections of the readings of each group of sensors, which have one unit; m or Pa."""
+    for sensors in groups:
+        kind, columns = sensors[0].unit, tuple(sensor.column for sensor in sensors)
+        number = {"m": "level", "Pa": "pressure"}.get(kind)
+        written = _written(kind, columns[0], recording) if number else ""
+        names = f"the {number} {columns[0]} is" if len(columns) == 1 else f"the {number}s {', '.join(columns)} are"
+        for right, ratio in _other_units(kind, written) if number else ():
+            if balance := _with_readings(plant, recording, columns, ratio):
+                yield Correction(names, written, right, ratio, balance, columns)
+
+
+def _with_readings(
+    plant: PlantDescription, recording: Recording, columns: Collection[str], ratio: float
+) -> Balance | None:
+    """The balance with readings `ratio` times too large, or None if the corrected ones lie above a rim."""
+    sensors = (
+        replace(s, gain=ratio * s.gain, offset=ratio * s.offset) if s.column in columns else s for s in plant.sensors
+    )
+    corrected = replace(plant, sensors=tuple(sensors))
+    if not _fits_into_tanks(corrected, recording):
+        return None
+    first = {s.tank: s.column for s in reversed(plant.sensors) if s.column in recording.output_names}  # gives the level
+    units = {tank: 1.0 / ratio for tank, column in first.items() if column in columns}
+    return balance_along(corrected, recording, units)
+
+
 def _fits_into_tanks(plant: PlantDescription, recording: Recording) -> bool:
     """Whether no reading shows a level above the rim of its tank, whose height may deviate as other constants do."""
-    for sensor in plant.sensors:
+    for sensor in (s for s in plant.sensors if s.column in recording.output_names):
         levels = (recording.valid_readings(sensor.column) - sensor.offset) / sensor.gain
         if bool((levels > (1.0 + DEVIATION) * plant.tank(sensor.tank).height).any()):
             return False

@@ -62,10 +62,11 @@ class TankBalance:
         """The same with other numbers for metered flows and for flows by laws."""
         return replace(self, by_flow=self.by_flow * torch.where(self.metered, metered, by_laws))
 
-    def log_evidence(self, rounding: float) -> float:
+    def log_evidence(self, rounding: float, unrelated: float = UNRELATED) -> float:
         """Log likelihood of the measured changes, up to a constant that all corrections share; NaN without intervals.
 
-        rounding: numerical error of the flows in a sum, the lower limit of their uncertainty, m.
+        rounding: numerical error of the flows in a sum, the lower limit of their uncertainty, m. unrelated: probability
+        that the readings do not depend on the flows.
 
         The variance of the sums is unknown; with GROUPS independent ones, the best fit of mean square s^2 has the
         likelihood s^-GROUPS. The prior of b is the multivariate Cauchy distribution of centre 1 and scale SCALE, a
@@ -86,8 +87,9 @@ class TankBalance:
         wider = 1.0 + variance[:, None] * information
         squares = information * (off @ directions).square()
         related = torch.logsumexp(share - 0.5 * (wider.log() + squares / wider).sum(-1), dim=0)
-        unrelated = -0.5 * (information * ((1.0 + off) @ directions).square()).sum()
-        either = torch.logaddexp(related + math.log1p(-UNRELATED), unrelated + math.log(UNRELATED))
+        without_flows = -0.5 * (information * ((1.0 + off) @ directions).square()).sum()
+        weights = torch.tensor([1.0 - unrelated, unrelated]).log()
+        either = torch.logsumexp(torch.stack([related, without_flows]) + weights, dim=0)
         return float(either - 0.5 * GROUPS * (left + self.digits**2).log())
 
 
@@ -107,14 +109,14 @@ class Balance:
         """Whether there is any metered flow."""
         return any(bool((tank.by_flow[..., tank.metered] != 0.0).any()) for tank in self.tanks)
 
-    def log_evidence(self) -> Tensor:
+    def log_evidence(self, unrelated: float = UNRELATED) -> Tensor:
         """Log likelihood of the readings of each tank (tanks), up to a constant that all corrections share.
 
-        NaN for a tank without known sums.
+        NaN for a tank without known sums. unrelated: as of `TankBalance.log_evidence`.
         """
         known = [tank for tank in self.tanks if tank.intervals]
         largest = max((float(tank.by_flow.abs().max()) / tank.intervals for tank in known), default=0.0)
-        return torch.tensor([tank.log_evidence(HALF_OF_DIGITS * largest) for tank in self.tanks])
+        return torch.tensor([tank.log_evidence(HALF_OF_DIGITS * largest, unrelated) for tank in self.tanks])
 
 
 def balance_along(plant: PlantDescription, recording: Recording, units: Mapping[str, float] | None = None) -> Balance:
