@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -223,6 +224,32 @@ def test_an_unusual_level_at_rest_is_no_wrong_unit() -> None:
     for trusted in (False, True):
         wrong = replace(run, outputs=run.outputs * torch.tensor([0.1, 1.0, 1.0]), trusted=trusted)
         assert any("h1 is 10 times too small" in warning for warning in data_warnings(wrong, plant)) is not trusted
+
+
+def test_doubts_about_a_recording_come_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A column in cm that is mapped as mm, at rest: wrong by the check, and said first by train, its page and JSON."""
+    monkeypatch.chdir(tmp_path)
+    run = fdi_torch.simulate("three_tank", start_levels="equilibrium", **STEADY)
+    fdi_torch.write_csv(run, tmp_path / "run.csv")
+    text = (tmp_path / "run.csv").read_text()
+    (tmp_path / "run.csv").write_text(text.replace(",h1_cm", ",first_cm", 1))
+    (tmp_path / "train.yaml").write_text(
+        "recordings: [{file: run.csv, columns: {h1: {column: first_cm, unit: mm}}}]\n"
+        "estimate: {parameters: [T1.leak], search: {population: 8, evaluations: 40}}\n"
+    )
+    doubts = ["read in mm as mapped, although its header says cm", "the level h1 is 10 times too small (write cm"]
+    assert main(["check", "--config", "train.yaml"]) == NOT_EXPLAINED
+    assert all(doubt in capsys.readouterr().out for doubt in doubts[1:])
+    assert main(["train", "--config", "train.yaml", "--json"]) != MISUSE
+    said = json.loads(capsys.readouterr().out)["doubts"]
+    assert len(said) == 2 and all(doubt in sentence for doubt, sentence in zip(doubts, said, strict=True))
+    assert main(["train", "--config", "train.yaml"]) != MISUSE
+    terminal = capsys.readouterr().out
+    assert terminal.splitlines()[:4] == ["Doubts about the recording:", *(f"- {sentence}" for sentence in said), ""]
+    page = fdi_torch.report("logs/train.mcap").page.read_text()
+    assert all(page.index(doubt) < page.index("<svg") for doubt in doubts)
 
 
 def test_flows_follow_from_levels_not_from_readings(folder: Path) -> None:

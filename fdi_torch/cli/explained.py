@@ -24,5 +24,14 @@ def say_first(misfit: Misfit, screen: Screen, *hints: str, doubts: Sequence[str]
         screen.say()
 
 
+def say_doubts(doubts: Sequence[str], screen: Screen) -> None:
+    """Print what limits the trust in the recordings, if anything does."""
+    if doubts:
+        screen.say("Doubts about the recording:")
+        for doubt in doubts:
+            screen.say(f"- {doubt}")
+        screen.say()
+
+
 def exit_code(misfit: Misfit) -> int:
     return DONE if misfit.explained else NOT_EXPLAINED

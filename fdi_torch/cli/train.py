@@ -15,7 +15,7 @@ from functools import partial
 
 from fdi_torch.amounts import parameter_words
 from fdi_torch.cli import DONE, NOT_CONVERGED
-from fdi_torch.cli.explained import exit_code, say_first
+from fdi_torch.cli.explained import exit_code, say_doubts, say_first
 from fdi_torch.cli.options import live, overrides
 from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.clock import clock_unit, show_clock
@@ -26,7 +26,6 @@ from fdi_torch.jobs.windowed_fit import WindowedFit, fit_windows
 from fdi_torch.parameters import ParameterName
 from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.check import data_warnings
 from fdi_torch.report.numbers import HEADER, estimate_cells
 
 
@@ -54,8 +53,9 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 def show(done: TrainResult, screen: Screen) -> None:
     """Print the estimate as a table with units, the diagnosis, and the paths of log and pictures.
 
-    If the model does not explain the recording, that comes first.
+    Doubts about the recordings come first, then a model that does not explain them.
     """
+    say_doubts(done.doubts, screen)
     final, diagnosis = done.result.estimate, done.result.diagnosis
     show_clock(r.clock_zero for r in done.fitting.recordings)
     network, space = done.fitting.networks[0], done.fitting.space
@@ -130,10 +130,7 @@ def show_uncertainty(done: TrainResult, screen: Screen) -> None:
 def in_words(done: TrainResult) -> list[str]:
     """The diagnosis, one sentence per line."""
     diagnosis, final = done.result.diagnosis, done.result.estimate
-    recordings = done.fitting.recordings
-    lines = not_counted(recordings) + list(
-        dict.fromkeys(s for r in recordings for s in data_warnings(r, done.fitting.plant))
-    )
+    lines = not_counted(done.fitting.recordings)
     if diagnosis.faults:
         lines.append(diagnosis.statement)
     changes = "changes" if diagnosis.misfit.explained else "would change"
@@ -151,8 +148,8 @@ def in_words(done: TrainResult) -> list[str]:
 
 
 def not_counted(recordings: Sequence[Recording]) -> list[str]:
-    """Notes on the rows of each file: changed rows, missing or masked readings, unknown inputs."""
-    lines = list(dict.fromkeys(note for r in recordings for note in r.notes))
+    """Notes on the rows of each file: missing or masked readings, unknown inputs."""
+    lines = []
     for source in dict.fromkeys(r.source for r in recordings):
         masks = [r.mask for r in recordings if r.source == source]
         missing, total = sum(int((~mask).sum()) for mask in masks), sum(mask.numel() for mask in masks)
@@ -168,6 +165,7 @@ def as_json(done: TrainResult) -> dict[str, object]:
     return {
         "format": "fdi_torch.train/1",
         "estimate": result.estimate.to_dict(),
+        "doubts": list(done.doubts),
         "truth": done.truth,
         "diagnosis": {
             "kind": result.diagnosis.kind,

@@ -33,6 +33,9 @@ from fdi_torch.jobs.run_setup import (
 )
 from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
+from fdi_torch.plant.description import PlantDescription
+from fdi_torch.recording import Recording
+from fdi_torch.recordings.check import data_warnings
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import notebook_svg, save
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
@@ -43,7 +46,8 @@ GENERATION, ITERATION = "/estimator/de/generation", "/estimator/refine/iteration
 
 @dataclass(frozen=True, repr=False)
 class TrainResult(Shown):
-    """result: estimate and diagnosis. truth: simulated values by name, empty for real data. profiles: as asked for."""
+    """result: estimate and diagnosis. truth: simulated values by name, empty for real data. profiles: as asked for.
+    doubts: what limits the trust in the recordings, one sentence each."""
 
     result: HybridResult
     fitting: Fitting
@@ -51,6 +55,7 @@ class TrainResult(Shown):
     log: Path
     pictures: tuple[Path, ...]
     profiles: tuple[Profile, ...] = ()
+    doubts: tuple[str, ...] = ()
 
     @property
     def estimate(self) -> Estimate:
@@ -126,14 +131,26 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False, listener: Li
     with RunLog(path, "train", **records, listener=listener, after_interruption=RESUMES) as log:
         if not log.carry_over(before):
             log_recordings(log, loaded, truth)
-        result, profiles = estimate_logged(run, fitting, log, tell, search)
+        doubts = doubts_about([part.recording for part in loaded], run.plant)
+        result, profiles = estimate_logged(run, fitting, log, tell, search, doubts)
         pictures = draw(run, fitting, result, path)
     tell(1.0, "done")
-    return TrainResult(result, fitting, truth, path, pictures, profiles)
+    return TrainResult(result, fitting, truth, path, pictures, profiles, doubts)
+
+
+def doubts_about(recordings: Sequence[Recording], plant: PlantDescription) -> tuple[str, ...]:
+    """Corrections by the readers of the files, and findings that limit the trust in an estimate."""
+    notes = [note for recording in recordings for note in recording.notes]
+    return tuple(dict.fromkeys([*notes, *(s for recording in recordings for s in data_warnings(recording, plant))]))
 
 
 def estimate_logged(
-    run: Run, fitting: Fitting, log: RunLog, tell: Tell, resume: Search | None = None
+    run: Run,
+    fitting: Fitting,
+    log: RunLog,
+    tell: Tell,
+    resume: Search | None = None,
+    doubts: Sequence[str] = (),
 ) -> tuple[HybridResult, tuple[Profile, ...]]:
     """Estimate the parameters, with the profiles and draws asked for, and log each step and the result."""
     config, settings = run.config.estimate, hybrid_settings(run.config.estimate)
@@ -145,7 +162,7 @@ def estimate_logged(
     profiles = profiles_of(fitting, result, profiled, config.confidence) if profiled else ()
     if config.draws:
         result = with_draws(fitting, result, config.draws, run.config.seed, tell=tell)
-    log_result(log, result, fitting.space, profiles)
+    log_result(log, result, fitting.space, profiles, doubts)
     for k, (recording, predicted) in enumerate(zip(fitting.recordings, result.predicted, strict=True)):
         group = group_of(k, len(fitting.recordings))
         log_prediction(log, recording, predicted, group, result.estimate.noise_std)
@@ -210,8 +227,14 @@ def group_of(k: int, count: int) -> str:
     return "" if count == 1 else str(k + 1)
 
 
-def log_result(log: RunLog, result: HybridResult, space: ParameterSpace, profiles: Sequence[Profile] = ()) -> None:
-    """Log the final estimate with its profiles and draws, and the diagnosis of each fault."""
+def log_result(
+    log: RunLog,
+    result: HybridResult,
+    space: ParameterSpace,
+    profiles: Sequence[Profile] = (),
+    doubts: Sequence[str] = (),
+) -> None:
+    """Log the final estimate with its profiles and draws, the diagnosis of each fault, and doubts about recordings."""
     final = result.estimate
     log.estimate(
         final.names,
@@ -231,6 +254,8 @@ def log_result(log: RunLog, result: HybridResult, space: ParameterSpace, profile
     several = len(result.predicted) > 1
     log.result_arrays(**{f"predicted_{k + 1}" if several else "predicted": p for k, p in enumerate(result.predicted)})
     more: dict[str, Any] = {"profiles": [profile.to_dict() for profile in profiles]} if profiles else {}
+    if doubts:
+        more["doubts"] = list(doubts)
     if final.draws is not None:
         log.result_arrays(draws=final.draws.values)
         more["draws"] = final.draws.to_dict()
