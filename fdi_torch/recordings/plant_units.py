@@ -7,8 +7,9 @@ named, unless the unchanged file is among them. A recording without metered flow
 hardly opens looks like tanks that are too small.
 
 An unusual plant is not mistaken for a wrong unit: a leak or a plugged pipe changes a coefficient of the balance by some
-factor, but rarely by one that is close to the ratio of two units. What has one channel alone is left to
-`gap.preprocess.recording_faults`, where effects of the plant compete.
+factor, but rarely by one that is close to the ratio of two units. The unit of one sensor alone is a doubt only
+(`doubtful_units`): whether its recording is refused is left to `gap.preprocess.recording_faults`, where effects of the
+plant compete.
 """
 
 from __future__ import annotations
