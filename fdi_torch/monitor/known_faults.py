@@ -166,6 +166,7 @@ def possible_ends(observer: ObserverBank, state: MonitorState, change: DetectedC
 def _possible_end(
     observer: ObserverBank, state: MonitorState, change: DetectedChange, ended: FaultTrack, lookback: float
 ) -> tuple[float, float] | None:
+    """The interval of `possible_ends` for one fault, from runs that end it at up to END_CANDIDATES times."""
     best, window = change.best, state.window(max(change.best.onset - lookback, change.since))
     times = window.samples.time[:: max(len(window) // END_CANDIDATES, 1)]
     onsets = torch.cat([times, times.new_tensor([best.onset])])
