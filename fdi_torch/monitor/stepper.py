@@ -48,7 +48,7 @@ class Stepper:
     def __init__(self, network: TankNetwork, longest: float | None = None) -> None:
         longest = usual_step(network.description) if longest is None else longest
         if not longest > 0:
-            raise ValueError(f"expected a positive integration step, got {longest} s")
+            raise ValueError(f"expected a positive integration step, got {longest:g} s")
         delayed = [p.prefix for p in network.placements if p.effect.delays]
         if delayed:
             raise ValueError(f"expected a plant without pure delays, got {delayed[0]}; observe it without that effect")

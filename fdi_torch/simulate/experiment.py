@@ -91,7 +91,7 @@ def expect_step(step: float) -> None:
     if isinstance(step, str):
         raise ValueError(f"expected the integration step as a number of seconds, got '{step}'; leave out the unit")
     if not step > 0:
-        raise ValueError(f"expected a positive integration step, got {step} s")
+        raise ValueError(f"expected a positive integration step, got {step:g} s")
 
 
 def divided(experiment: Experiment, counts: Int[Tensor, " K"]) -> Experiment:
