@@ -320,35 +320,37 @@ void kalman_transposed(int64_t samples, const Model* model, int64_t columns, con
              columns, gain, white, v, out);
 }
 
-// Disturbance smoother (Durbin and Koopman, 2012, sections 4.5 and 7.3.3). Input: innovations nu (S, C) of unit
-// variance. Output:
+// Disturbance smoother (Durbin and Koopman, 2012, sections 4.5 and 7.3.3). Input: columns nu (M, S, C) of innovations of
+// unit variance, the squares of which add up. Output:
 //   by_q (decaying), by_r (C), by_p0 (d): derivatives of the log-likelihood by the variances q, R and P0;
 //   n_q, n_r, n_p0: minus the parts of these that do not depend on nu; a variance times twice its n is the effective
 //       number of readings that determine it;
-//   shocks (S, d): the smoothed state at the start of a recording, else the smoothed shock that leads to the sample.
-void kalman_score(int64_t samples, const Model* model, const double* gain, const double* white, const double* nu,
-                  double* by_q, double* by_r, double* by_p0, double* n_q, double* n_r, double* n_p0,
+//   shocks (S, d): of the first column, the smoothed state at the start of a recording, else the smoothed shock that
+//       leads to the sample.
+void kalman_score(int64_t samples, const Model* model, int64_t columns, const double* gain, const double* white,
+                  const double* nu, double* by_q, double* by_r, double* by_p0, double* n_q, double* n_r, double* n_p0,
                   double* shocks) {
     const Model& m = *model;
     std::vector<double> space(3 * d * d + 4 * d * C);
     double *big = space.data(), *half = big + d * d, *turned = half + d * d, *inner = turned + d * d;
     double *inner_t = inner + d * C, *wide = inner_t + d * C, *cross = wide + d * C;
-    double r[d] = {}, back[d], u[C], spread[C * C], by_level[n * n], by_flow[2 * n * n];
+    std::vector<double> of_columns(columns * d);
+    double back[d], u[C], spread[C * C], by_level[n * n], by_flow[2 * n * n];
     for (double* sum : {by_q, n_q}) std::fill(sum, sum + decaying, 0.0);
     for (double* sum : {by_r, n_r}) std::fill(sum, sum + C, 0.0);
     for (double* sum : {by_p0, n_p0}) std::fill(sum, sum + d, 0.0);
     for (int64_t t = samples - 1; t >= 0; --t) {
         const double *k = gain + t * d * C, *w = white + t * C * C;
         if (t + 1 == samples || m.fresh[t + 1]) {
-            std::fill(r, r + d, 0.0);
+            std::fill(of_columns.begin(), of_columns.end(), 0.0);
             std::fill(big, big + d * d, 0.0);
         } else {
-            for (int i = 0; i < decaying; ++i) {
-                by_q[i] += 0.5 * (r[n + i] * r[n + i] - big[(n + i) * (d + 1)]);
-                n_q[i] += 0.5 * big[(n + i) * (d + 1)];
+            for (int i = 0; i < decaying; ++i) n_q[i] += 0.5 * big[(n + i) * (d + 1)];
+            for (double* r = of_columns.data(); r < of_columns.data() + columns * d; r += d) {
+                for (int i = 0; i < decaying; ++i) by_q[i] += 0.5 * r[n + i] * r[n + i];
+                backward<1>(m, t, r, back);
+                std::copy(back, back + d, r);
             }
-            backward<1>(m, t, r, back);
-            std::copy(back, back + d, r);
             // F' N F: only the rows and columns of the levels and flows need a product, and N is symmetric.
             backward<d>(m, t, big, half);
             for (int i = 0; i < d; ++i)
@@ -371,19 +373,20 @@ void kalman_score(int64_t samples, const Model* model, const double* gain, const
         std::fill(spread, spread + C * C, 0.0);
         add_product_of_transposed<d, C, C>(k, inner, spread);
         add_product_of_transposed<C, C, C>(w, w, spread);
-        std::fill(u, u + C, 0.0);
-        add_product_of_transposed<C, C, 1>(w, nu + t * C, u);
-        for (int c = 0; c < C; ++c) {
-            for (int i = 0; i < d; ++i) u[c] -= k[i * C + c] * r[i];
-            if (m.seen[t * C + c]) {
-                by_r[c] += 0.5 * (u[c] * u[c] - spread[c * C + c]);
-                n_r[c] += 0.5 * spread[c * C + c];
-            } else {
-                u[c] = 0.0;
+        for (int c = 0; c < C; ++c) n_r[c] += m.seen[t * C + c] ? 0.5 * spread[c * C + c] : 0.0;
+        for (int64_t column = 0; column < columns; ++column) {
+            double* r = &of_columns[column * d];
+            std::fill(u, u + C, 0.0);
+            add_product_of_transposed<C, C, 1>(w, nu + (column * samples + t) * C, u);
+            for (int c = 0; c < C; ++c) {
+                for (int i = 0; i < d; ++i) u[c] -= k[i * C + c] * r[i];
+                if (!m.seen[t * C + c]) u[c] = 0.0;
+                by_r[c] += 0.5 * u[c] * u[c];
             }
+            look_back<1>(m, t, u, back);
+            for (int i = 0; i < d; ++i) r[i] += back[i];
+            for (int i = 0; i < d && m.fresh[t]; ++i) by_p0[i] += 0.5 * r[i] * r[i];
         }
-        look_back<1>(m, t, u, back);
-        for (int i = 0; i < d; ++i) r[i] += back[i];
         // big = F'NF + Z + Z' with Z = H' (T H / 2 - (F'NF K)') and T = spread, which equals
         // (I - K H)' F'NF (I - K H) + H' S^-1 H.
         for (int c = 0; c < C; ++c)
@@ -400,13 +403,13 @@ void kalman_score(int64_t samples, const Model* model, const double* gain, const
             for (int j = 0; j < d; ++j) big[i * d + j] += half[i * d + j] + half[j * d + i];
         for (int i = 0; i < d; ++i) {
             const double shock = m.fresh[t] ? m.p0[i] : i < n ? 0.0 : m.q[i - n];
-            shocks[t * d + i] = shock * r[i];
-            if (m.fresh[t]) {
-                by_p0[i] += 0.5 * (r[i] * r[i] - big[i * (d + 1)]);
-                n_p0[i] += 0.5 * big[i * (d + 1)];
-            }
+            shocks[t * d + i] = shock * of_columns[i];
+            n_p0[i] += m.fresh[t] ? 0.5 * big[i * (d + 1)] : 0.0;
         }
     }
+    for (int i = 0; i < decaying; ++i) by_q[i] -= n_q[i];
+    for (int c = 0; c < C; ++c) by_r[c] -= n_r[c];
+    for (int i = 0; i < d; ++i) by_p0[i] -= n_p0[i];
 }
 
 // Levels x (S, n) predicted for each sample from all earlier ones, from residuals y (S, C).

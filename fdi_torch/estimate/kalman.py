@@ -196,11 +196,13 @@ class KalmanWhitening:
         """Adjoint of `innovations`: u (S, C, M) such that sum(u y) = sum(v innovations(y)) for every y."""
         return self._run_on_columns("kalman_transposed", v)
 
-    def score(self, nu: Float[Tensor, "S C"]) -> Score:
-        """Score of the log-likelihood, given innovations nu (S, C) of unit variance."""
+    def score(self, nu: Float[Tensor, "S C M"]) -> Score:
+        """Score of the log-likelihood, given innovations nu (S, C, M) of unit variance, the mean product nu nu' of
+        which is the sum over the M columns. Its shocks are those of the first column."""
         slopes, information = ([torch.empty_like(x) for x in (self.q, self.r, self.p0)] for _ in range(2))
         shocks = nu.new_empty(self.gain.shape[:2])
-        self._run("kalman_score", self.gain, self.white, nu.contiguous(), *slopes, *information, shocks)
+        columns = nu.permute(2, 0, 1).contiguous()
+        self._run("kalman_score", len(columns), self.gain, self.white, columns, *slopes, *information, shocks)
         return Score(self._by_deviation(*slopes), self._by_deviation(*information), shocks)
 
     def _by_deviation(self, by_q: Tensor, by_r: Tensor, by_p0: Tensor) -> Tensor:
@@ -213,7 +215,7 @@ class KalmanWhitening:
 
     def smoothed(self, residual: Float[Tensor, "S C"]) -> Float[Tensor, "S n"]:
         """Smoothed deviation of the levels from the trajectory, (S, n) m, given all residuals (S, C)."""
-        shocks = self.score(self.innovations(residual.unsqueeze(-1)).squeeze(-1)).shocks
+        shocks = self.score(self.innovations(residual.unsqueeze(-1))).shocks
         states = residual.new_empty(self.own.samples, self.order)
         self._run("kalman_levels", shocks, states)
         return states[:, : self.own.order]

@@ -4,7 +4,9 @@ Intensities and scales maximise the likelihood of the innovations (kalman.py) ti
 are of one order of magnitude, since a significant diffusion term in one state equation shows where a model is deficient
 (Kristensen, Madsen and Jorgensen, 2004, Automatica 40, 225-237). The gradient comes from the disturbance
 smoother (Durbin and Koopman, 2012, "Time series analysis by state space methods", section 7.3.3). Plant parameters, in
-which the residuals are linear, are profiled out. The correlation time is selected from a grid of candidates.
+which the residuals are linear, are profiled out, or averaged over their posterior: then the flows that look like errors
+of parameters are not lost, as in restricted maximum likelihood (Patterson and Thompson, 1971, Biometrika 58, 545-554).
+The correlation time is selected from a grid of candidates.
 """
 
 from __future__ import annotations
@@ -32,8 +34,9 @@ LOG_BOUND = 10.0  # bound on |log(intensity / unit)| and |log(scale)| in the opt
 class Likelihood:
     """Maximum of the likelihood.
 
-    noise: the maximising noise model. log_likelihood: of the residuals, maximised over the noise model and the linear
-    parameters, the log density of the priors of both included; constants of the normal distribution are omitted.
+    noise: the maximising noise model. log_likelihood: of the residuals, maximised over the noise model and maximised or
+    integrated over the linear parameters, the log density of the priors of both included; constants of the normal
+    distribution are omitted.
     converged: whether the optimisation of the noise model converged. determined: effective number of readings that
     determine each of its parameters, in the order of `Score.slope`.
     """
@@ -55,8 +58,10 @@ def estimate_state_noise(
     unit: Tensor,
     start: StateNoise | None = None,
     climb: bool = True,
+    marginal: bool = False,
 ) -> Likelihood:
-    """Estimate the noise model from residuals (S, C), with plant parameters profiled out.
+    """Estimate the noise model from residuals (S, C), with plant parameters profiled out or, if `marginal`, integrated
+    over.
 
     jacobian (S, C, P): derivatives of the readings by the P parameters.
     pull, off (P,): normal priors of the parameters. A parameter change delta has the prior residual off + pull * delta
@@ -66,7 +71,7 @@ def estimate_state_noise(
     search is over the wander's correlation time and smoothness if a sensor wanders, else over the correlation time of
     the flow disturbances.
     """
-    problem = _Problem(propagation, sensors, residual, jacobian, pull, off, unit)
+    problem = _Problem(propagation, sensors, residual, jacobian, pull, off, unit, marginal)
     interval = propagation.interval
     if start is None:
         start = StateNoise(unit, interval * CORRELATION_TIMES[2], torch.ones_like(sensors.std))
@@ -111,6 +116,7 @@ class _Problem:
     pull: Tensor
     off: Tensor
     unit: Tensor
+    marginal: bool = False
 
     @cached_property
     def filter(self) -> KalmanFilter:
@@ -151,7 +157,7 @@ class _Problem:
         return replace(best, start_log_likelihood=first.start_log_likelihood)
 
     def solve(self, start: StateNoise) -> Likelihood:
-        """Maximise the profile likelihood over the logarithms of intensities, scales and wander, by L-BFGS-B."""
+        """Maximise the likelihood over the logarithms of intensities, scales and wander, by L-BFGS-B."""
         tanks, start_wander = len(self.unit), start.wander
 
         def noise_at(x: np.ndarray) -> StateNoise:
@@ -190,15 +196,32 @@ class _Problem:
         return Likelihood(noise, value, start_value, bool(optimum.success), likeliest[1].determined)
 
     def likelihood(self, noise: StateNoise) -> tuple[float, Score]:
-        """Profile log-likelihood of a noise model with the log prior of its intensities, and its score."""
+        """Log-likelihood of a noise model with the log prior of its intensities, and its score."""
         model = self.filter.under(noise)
-        innovations, prior_residual = _profiled(model.innovations(self.columns), self.pull, self.off)
+        white = model.innovations(self.columns)
+        innovations, prior_residual = _profiled(white, self.pull, self.off)
         cost = float(innovations.square().sum()) + float(prior_residual.square().sum()) + model.log_det
+        innovations = innovations.unsqueeze(-1)
+        if self.marginal:
+            errors, log_det = _by_errors(white[..., 1:], self.pull)
+            innovations, cost = torch.cat([innovations, errors], dim=-1), cost + log_det
         score, deviation = model.score(innovations), noise.scatter() / SCATTER
         slope, determined = score.slope.clone(), score.determined.clone()
         slope[: len(deviation)] -= deviation
         determined[: len(deviation)] += torch.where(noise.tied, 0.5 / SCATTER**2, 0.0)
         return -0.5 * cost + noise.log_prior(), replace(score, slope=slope, determined=determined)
+
+
+def _by_errors(white: Tensor, pull: Tensor) -> tuple[Tensor, float]:
+    """What the errors of the most likely parameters add to the innovations, as P independent columns (S, C, P), and the
+    log determinant of the information about the parameters over that of their priors.
+
+    white (S, C, P): whitened Jacobian. pull (P,): positive.
+    """
+    by_priors = white.flatten(0, 1) / pull
+    root = torch.linalg.cholesky(by_priors.mT @ by_priors + torch.eye(len(pull), dtype=white.dtype))
+    errors = torch.linalg.solve_triangular(root.mT, by_priors, upper=True, left=False)
+    return errors.reshape(white.shape), 2.0 * float(torch.diagonal(root).log().sum())
 
 
 def _profiled(white: Tensor, pull: Tensor, off: Tensor) -> tuple[Tensor, Tensor]:

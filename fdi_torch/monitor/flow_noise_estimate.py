@@ -99,7 +99,8 @@ def _likeliest(
 
     def solved(noise: StateNoise) -> Likelihood:
         priors = ones, 0.0 * ones
-        return estimate_state_noise(propagation, sensors, residual, columns, *priors, unit, noise, climb=False)
+        given = propagation, sensors, residual, columns, *priors, unit, noise
+        return estimate_state_noise(*given, climb=False, marginal=True)
 
     noise = replace(start.noise, scale=torch.ones_like(start.reading_std))
     likely = _with_likeliest_time(solved, noise, start.interval, times)
