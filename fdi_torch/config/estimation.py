@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from fdi_torch.config.problems import ConfigError, naming, shown
-from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity, quantity_at
+from fdi_torch.config.strict import Amount, Share, Strict, quantity, quantity_at
 from fdi_torch.effects import all_placements, build_network, full_name, placements_for, unknown_parameter
 from fdi_torch.estimate.evolution_settings import STRATEGIES, EvolutionSettings
 from fdi_torch.estimate.objectives import Objective
@@ -94,9 +94,6 @@ class EstimationConfig(Strict):
     )
     draws: int = Field(
         0, ge=0, le=1_000_000, description="draws from the posterior by an ensemble sampler (extra draws)"
-    )
-    windows: Seconds | None = Field(
-        None, gt=0, description="length of windows that are fitted separately, s, for faults that come and go"
     )
 
 
