@@ -40,7 +40,7 @@ class WindowConfig(Strict):
 
 class MonitorConfig(Strict):
     plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
-    recording: RecordingConfig = Field(description="the recording to follow; none beside `source`")
+    recording: RecordingConfig = Field(description="the recording to follow; leave it out with `source`")
     source: SourceConfig | None = Field(None, description="a live source in place of a recording")
     fault_free: tuple[Seconds, Seconds] = Field(
         description="interval from which the noise is estimated, as in [0 s, 300 s]"

@@ -27,7 +27,8 @@ from fdi_torch.simulate.simulated_recording import noise_level
 class InputConfig(Strict):
     value: Amount | None = Field(None, description="constant value, in the unit of the plant's channel")
     steps: list[tuple[Seconds, Amount]] = Field(
-        default_factory=list, description="[[0 s, 50 cm^3/s], [200 s, 60 cm^3/s], ...]: from each time on"
+        default_factory=list,
+        description="[[0 s, 50 cm^3/s], [200 s, 60 cm^3/s], ...]: each value holds from its time on",
     )
 
 

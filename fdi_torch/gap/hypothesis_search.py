@@ -161,7 +161,7 @@ class HypothesisSearch:
         return hypotheses
 
     def _needed(self, explanation: RankedExplanation, best: CauseHypothesis) -> float:
-        """Log evidence that a discrepancy must add to an explanation, for the share RARE of the best one's weight."""
+        """Log evidence that a discrepancy must add to give the explanation the share RARE of the best one's weight."""
         return best.weight + math.log(RARE) - explanation.log_weight - self.weights.log_odds
 
     def _after_fits_at_unknowns(

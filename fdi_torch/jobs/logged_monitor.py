@@ -252,8 +252,8 @@ class LoggedMonitor:
 
 
 def _positions(clock: Sequence[float], times: Sequence[tuple[float, bool]], tested: Container[int] = ()) -> list[int]:
-    """Index on the clock of each of the times, which follow it in order; True: after that of the time before, and not
-    among `tested`. The clock may jump back, which causes a notice. No two notices belong to one sample."""
+    """Index on the clock of each of the times, in their order. A time with True comes after the previous one, and not
+    among `tested`: the clock may jump back, which causes a notice, and each sample has at most one notice."""
     positions, k = [], -1
     for time_of_item, is_later in times:
         k = clock.index(time_of_item, k + 1 if is_later else max(k, 0))

@@ -130,7 +130,7 @@ def _residual_plots(fields: Fields) -> list[Panel]:
 
 
 def _tests(present: Mapping[str, str]) -> list[str]:
-    """What the monitor's statistics are of: a sensor, or all of them by a chart such as cusum."""
+    """The subject of a test statistic of the monitor: a sensor, or all sensors together by a detector such as cusum."""
     return [name.removesuffix(_TEST[0]) for name in present if name.endswith(_TEST[0])]
 
 

@@ -166,7 +166,7 @@ def _level_findings(
 
 
 def _level(value: float, sensor: Sensor) -> str:
-    """A level, m, in the unit of a sensor's readings if they are levels."""
+    """A level (given in m) as text, in the unit in which the sensor reads levels."""
     return quantity_text(value, "m", name=sensor.column)
 
 

@@ -59,7 +59,7 @@ class TankBalance:
     intervals: int
 
     def scaled(self, metered: float, by_laws: float) -> TankBalance:
-        """The same with other numbers for metered flows and for flows by laws."""
+        """The balance with other values for metered flows and for flows by laws."""
         return replace(self, by_flow=self.by_flow * torch.where(self.metered, metered, by_laws))
 
     def log_evidence(self, rounding: float, unrelated: float = UNRELATED) -> float:
@@ -100,7 +100,7 @@ class Balance:
     tanks: tuple[TankBalance, ...]
 
     def scaled(self, metered: Tensor, by_laws: Tensor) -> Balance:
-        """The same with other numbers for metered flows and for flows by laws, of each tank (tanks)."""
+        """The balances with other values for metered flows and for flows by laws, of each tank (tanks)."""
         factors = zip(self.tanks, metered.tolist(), by_laws.tolist(), strict=True)
         return Balance(tuple(tank.scaled(*each) for tank, *each in factors))
 

@@ -170,7 +170,7 @@ class Collocation:
         return self._output_map.look(levels.movedim(1, 2), values, self._columns(theta))
 
     def apart(self, theta: Tensor, near: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:
-        """The same as of `JointCollocation`, for one recording."""
+        """As `JointCollocation`, for one recording."""
         return [(self, theta, near)]
 
     def _columns(self, theta: Tensor) -> list[Tensor]:
