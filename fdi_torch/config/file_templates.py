@@ -33,7 +33,7 @@ from fdi_torch.recordings.source import ClockSource
 from fdi_torch.units import spelled
 
 FALSE_ALARMS_EVERY, LEARNING = 20000.0, 1000.0
-"""Of a plant with the time scale of three_tank, s. A fault-free part of unknown sampling lasts LEARNING."""
+"""Mean time between false alarms, and length of a fault-free part of unknown sampling; s, for three_tank."""
 
 
 def template(kind: str, plant: PlantDescription, plant_file: str, name: str, recording: str | None = None) -> str:

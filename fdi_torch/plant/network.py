@@ -174,11 +174,11 @@ class TankNetwork(nn.Module):
         return self._command_chain.delays(values)
 
     def flows(self, point: OperatingPoint) -> dict[str, Tensor]:
-        """FLOW of each component whose flow does not depend on net inflows, by its name, m^3/s."""
+        """Flow of each component whose flow does not depend on net inflows, with its FLOW effects, by name, m^3/s."""
         return {component.name: self.flow(point, component) for component in self._first_flows}
 
     def flow(self, point: OperatingPoint, component: FlowComponent, net: Tensor | None = None) -> Tensor:
-        """FLOW of one component, m^3/s, positive from source to target: its law, changed by its effects, limited.
+        """Flow of one component, m^3/s, positive from source to target: its law, changed by its FLOW effects, limited.
 
         net: inflow of its source by the flows that are computed before it, m^3/s.
         """
@@ -211,7 +211,7 @@ class TankNetwork(nn.Module):
         return net
 
     def last_flows(self, point: OperatingPoint, net: Sequence[Tensor]) -> tuple[dict[str, Tensor], list[Tensor]]:
-        """FLOW of each component that depends on the net inflow of its source, and the net inflows after it, m^3/s."""
+        """Flow of each component that depends on the net inflow of its source, and the net inflows after it, m^3/s."""
         inflows, flows = list(net), {}
         for component in self._last_flows:
             flow = self.flow(point, component, inflows[self._tank_index[component.source]])

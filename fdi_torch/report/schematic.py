@@ -241,7 +241,7 @@ class _Drawing:
         return [(x, y + self.tall + 0.55 - sketch.round), (x, y + self.tall + 0.06)]
 
     def route_over_wall(self, component: FlowComponent, rise: float) -> list[Point]:
-        """Over a wall of the source at the height `rise`: down outside it, or into the target."""
+        """Points of a line over the wall of the source tank, at the height `rise`, and down outside or into the target."""
         x, y = self.corner(component.source)
         if component.target == OUTSIDE:
             return [(x - 0.5, y + rise), (x - ASIDE, y + rise), (x - ASIDE, y - 0.45)]
@@ -252,7 +252,7 @@ class _Drawing:
         return [(x + side, y + rise), (to_x - side, y + rise)]
 
     def route_beside(self, start: Point, to_x: float, to_y: float) -> list[Point]:
-        """From the left wall of a tank past it to the rim of a tank in another row."""
+        """Points of a line from the left wall of a tank, past this tank, to the rim of a tank in another row."""
         self.besides += 1
         lane, above = start[0] + 0.5 - ASIDE - LANE * (self.besides - 1), to_y + self.tall + 0.14 + 0.1 * self.besides
         end = to_x - 0.2 - 0.12 * self.besides

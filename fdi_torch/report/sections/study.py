@@ -25,7 +25,7 @@ from fdi_torch.study.estimators import ESTIMATORS, Estimator
 TRIAL, SUMMARY = "/study/trial", "/study/summary"
 MOST_PANELS, MOST_GROUPS, MOST_ROWS = 9, 40, 30
 SHOWN: tuple[Estimator, ...] = ("free", "boxed", "correlation", "search")
-"""Of the estimators that a log has, the first of these is shown."""
+"""Estimators in the order of preference: the first one that a log has is shown."""
 MAIN = {"over_bound": "error over the Cramér-Rao bound", "coverage": "coverage of the 95 % interval"}
 _OWN = ("t", "trial", "trials", "group", "seed", "status")
 
