@@ -117,7 +117,7 @@ class TrajectoryProblem:
     def attempt(
         self, theta: Tensor, known: Linearisation, step: Tensor, near: TrialTrajectory | None = None
     ) -> TrialTrajectory:
-        """The trajectories at theta, a `step` away from `known` or from `near`."""
+        """The trajectories at theta, found from those of `near` (otherwise `known`), which lie a `step` away."""
         linearised = _fitted(known).linearised
         guess = (near or linearised).levels + _along(linearised.slopes, step)
         levels = self.engine.trajectories(theta, guess)

@@ -241,7 +241,7 @@ class _Drawing:
         return [(x, y + self.tall + 0.55 - sketch.round), (x, y + self.tall + 0.06)]
 
     def route_over_wall(self, component: FlowComponent, rise: float) -> list[Point]:
-        """Points of a line over the wall of the source tank, at the height `rise`, and down outside or into the target."""
+        """Points of a line over the source's wall at the height `rise`, then down outside or into the target."""
         x, y = self.corner(component.source)
         if component.target == OUTSIDE:
             return [(x - 0.5, y + rise), (x - ASIDE, y + rise), (x - ASIDE, y - 0.45)]
