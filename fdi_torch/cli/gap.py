@@ -123,7 +123,7 @@ def _errors(answer: Answer) -> dict[str, float]:
 
 
 def _written(plant: PlantDescription, answer: Answer, folder: Path) -> Path | None:
-    """Write gap.json, and next_input.csv if several explanations are plausible. Returns the path of the latter."""
+    """Write gap.json and, if several explanations are plausible, next_input.csv, whose path is returned."""
     write_text(folder / "gap.json", json.dumps(answer.to_dict(), indent=1) + "\n")
     if not answer.next_input:
         return None

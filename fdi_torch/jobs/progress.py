@@ -1,4 +1,4 @@
-"""Progress of a job, as told to a function of the caller."""
+"""Progress of a job, reported to a function of the caller."""
 
 from __future__ import annotations
 
