@@ -121,12 +121,14 @@ def test_check_shows_channels_and_findings(rig: str, capsys: pytest.CaptureFixtu
     [
         (
             "simulate.faults.T1.leek=0.3",
-            "simulate.faults: expected a parameter of the plant or its faults, got 'T1.leek'",
+            "simulate.faults.T1.leek: expected a parameter of the plant or its faults, got 'T1.leek'",
         ),
         ("simulate.faults.T1.leak=30", "simulate.faults.T1.leak: expected a size from 0 to 1, got 30"),
         ("simulate.duration=600", "simulate.duration: expected a quantity in s, got the bare number 600"),
         ("foo=1", "expected a known key (plant, recordings, "),
         ("estimate.search={population: 2}", "estimate.search: expected a population of at least 4"),
+        ("simulate.noise.std.hh1=1 mm", "simulate.noise.std.hh1: expected an output of the plant (h1, h2, h3)"),
+        ("plant=three_tnak", "plant: expected a plant file (.yaml) or a shipped plant"),
     ],
 )
 def test_a_wrong_value_of_the_option_set_is_not_blamed_on_the_file(
@@ -134,6 +136,13 @@ def test_a_wrong_value_of_the_option_set_is_not_blamed_on_the_file(
 ) -> None:
     assert cli.main(["simulate", "--quiet", "--set", "seed=3", "--set", override]) == cli.MISUSE
     assert f"fdi simulate: --set {override}: {told}" in capsys.readouterr().err
+
+
+def test_an_override_within_what_is_wrong_is_named_beside_the_file(capsys: pytest.CaptureFixture[str]) -> None:
+    """The file gives the keys around it, and the two may be wrong only together."""
+    assert cli.main(["simulate", "--quiet", "--set", "seed=3", "--set", "estimate.search.population=2"]) == cli.MISUSE
+    said = capsys.readouterr().err
+    assert "default.yaml with --set estimate.search.population=2: estimate.search: expected a population" in said
 
 
 def test_a_mistake_in_the_file_is_blamed_on_it_beside_the_option_set(

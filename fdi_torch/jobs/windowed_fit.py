@@ -40,7 +40,8 @@ def fit_windows(run: Run, tell: Tell = silent) -> WindowedFit:
     """
     run = replace(run, plant=without_startup_effects(run.plant, run.plant.channels()))
     if run.config.device != "cpu":
-        raise ConfigError([f"device: expected cpu with estimate.windows, got {run.config.device}; leave it out"])
+        place = run.source.at("device")
+        raise ConfigError([f"{place}: expected cpu with estimate.windows, got {run.config.device}; leave it out"])
     length = run.config.estimate.windows
     assert length is not None
     loaded = recordings_of(run)
@@ -54,8 +55,8 @@ def fit_windows(run: Run, tell: Tell = silent) -> WindowedFit:
         noise = [noise_of(part.recording, run.plant) for part in loaded]
         cuts = [(c, std) for part, std in zip(loaded, noise, strict=True) for c in cut_up(part.recording, length)]
         if not cuts:
-            got = f"{length:g} s; shorten them"
-            raise ConfigError([f"{run.source}: estimate.windows: expected windows shorter than a recording, got {got}"])
+            place = run.source.at("estimate.windows")
+            raise ConfigError([f"{place}: expected windows shorter than a recording, got {length:g} s; shorten them"])
         fittings = [fitting_of(run, space, [LoadedRecording(cut, free)]) for cut, _ in cuts]
         step = hybrid_settings(run.config.estimate).refine_step or window_step(fittings, noise[0])
         windows = []
