@@ -37,6 +37,7 @@ from fdi_torch.monitor.events import Event
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.check import doubts_about
 
 AnyRecording = Recording | Mapping[str, Any] | str | Path
 AnyRun = Run | Mapping[str, Any] | str | Path
@@ -246,7 +247,7 @@ def refit(
     plant, segments = _plant_and_recordings(plant, recordings, "refit")
     with one_thread():
         fit = refitted(plant, segments, step=step, tell=rounded(tell), **choices)
-    return RefitResult(fit, misfit_of(fit.rmse, segments, plant))
+    return RefitResult(fit, misfit_of(fit.rmse, segments, plant), doubts_about(segments, plant))
 
 
 def study(

@@ -20,16 +20,21 @@ from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of,
 from fdi_torch.jobs.train import log_recordings
 from fdi_torch.logbook import RunLog
 from fdi_torch.parameters import is_effect_parameter
+from fdi_torch.recordings.check import doubts_about
 
 
 @dataclass(frozen=True)
 class WindowedFit:
-    """windows: fitted windows. stretches: periods in which each fault was present. step: of the integration, s."""
+    """windows: fitted windows. stretches: periods in which each fault was present. step: of the integration, s.
+
+    doubts: what limits the trust in the recordings, one sentence each.
+    """
 
     windows: tuple[Window, ...]
     stretches: tuple[Stretch, ...]
     step: float
     log: Path
+    doubts: tuple[str, ...]
 
 
 def fit_windows(run: Run, tell: Tell = silent) -> WindowedFit:
@@ -63,12 +68,14 @@ def fit_windows(run: Run, tell: Tell = silent) -> WindowedFit:
         for k, (fitting, (cut, std)) in enumerate(zip(fittings, cuts, strict=True)):
             tell(k / len(cuts), f"window at {float(cut.time[0]):g} s")
             windows.append(window_of(fitting, std, suspects, step))
-        result = WindowedFit(tuple(windows), tuple(stretches_of(windows)), step, path)
+        doubts = doubts_about([part.recording for part in loaded], run.plant)
+        result = WindowedFit(tuple(windows), tuple(stretches_of(windows)), step, path, doubts)
         fields = [
             {"start": w.start, "stop": w.stop, "misfit": w.misfit}
             | {f.name: {"size": f.size, "std": f.std, "state": f.state} for f in w.faults}
             for w in windows
         ]
-        log.result({"step": step, "windows": fields, "stretches": [vars(s) for s in result.stretches]})
+        stretches = [vars(s) for s in result.stretches]
+        log.result({"step": step, "doubts": list(doubts), "windows": fields, "stretches": stretches})
     tell(1.0, "done")
     return result
