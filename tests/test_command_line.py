@@ -357,6 +357,19 @@ def test_gap_asks_whether_the_adopted_file_can_be_written_before_it_searches(
         assert f"fdi gap: {target}: {reason}" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["gap", "refit"])
+def test_adopt_overwrites_a_file_only_where_it_is_told_to(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, rig: str, command: str
+) -> None:
+    monkeypatch.setattr("fdi_torch.cli.gap.run_gap", lambda *given: pytest.fail("searched"))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "better.yaml").write_text("mine")
+    words = [command, "--plant", "three_tank", "--recording", rig, "--adopt", "better.yaml"]
+    assert cli.main(words) == cli.MISUSE
+    assert "better.yaml: expected a new file for --adopt, but it exists" in capsys.readouterr().err
+    assert (tmp_path / "better.yaml").read_text() == "mine"
+
+
 def test_short_options_become_overrides_and_win() -> None:
     arguments = SimpleNamespace(set=["seed=1"], out="here", device=None, seed=2)
     assert overrides(arguments) == ["seed=1", "output.folder=here", "seed=2"]  # type: ignore[arg-type]

@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 
 from fdi_torch.amounts import rounded
-from fdi_torch.cli.adoption import write_adopted
+from fdi_torch.cli.adoption import expect_adoptable, write_adopted
 from fdi_torch.cli.explained import exit_code, say_doubts, say_first
 from fdi_torch.cli.gap_text import MOVED
 from fdi_torch.cli.options import names
@@ -42,6 +42,7 @@ DISTURBED = (
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     plant = chosen_plant(arguments.plant)
+    expect_adoptable(arguments.adopt, arguments.replace)
     recordings = named_recordings(arguments.recording, plant, Path.cwd())
     holdouts = [r for name in arguments.holdout for r in named_recordings(name, plant, Path.cwd())]
     white = parse_level_deviation(arguments.white, "--white") if arguments.white else None
