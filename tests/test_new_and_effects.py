@@ -16,10 +16,11 @@ import fdi_torch
 from fdi_torch import cli
 from fdi_torch.config.channels import mapped
 from fdi_torch.config.estimation import parameter_values, placements_of
-from fdi_torch.config.file_templates import plant_from_recording, template
+from fdi_torch.config.file_templates import template
 from fdi_torch.config.loaded_recordings import listed_recordings, read_recording
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import build_plant, load_plant
+from fdi_torch.config.plant_from_columns import plant_from_recording
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.rehearsal_file import load_rehearsal

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import torch
 
@@ -27,15 +26,14 @@ from fdi_torch.gap.preprocess.outliers import sensor_with_outliers
 from fdi_torch.gap.preprocess.sensor_limits import noise_before_clipping, with_noise_limits
 from fdi_torch.gap.problem import PLAIN, DiagnosisProblem, Settings, problem_of
 from fdi_torch.gap.screening import options_of
+from fdi_torch.gap.stage_progress import ProgressCallback, StageProgress
 from fdi_torch.gap.structure_search import search
-from fdi_torch.gap.verdict_words import explanation_words
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of_all, with_simulated_levels
 from fdi_torch.recording import Recording
 
 CONTENT = 0.95
-ProgressCallback = Callable[[float, str], None]
 
 
 def diagnose(
@@ -63,11 +61,11 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     progress(0.2, "which effects")
     present = {p.prefix for p in problem.known_effects} | {ParameterName.parse(name).prefix for name in data.nuisance}
     options = options_of([p for p in library if not p.effect.quantizes and p.prefix not in present], fitter, reach)
-    pool = ExplanationPool(fitter, null, len(library))
-    result = search(pool, options, problem.settings.most, partial(_report, progress, 0.2, "which effects"))
+    pool = ExplanationPool(fitter, null, len(library), StageProgress(progress, "which effects", 0.2, 0.6))
+    result = search(pool, options, problem.settings.most)
     progress(0.6, "where")
-    report = partial(_report, progress, 0.6, "where")
-    posterior = posterior_of(pool, result, options, plant, possible_places(plant), problem.settings.named_only, report)
+    pool.progress = StageProgress(progress, "where", 0.6, 0.8)
+    posterior = posterior_of(pool, result, options, plant, possible_places(plant), problem.settings.named_only)
     credible_set = posterior.credible_set(CONTENT)
     rounded = {s.name for s, step in zip(plant.sensors, quantization_steps, strict=True) if step > 0.0}
     from_readings = [p.cause for p in library if p.effect.quantizes and p.location in rounded]
@@ -94,12 +92,6 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     )
     answer = build_answer(diagnosis, problem.holdouts)
     return replace(answer, remarks=[*dict.fromkeys(problem.remarks), *answer.remarks])
-
-
-def _report(progress: ProgressCallback, share: float, stage: str, causes: Collection[CauseName]) -> None:
-    """Tell the likeliest causes so far."""
-    named = [{"effect": effect, "location": place} for effect, place in sorted(causes)]
-    progress(share, f"{stage}, so far {explanation_words(named)}")
 
 
 def verdict_of(credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: Sequence[CauseName]) -> Verdict:

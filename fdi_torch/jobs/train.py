@@ -33,9 +33,7 @@ from fdi_torch.jobs.run_setup import (
 )
 from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.recording import Recording
-from fdi_torch.recordings.check import data_warnings
+from fdi_torch.recordings.check import doubts_about
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import notebook_svg, save
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
@@ -136,12 +134,6 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False, listener: Li
         pictures = draw(run, fitting, result, path)
     tell(1.0, "done")
     return TrainResult(result, fitting, truth, path, pictures, profiles, doubts)
-
-
-def doubts_about(recordings: Sequence[Recording], plant: PlantDescription) -> tuple[str, ...]:
-    """Corrections by the readers of the files, and findings that limit the trust in an estimate."""
-    notes = [note for recording in recordings for note in recording.notes]
-    return tuple(dict.fromkeys([*notes, *(s for recording in recordings for s in data_warnings(recording, plant))]))
 
 
 def estimate_logged(
