@@ -133,7 +133,8 @@ class TracedRates:
 
 @dataclass(frozen=True)
 class _Slopes:
-    """The program of the rates and then of these slopes, each by its two indices."""
+    """The program that computes the rates and then these slopes. Each slope is named by two indices, of its rate and of
+    the state, command or parameter."""
 
     by_state: list[Entry]
     by_command: list[Entry]
