@@ -33,7 +33,7 @@ from fdi_torch.recordings.source import ClockSource
 from fdi_torch.units import spelled
 
 FALSE_ALARMS_EVERY, LEARNING = 20000.0, 1000.0
-"""Mean time between false alarms, and length of a fault-free part of unknown sampling; s, for three_tank."""
+"""Of a plant with the time scale of three_tank, s. A fault-free part of unknown sampling lasts LEARNING."""
 
 
 def template(kind: str, plant: PlantDescription, plant_file: str, name: str, recording: str | None = None) -> str:
@@ -173,7 +173,7 @@ def _shares(plant: PlantDescription, channel: str, shares: Sequence[float]) -> l
 
 HEIGHT = 0.6  # m, of a tank that is still to be measured
 AT_RIM = {"1": 1.0, "V": 10.0, "A": 0.02, "Pa": 9810.0 * HEIGHT}
-"""Reading of a sensor at the rim, by the unit of its reading: 100 %, 10 V, 20 mA, water."""
+"""What a sensor reads at the rim, by the unit of its reading: 100 %, 10 V, 20 mA, water."""
 READING = re.compile(r"[LHX]|P[A-Z]|.*(level|füllstand|niveau|pegel|pressure|druck)", re.IGNORECASE)
 """Tags of levels and pressures (ISA-5.1: PT, PI; P-101 is a pump), letters of levels by custom, and words."""
 COMMAND = re.compile(

@@ -20,7 +20,7 @@ from fdi_torch.gap.explanation_pool import BEAM, ExplanationPool
 from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, pairs_of, screen, screen_under_each
 
-Report = Callable[[Collection[CauseName]], None]  # receives the causes that are the likeliest so far
+Report = Callable[[Collection[CauseName]], None]  # told the causes that are the likeliest so far
 
 # Budgets of computing.
 DEEPEST = 4  # effects in one explanation
