@@ -152,12 +152,12 @@ class TankNetwork(nn.Module):
     def _at_states(self, point: OperatingPoint) -> list[FlowBefore]:
         """Each effect with states, the flow before it and its conditions, in the order of the state vector."""
         places = {p.location for p in self._with_states}
-        found = [each for c in self._first_flows if c.name in places for each in self._through_effects(point, c)[1]]
+        flows = [each for c in self._first_flows if c.name in places for each in self._through_effects(point, c)[1]]
         for placement in self._with_states:
             if placement.effect.stage is Stage.BALANCE:
                 local = self._at_balance(point, placement)
-                found.append((placement, torch.zeros_like(local.level), local))
-        return sorted(found, key=lambda each: self._with_states.index(each[0]))
+                flows.append((placement, torch.zeros_like(local.level), local))
+        return sorted(flows, key=lambda each: self._with_states.index(each[0]))
 
     def commands(
         self, channels: Sequence[Tensor], memory: Memory, clock: Clock, values: PlaceValues
