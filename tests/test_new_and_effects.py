@@ -349,12 +349,12 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
     assert "or command: pulses_per_s, mass (s)\n" in Path("duty.yaml").read_text()
     plant = load_plant(Path("duty.yaml"))
     assert [s.column for s in plant.sensors] == ["y_lower"] and list(plant.channels()) == ["pwm", "u_pump"]
-    Path("tags.csv").write_text("t_s,P101.OUT [V],PT-7 [V],LI101 [mm]\n0,3.6,1,120\n1,3,1,121\n")
+    Path("tags.csv").write_text("t_s,P101.OUT [V],PT-7 [V],LI101 [mm],PK [V]\n0,3.6,1,120,4\n1,3,1,121,5\n")
     fdi("new", "plant", "--recording", "tags.csv", "--out", "tags.yaml")
     assert cli.main(["check", "--plant", "tags.yaml", "--recording", "tags.csv"]) == cli.NOT_EXPLAINED
     assert "asks for up to" not in capsys.readouterr().out
     plant = load_plant(Path("tags.yaml"))
-    assert [s.column for s in plant.sensors] == ["PT-7", "LI101"] and list(plant.channels()) == ["P101.OUT"]
+    assert [s.column for s in plant.sensors] == ["PT-7", "LI101"] and list(plant.channels()) == ["P101.OUT", "PK"]
     Path("none.csv").write_text("t_s,a,b\n0,1,2\n1,1,2\n")
     assert cli.main(["new", "plant", "--recording", "none.csv", "--out", "none.yaml"]) != cli.DONE
     assert "expected a column of a level with its unit in the header" in capsys.readouterr().err

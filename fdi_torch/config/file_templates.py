@@ -20,8 +20,8 @@ from fdi_torch.recordings.database import is_query
 
 FALSE_ALARMS_EVERY, LEARNING = 20000.0, 1000.0
 """Of a plant with the time scale of three_tank, s. A fault-free part of unknown sampling lasts LEARNING."""
-TRIALS, MARGIN = 4, 1.1
-"""A fault-free part is lengthened this often, and to as many times what the monitor asks for."""
+FEWEST, TRIALS, MARGIN = 200, 4, 1.1
+"""A fault-free part has at least as many samples, and is lengthened this often, to as many times what is asked for."""
 
 
 def template(kind: str, plant: PlantDescription, plant_file: str, name: str, recording: str | None = None) -> str:
@@ -107,10 +107,13 @@ def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
 
     read = read_recording(entry, plant)
     first, last = float(read.time[0]), float(read.time[-1])
-    until, needed = _learning_time(plant, read, every, 0.5 * (last - first))
-    remark = "the noise is learnt from it"
-    if needed > until:
-        remark = f"half of the recording; the noise needs some {needed:.10g} s, without which the threshold is raised"
+    until, remark = 0.5 * (last - first), "the noise is learnt from it"
+    try:
+        until, needed = _learning_time(plant, read, every, until)
+        if needed > until:
+            remark = f"half of the recording; the noise needs some {needed:.10g} s; until then the threshold is raised"
+    except ValueError as error:
+        remark = f"half of the recording, which the monitor will refuse: {str(error).partition(chr(10))[0]}"
     return f"[{first:.10g} s, {first + until:.10g} s]    # {remark}"
 
 
@@ -126,7 +129,8 @@ def _learning_time(
     from fdi_torch.monitor.fault_free_checks import learning_times
     from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
 
-    first, length = float(recording.time[0]), min(rounded_up(2.0 * LEARNING * time_scale(plant)), longest)
+    first, usual = float(recording.time[0]), 2.0 * LEARNING * time_scale(plant)
+    length = min(rounded_up(max(usual, FEWEST * recording.interval)), longest)
     for _ in range(TRIALS):
         part = fault_free_part(recording, first, first + length)
         monitor = prepare_monitor(plant, part, time_between_false_alarms=false_alarms_every).monitor
