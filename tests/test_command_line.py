@@ -128,6 +128,7 @@ def test_check_shows_channels_and_findings(rig: str, capsys: pytest.CaptureFixtu
         ("foo=1", "expected a known key (plant, recordings, "),
         ("estimate.search={population: 2}", "estimate.search: expected a population of at least 4"),
         ("simulate.noise.std.hh1=1 mm", "simulate.noise.std.hh1: expected an output of the plant (h1, h2, h3)"),
+        ("estimate.search.populaton=40", "estimate.search: expected a known key (strategy, population"),
         ("plant=three_tnak", "plant: expected a plant file (.yaml) or a shipped plant"),
     ],
 )

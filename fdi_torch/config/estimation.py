@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from fdi_torch.config.problems import ConfigError, naming, shown
-from fdi_torch.config.strict import Amount, Share, Strict, quantity, quantity_at
+from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity, quantity_at, with_known_keys
 from fdi_torch.effects import all_placements, build_network, full_name, placements_for, unknown_parameter
 from fdi_torch.estimate.evolution_settings import STRATEGIES, EvolutionSettings
 from fdi_torch.estimate.objectives import Objective
-from fdi_torch.names import shortened, unknown
+from fdi_torch.names import shortened
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
@@ -49,11 +49,7 @@ def _auto_or_seconds(value: Any) -> Any:
 
 
 def _known_settings(value: Any) -> Any:
-    known = [field.name for field in fields(EvolutionSettings)]
-    for key in value if isinstance(value, dict) else ():
-        if key not in known:
-            raise ValueError(unknown("a known key", str(key), known))
-    return value
+    return with_known_keys(value, [field.name for field in fields(EvolutionSettings)])
 
 
 class ObjectiveConfig(Strict):

@@ -8,8 +8,6 @@ from pathlib import Path
 from string import Template
 from urllib.parse import urlsplit
 
-import torch
-
 from fdi_torch.config.channels import mapped
 from fdi_torch.config.yaml_files import find_data, parse_yaml
 from fdi_torch.live.values import PORTS
@@ -22,6 +20,8 @@ from fdi_torch.recordings.database import is_query
 
 FALSE_ALARMS_EVERY, LEARNING = 20000.0, 1000.0
 """Mean time between false alarms, and length of a fault-free part of unknown sampling; s, for three_tank."""
+FEWEST, TRIALS, MARGIN = 200, 4, 1.1
+"""A fault-free part has at least as many samples, and is lengthened this often, to as many times what is asked for."""
 
 
 def template(kind: str, plant: PlantDescription, plant_file: str, name: str, recording: str | None = None) -> str:
@@ -99,7 +99,7 @@ def _usual_part(plant: PlantDescription) -> str:
 
 
 def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
-    """The fault-free part for the entry of a recording: by its sampling, and at most half of it."""
+    """The fault-free part for the entry of a recording: as long as the monitor needs, and at most half of it."""
     entry = parse_yaml(reading.encode(), "recording").get("recording")
     if entry is None or " ..." in reading:  # a live source, or columns that the user must write
         return _usual_part(plant)
@@ -107,30 +107,39 @@ def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
 
     read = read_recording(entry, plant)
     first, last = float(read.time[0]), float(read.time[-1])
-    enough = rounded_up(_learning_time(read, every))
-    until = first + min(enough, 0.5 * (last - first))
-    return f"[{first:.10g} s, {until:.10g} s]    # the noise is learnt from it; white noise needs some {enough:.10g} s"
+    until, remark = 0.5 * (last - first), "the noise is learnt from it"
+    try:
+        until, needed = _learning_time(plant, read, every, until)
+        if needed > until:
+            remark = f"half of the recording; the noise needs some {needed:.10g} s; until then the threshold is raised"
+    except ValueError as error:
+        remark = f"half of the recording, which the monitor will refuse: {str(error).partition(chr(10))[0]}"
+    return f"[{first:.10g} s, {first + until:.10g} s]    # {remark}"
 
 
-def _learning_time(recording: Recording, false_alarms_every: float) -> float:
-    """Time from which white noise determines the false-alarm rate within a factor of RATE_FACTOR (95 %), s.
+def _learning_time(
+    plant: PlantDescription, recording: Recording, false_alarms_every: float, longest: float
+) -> tuple[float, float]:
+    """Length of a fault-free part at the beginning of the recording, at most `longest`, and the length that the monitor
+    then asks for, s.
 
-    The recording gives the sampling interval and the number of sensors; correlated noise and random flows need longer.
-    false_alarms_every: mean time between false alarms, s. Raises ValueError if it is less than 20 samples.
+    false_alarms_every: mean time between false alarms, s. Raises ValueError for a recording that cannot be monitored.
     """
     # Only this needs the monitor, which takes a while to load.
-    from fdi_torch.monitor.detection import make_detector
-    from fdi_torch.monitor.fault_free_checks import RATE_FACTOR
-    from fdi_torch.monitor.samples import usual_interval
-    from fdi_torch.monitor.whitening import FEWEST_SAMPLES, Whitening
+    from fdi_torch.monitor.fault_free_checks import learning_times
+    from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
 
-    interval, sensors = usual_interval(recording.time), len(recording.output_names)
-    zero, one = torch.zeros(sensors, dtype=torch.float64), torch.eye(sensors, dtype=torch.float64)
-    error = torch.full_like(zero, (2.0 * FEWEST_SAMPLES) ** -0.5)  # of ln of a standard deviation
-    white = Whitening(zero, zero.new_zeros(0, sensors, sensors), one, FEWEST_SAMPLES, error)
-    draws = torch.Generator().manual_seed(0)
-    design = make_detector("cusum", false_alarms_every, interval, sensors, draws, learnt=white).design
-    return interval * FEWEST_SAMPLES * max(design.learning_factor(RATE_FACTOR), 1.0)
+    first, usual = float(recording.time[0]), 2.0 * LEARNING * time_scale(plant)
+    length = min(rounded_up(max(usual, FEWEST * recording.interval)), longest)
+    for _ in range(TRIALS):
+        part = fault_free_part(recording, first, first + length)
+        monitor = prepare_monitor(plant, part, time_between_false_alarms=false_alarms_every).monitor
+        learnt, asked = learning_times(monitor.noise, monitor.detector)
+        needed = rounded_up(asked + length - learnt)
+        if learnt >= asked or length >= longest:
+            break
+        length = min(rounded_up(MARGIN * needed), longest)
+    return length, needed
 
 
 def _inputs(plant: PlantDescription, sampling: float) -> str:

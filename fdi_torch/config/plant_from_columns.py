@@ -22,8 +22,8 @@ from fdi_torch.units import spelled
 HEIGHT = 0.6  # m, of a tank that is still to be measured
 AT_RIM = {"1": 1.0, "V": 10.0, "A": 0.02, "Pa": 9810.0 * HEIGHT}
 """Reading of a sensor at the rim, by the unit of its reading: 100 %, 10 V, 20 mA, water."""
-READING = re.compile(r"[LHX]|P[A-Z]|.*(level|füllstand|niveau|pegel|pressure|druck)", re.IGNORECASE)
-"""Tags of levels and pressures (ISA-5.1: PT, PI; P-101 is a pump), letters of levels by custom, and words."""
+READING = re.compile(r"[LHX]|P[DIRT]|.*(level|füllstand|niveau|pegel|pressure|druck)", re.IGNORECASE)
+"""Tags of levels and pressures (ISA-5.1: PT, PI; P-101 and PK are pumps), letters of levels by custom, and words."""
 COMMAND = re.compile(
     r".*(pump|valve|ventil|pwm|duty|cmd|command|speed|drehzahl)|[A-Z]+C\W?\d+\W?(out|op)$", re.IGNORECASE
 )

@@ -20,7 +20,7 @@ from torch import Tensor
 from fdi_torch.amounts import faults_in_words
 from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.monitor_file import MonitorRun
-from fdi_torch.config.problems import naming
+from fdi_torch.config.problems import naming, naming_source
 from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.jobs.monitor_rows import CLOCK, FROM_SOURCE, event_fields, samples_of_rows
 from fdi_torch.logbook import Listener, RunLog, as_array
@@ -265,7 +265,7 @@ def _positions(clock: Sequence[float], times: Sequence[tuple[float, bool]], test
 
 def _prepare(run: MonitorRun, whole: Recording, end: float) -> PreparedMonitor:
     c = run.config
-    with naming("fault_free"):
+    with naming_source(run.source), naming("fault_free"):
         part = usable_part(run.plant, fault_free_part(whole, *c.fault_free))
         if end <= c.fault_free[1]:
             raise ValueError(

@@ -224,7 +224,7 @@ class _Drawing:
         side = 0.5 if to_x > x else -0.5
         same = [c.name for c in flows if {c.source, c.target} == {component.source, component.target}]
         rise += LOWEST + 0.28 * same.index(component.name)
-        if y == to_y and abs(to_x - x) <= self.column:
+        if y == to_y and abs(to_x - x) < 1.01 * self.column:  # the next tank
             return [(x + side, y + rise), (to_x - side, to_y + rise)]
         if x == to_x and sketch.arrow:
             return self.route_beside((x - 0.5, y + rise), to_x, to_y)

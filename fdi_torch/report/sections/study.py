@@ -194,6 +194,7 @@ def _shown(value: Any, scale: float = 1.0) -> str | None:
 
 
 MOST_MODES = 64
+MOST_NAMED, LONGEST_MODE = 12, 24
 
 
 def isolation_section(material: Material) -> Section | None:
@@ -209,11 +210,14 @@ def isolation_section(material: Material) -> Section | None:
     )
     rows = [_row(k, labels, counts) for k in range(len(labels)) if counts[k].sum()]
     listed = table(["", "mode", "trials", "right", "most often taken for"], rows)
-    return Section("Isolation", [words, [Picture("isolation", matrix_panel(counts))], folded("The modes", listed)])
+    picture = Picture("isolation", matrix_panel(counts, labels))
+    return Section("Isolation", [words, [picture], folded("The modes", listed)])
 
 
-def matrix_panel(counts: np.ndarray) -> Figure:
-    """Share of each row (M, M) as a heat map; right answers are on the diagonal."""
+def matrix_panel(counts: np.ndarray, labels: Sequence[str] = ()) -> Figure:
+    """Share of each row (M, M) as a heat map; right answers are on the diagonal. labels: names of the modes, written
+    beside the rows if these are at most `MOST_NAMED`.
+    """
     figure, axes = panel("Stated against true", "stated mode", "true mode", height=4.0)
     share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     for row, column in np.argwhere(share > 0):
@@ -225,6 +229,9 @@ def matrix_panel(counts: np.ndarray) -> Figure:
     axes.grid(False)
     for side in (axes.xaxis, axes.yaxis):
         side.set_major_locator(MaxNLocator(8, integer=True, min_n_ticks=1))
+    if 0 < len(labels) <= MOST_NAMED:
+        named = [f"{short(label, LONGEST_MODE)}  {number}" for number, label in enumerate(labels, 1)]
+        axes.set_yticks(range(1, len(labels) + 1), named)
     return figure
 
 
