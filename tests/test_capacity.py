@@ -17,8 +17,10 @@ from fdi_torch.config.run_file import load_run
 from fdi_torch.config.study_file import load_study
 from fdi_torch.estimate.evolution import EvolutionSettings, evolve
 from fdi_torch.estimate.fitting import Fitting
+from fdi_torch.estimate.windows import cut_up
 from fdi_torch.jobs.run_setup import fitting_of, recordings_of, requested_space
 from fdi_torch.monitor.stepper import substeps
+from fdi_torch.recording import Recording
 from fdi_torch.simulate.experiment import grid_nodes
 from fdi_torch.simulate.step_control import ADDED_UP, StepControl
 
@@ -106,6 +108,13 @@ def test_steps_below_the_rounding_of_levels_are_refused(fitting: Fitting) -> Non
     plant = load_plant("three_tank")
     shortest = StepControl.for_tolerance(ADDED_UP * 2.0**-52 * 1.001, replace(plant)).resolution
     assert StepControl.for_fixed_step(1.01 * shortest, plant).resolution == pytest.approx(1.01 * shortest)
+
+
+def test_windows_shorter_than_a_sampling_interval(fitting: Fitting) -> None:
+    (recording,) = fitting.recordings
+    assert isinstance(recording, Recording) and len(cut_up(recording, 10.0)) == 10
+    with pytest.raises(ValueError, match=r"longer than the sampling interval \(1 s\), got 1e-09 s"):
+        cut_up(recording, 1e-9)
 
 
 def test_studies_and_rehearsals_that_no_machine_holds() -> None:

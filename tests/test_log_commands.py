@@ -14,13 +14,12 @@ import torch
 
 from fdi_torch import cli
 from fdi_torch.cli.options import inspect
-from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.run_file import load_run
 from fdi_torch.config.study_file import load_study
 from fdi_torch.jobs.replay import repeat_run
 from fdi_torch.jobs.study import run_study
 from fdi_torch.jobs.train import train
-from fdi_torch.logbook import Message, RunLog, read_run, replay
+from fdi_torch.logbook import LogError, Message, RunLog, read_run, replay
 from fdi_torch.logbook.export import FORMATS
 
 QUICK = [
@@ -319,8 +318,8 @@ def test_a_log_of_another_command_cannot_be_replayed(tmp_path: Path, capsys: pyt
     )
 
 
-def test_a_job_of_an_earlier_version_is_not_replayed_as_another(tmp_path: Path) -> None:
+def test_a_fit_window_by_window_is_not_replayed_as_another(tmp_path: Path) -> None:
     source = Path(__file__).parent / "data" / "log_format_1_windows.mcap"
-    with pytest.raises(ConfigError, match="got 'windows'"):
+    with pytest.raises(LogError, match="got one window by window"):
         repeat_run(read_run(source), tmp_path / "again.mcap")
     assert not list(tmp_path.iterdir())

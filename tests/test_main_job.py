@@ -167,6 +167,8 @@ def test_what_computes_on_the_cpu_says_so(tmp_path: Path, capsys: pytest.Capture
     on_gpu = ["--out", str(tmp_path), "--set", "device=cuda"]
     assert main(["simulate", *on_gpu]) == DONE
     assert "one simulation is computed on the CPU" in capsys.readouterr().err
+    assert main(["train", *on_gpu, "--set", "estimate.windows=100 s"]) == MISUSE
+    assert "device: expected cpu with estimate.windows, got cuda" in capsys.readouterr().err
 
 
 def test_an_unwritable_folder_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,11 +11,13 @@ from fdi_torch.config.loaded_recordings import named_recordings, read_recording
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.recording_config import RecordingConfig
+from fdi_torch.config.run_file import load_run
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.free_runs.prediction import predict
 from fdi_torch.gap.free_runs.refit import refit
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
+from fdi_torch.jobs.windowed_fit import fit_windows
 from fdi_torch.monitor.events import Event
 from fdi_torch.recording import Recording
 
@@ -61,6 +63,39 @@ def test_openings_of_the_valve_that_were_not_used_are_predicted_by_the_others(da
     assert abs(dead_zone - 0.137) < 3.0 * error < 0.06  # 0.1375 ± 0.0018 by another way, from all runs
     left_out = next(r for r in runs("dts200_trials") if "valve_60" in r.source)
     assert max(predict(found.plant, left_out, 3).rmse.values()) < 0.005
+
+
+def test_windows_with_open_drains_are_told_and_sized_from_levels_and_commands_alone(data: Path, tmp_path: Path) -> None:
+    """The first of five cycles; the recorded positions of the drains, which are not shown, are the truth."""
+    changes = ["recordings.0.start=300 s", "recordings.0.stop=480 s", f"output.folder={tmp_path}"]
+    found = fit_windows(load_run(REAL / "dts200_exp5_windows.yaml", changes))
+    truth = read_recording(RecordingConfig(file=EXP5), load_plant("dts200"), ROOT)
+    seen = 0
+    for place, valve, sensor in (("L", "vLD", "h1_L"), ("R", "vRD", "h2_R")):
+        opening = truth.inputs[:, truth.input_names.index(valve)]
+        level = truth.outputs[:, truth.output_names.index(sensor)]
+        for window in found.windows:
+            inside = (truth.time >= window.start) & (truth.time <= window.stop)
+            fault = next(f for f in window.faults if f.name == f"{place}.leak.size")
+            if float(opening[inside].max()) < 0.05:
+                assert fault.state != "present"
+            if float(opening[inside].min()) > 0.95 and float(level[inside].min()) > 0.05:
+                seen += 1
+                assert fault.state == "present"
+                assert 0.85 < fault.size < 1.2  # of the drain fully open
+                assert fault.flow is not None and 40e-6 < fault.flow < 130e-6
+    assert seen >= 4
+
+
+def test_a_hose_that_fills_is_no_leak(data: Path, tmp_path: Path) -> None:
+    """The first stroke of exp5: 80 cm^3 pumped at R while its level stands."""
+    found = fit_windows(
+        load_run(REAL / "dts200_exp5_windows.yaml", ["recordings.0.stop=40 s", f"output.folder={tmp_path}"])
+    )
+    states = {f.name: f for f in found.windows[0].faults}
+    assert states["R.leak.size"].state == "absent"
+    assert states["qR.pump_priming.volume"].state == "present"
+    assert 55e-6 < states["qR.pump_priming.volume"].size < 90e-6
 
 
 @pytest.mark.longest

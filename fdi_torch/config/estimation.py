@@ -91,6 +91,9 @@ class EstimationConfig(Strict):
     draws: int = Field(
         0, ge=0, le=1_000_000, description="draws from the posterior by an ensemble sampler (extra draws)"
     )
+    windows: Seconds | None = Field(
+        None, gt=0, description="length of windows that are fitted separately, s, for faults that come and go"
+    )
 
 
 def matching_names(pattern: str, plant: PlantDescription) -> list[str]:

@@ -65,6 +65,11 @@ def repeat_run(
 def replay_estimate(log: LoggedRun, path: Path, overrides: Sequence[str], tell: TellEndless, parent: str) -> None:
     """Repeat an estimation from the recordings in the log."""
     run = logged_run(log, overrides)
+    if run.config.estimate.windows is not None:
+        raise LogError(
+            f"{log.path}: expected a fit of whole recordings, got one window by window, which has no events to "
+            "compare; repeat it with fdi train"
+        )
     space, loaded = requested_space(run), logged_recordings(log, run)
     fitting = fitting_of(run, space, loaded)
     records = run.log_records(part.recording.origin for part in loaded)

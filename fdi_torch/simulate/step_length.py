@@ -52,7 +52,7 @@ def choose_step(
     points: Float[Tensor, "N P"],
     tolerance: Float[Tensor, " C"],
     ladder: list[float],
-    quantile: float,
+    quantile: float = 1.0,
 ) -> float:
     """The longest step (s) of a ladder at which readings of `points` (N, P) are accurate to `tolerance` (C,).
 

@@ -1,4 +1,4 @@
-"""Section about a fit window by window, in logs of earlier versions: when each fault was present, and how large."""
+"""Section about a window-by-window fit: when each suspected fault was present, and how large."""
 
 from __future__ import annotations
 
