@@ -253,7 +253,8 @@ def test_doubts_about_a_recording_come_first(
     (tmp_path / "files.yaml").write_text("recordings: [{file: run.csv, columns: {h1: {column: first_cm, unit: mm}}}]\n")
     here = ["--plant", "three_tank", "--recording", "files.yaml"]
     logs = []
-    for words in (["train", "--config", "train.yaml", "--set", "estimate.windows=150 s"], ["predict", *here]):
+    windows = ["train", "--config", "train.yaml", "--set", "estimate.windows=150 s"]
+    for words in (windows, ["predict", *here], ["refit", *here]):
         assert main(words) != MISUSE
         assert capsys.readouterr().out.splitlines()[:4] == terminal.splitlines()[:4], words
         assert main([*words, "--json"]) != MISUSE

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.config.loaded_recordings import LoadedRecording
+from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.run_file import Run
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
@@ -118,6 +119,9 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False, listener: Li
     interruption. listener: receives every log message.
     """
     tell = tell or silent
+    if run.config.estimate.windows is not None:
+        place = run.source.at("estimate.windows")
+        raise ConfigError([f"{place}: expected none, got {run.config.estimate.windows:g} s; fdi train fits windows"])
     space = requested_space(run)
     tell(0.0, "reading" if run.config.recordings else "simulating the recording")
     loaded = recordings_of(run)

@@ -206,7 +206,7 @@ def isolation_section(material: Material) -> Section | None:
     counts_ = [result.get(f"isolation.{name}", "?") for name in ("right", "trials", "missed", "false")]
     words = (
         "{} of {} modes stated correctly; {} faults missed, {} false faults. ".format(*counts_)
-        + "Row: true mode; column: stated mode; the table has their names."
+        + "Row: true mode; column: stated mode; the table has their full names."
     )
     rows = [_row(k, labels, counts) for k in range(len(labels)) if counts[k].sum()]
     listed = table(["", "mode", "trials", "right", "most often taken for"], rows)
@@ -218,7 +218,9 @@ def matrix_panel(counts: np.ndarray, labels: Sequence[str] = ()) -> Figure:
     """Share of each row (M, M) as a heat map; right answers are on the diagonal. labels: names of the modes, written
     beside the rows if these are at most `MOST_NAMED`.
     """
-    figure, axes = panel("Stated against true", "stated mode", "true mode", height=4.0)
+    named = 0 < len(labels) <= MOST_NAMED
+    rows, height = ("", 2.9) if named else ("true mode", 4.0)  # the names leave no room for a label beside them
+    figure, axes = panel("Stated against true", "stated mode", rows, height=height)
     share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     for row, column in np.argwhere(share > 0):
         strength = 0.15 + 0.85 * float(share[row, column])
@@ -229,9 +231,9 @@ def matrix_panel(counts: np.ndarray, labels: Sequence[str] = ()) -> Figure:
     axes.grid(False)
     for side in (axes.xaxis, axes.yaxis):
         side.set_major_locator(MaxNLocator(8, integer=True, min_n_ticks=1))
-    if 0 < len(labels) <= MOST_NAMED:
-        named = [f"{short(label, LONGEST_MODE)}  {number}" for number, label in enumerate(labels, 1)]
-        axes.set_yticks(range(1, len(labels) + 1), named)
+    if named:
+        names = [f"{short(label, LONGEST_MODE)}  {number}" for number, label in enumerate(labels, 1)]
+        axes.set_yticks(range(1, len(labels) + 1), names)
     return figure
 
 
