@@ -73,8 +73,7 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     if not problem.settings.named_only and (sensor := sensor_with_outliers(problem.outliers[0])):
         from_readings.append((UNKNOWN, sensor))
     free_form_fit = _free_form(posterior, reach)
-    sure = posterior.probabilities[0] >= CONTENT
-    verdict = verdict_of(credible_set, sure, from_readings)
+    verdict = verdict_of(credible_set, is_sure(posterior), from_readings)
     progress(0.8, "hold-out")
     diagnosis = DiagnosisResult(
         fitter,
@@ -94,10 +93,19 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     return replace(answer, remarks=[*dict.fromkeys(problem.remarks), *answer.remarks])
 
 
+def is_sure(posterior: Posterior) -> bool:
+    """Whether the likeliest hypothesis has 95 % and, if it names causes, its fit has converged.
+
+    Laplace's approximation holds at a maximum. Away from it, the evidence and the sizes depend on where the fit ended.
+    """
+    best = posterior.best
+    return posterior.probabilities[0] >= CONTENT and (not best.causes or best.fit.converged)
+
+
 def verdict_of(credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: Sequence[CauseName]) -> Verdict:
     """The verdict of a credible set of hypotheses.
 
-    sure: whether the likeliest alone has 95 %. from_readings: causes that the readings show without a model.
+    sure: as `is_sure`. from_readings: causes that the readings show without a model.
     """
     best = credible_set[0]
     if not best.causes and not best.unknown and not from_readings:

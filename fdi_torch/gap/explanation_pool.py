@@ -94,6 +94,7 @@ class ExplanationPool:
             # The search for the correlation time, which takes longest, begins where the rest has converged.
             climb = not gain > TOLERANCE
             fit, start = (best.fit, best.noise) if climb else (there.fit, there.noise)
+        best = replace(best, fit=replace(best.fit, converged=best.fitter.converged(best.fit)))
         if before is None or best.log_evidence > before.log_evidence:
             self.explanations[fit.key] = best
         self.progress.step()
