@@ -159,6 +159,7 @@ def test_an_explanation_whose_fit_has_not_converged_says_so() -> None:
         "There is a gap; the likeliest is leak at T1, probability over 99.9 %. "
         "Its fit has not converged, so that its sizes and its probability may be wrong."
     )
+    assert not any("two explanations" in step for step in next_steps(answer, True, None, None, None))
 
 
 def test_where_the_plant_as_it_is_remains_plausible_there_may_be_a_gap() -> None:
