@@ -45,7 +45,7 @@ class ParameterName:
 
     @staticmethod
     def of_effect(text: str) -> ParameterName:
-        """'T1.leak', which means the leak's size, or 'T1.leak.size'; the field of the former is ''."""
+        """The name of an effect ('T1.leak', with an empty field) or of one of its parameters ('T1.leak.size')."""
         return ParameterName.parse(text if text.count(".") != 1 else f"{text}.")
 
     def __str__(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -82,6 +83,12 @@ def significant(value: float, digits: int) -> str:
     """A number with significant digits, such as '0.0123'; with an exponent only below 1e-4 and from 1e6 on."""
     text = f"{value:.{digits}g}"
     return f"{float(text):.0f}" if "e+" in text and abs(value) < 1e6 else text
+
+
+def rounded_up(value: float) -> float:
+    """The value rounded up to two digits."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.ceil(value / unit - 1e-9) * unit
 
 
 def quantity_text(value: float, si_unit: str, digits: int = 4, name: str = "") -> str:

@@ -1,6 +1,6 @@
 """Display of results in a session: a headline and a table, as text, as HTML, and for pandas.
 
-Results show numbers in the units for display of the context in which they were made: those of plant and recording.
+Numbers are shown in the units of the plant file and of the recording from which the result was computed.
 """
 
 from __future__ import annotations

@@ -74,12 +74,12 @@ def same_kind(unit: str, among: tuple[str, ...]) -> str | None:
     """The first unit of `among` with the dimension of `unit`; None for another dimension or a text that is no unit."""
     try:
         dimension = _parsed(unit).dimensionality
-        found = next((other for other in among if _parsed(other).dimensionality == dimension), None)
-        if found is not None:
-            factor(unit, found)  # of a finite size
+        same = next((other for other in among if _parsed(other).dimensionality == dimension), None)
+        if same is not None:
+            factor(unit, same)  # of a finite size
     except UnitError:
         return None
-    return found
+    return same
 
 
 def in_unit(number: float, unit: str, target: str) -> float:

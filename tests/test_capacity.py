@@ -83,7 +83,8 @@ def test_searches_that_no_machine_holds(settings: EvolutionSettings, what: str) 
 @pytest.mark.parametrize("change", ["duration=1e12 s", "sample_time=1e-12 s", "sample_time=1e-320 s"])
 def test_simulations_that_no_machine_holds(change: str) -> None:
     run = load_run(None, [f"simulate.{change}"])
-    with pytest.raises(ConfigError, match=r"default.yaml: simulate: expected work that fits into .* got \S+ samples"):
+    where = rf"default.yaml with --set simulate.{change}: simulate"
+    with pytest.raises(ConfigError, match=rf"{where}: expected work that fits into .* got \S+ samples"):
         recordings_of(run)
 
 

@@ -121,12 +121,15 @@ def test_check_shows_channels_and_findings(rig: str, capsys: pytest.CaptureFixtu
     [
         (
             "simulate.faults.T1.leek=0.3",
-            "simulate.faults: expected a parameter of the plant or its faults, got 'T1.leek'",
+            "simulate.faults.T1.leek: expected a parameter of the plant or its faults, got 'T1.leek'",
         ),
         ("simulate.faults.T1.leak=30", "simulate.faults.T1.leak: expected a size from 0 to 1, got 30"),
         ("simulate.duration=600", "simulate.duration: expected a quantity in s, got the bare number 600"),
         ("foo=1", "expected a known key (plant, recordings, "),
         ("estimate.search={population: 2}", "estimate.search: expected a population of at least 4"),
+        ("simulate.noise.std.hh1=1 mm", "simulate.noise.std.hh1: expected an output of the plant (h1, h2, h3)"),
+        ("estimate.search.populaton=40", "estimate.search: expected a known key (strategy, population"),
+        ("plant=three_tnak", "plant: expected a plant file (.yaml) or a shipped plant"),
     ],
 )
 def test_a_wrong_value_of_the_option_set_is_not_blamed_on_the_file(
@@ -134,6 +137,13 @@ def test_a_wrong_value_of_the_option_set_is_not_blamed_on_the_file(
 ) -> None:
     assert cli.main(["simulate", "--quiet", "--set", "seed=3", "--set", override]) == cli.MISUSE
     assert f"fdi simulate: --set {override}: {told}" in capsys.readouterr().err
+
+
+def test_an_override_within_what_is_wrong_is_named_beside_the_file(capsys: pytest.CaptureFixture[str]) -> None:
+    """The file gives the keys around it, and the two may be wrong only together."""
+    assert cli.main(["simulate", "--quiet", "--set", "seed=3", "--set", "estimate.search.population=2"]) == cli.MISUSE
+    said = capsys.readouterr().err
+    assert "default.yaml with --set estimate.search.population=2: estimate.search: expected a population" in said
 
 
 def test_a_mistake_in_the_file_is_blamed_on_it_beside_the_option_set(
@@ -346,6 +356,19 @@ def test_gap_asks_whether_the_adopted_file_can_be_written_before_it_searches(
         words = ["gap", "--plant", "three_tank", "--recording", rig, "--adopt", target]
         assert cli.main(words) == cli.MISUSE
         assert f"fdi gap: {target}: {reason}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["gap", "refit"])
+def test_adopt_overwrites_a_file_only_where_it_is_told_to(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, rig: str, command: str
+) -> None:
+    monkeypatch.setattr("fdi_torch.cli.gap.run_gap", lambda *given: pytest.fail("searched"))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "better.yaml").write_text("mine")
+    words = [command, "--plant", "three_tank", "--recording", rig, "--adopt", "better.yaml"]
+    assert cli.main(words) == cli.MISUSE
+    assert "better.yaml: expected a new file for --adopt, but it exists" in capsys.readouterr().err
+    assert (tmp_path / "better.yaml").read_text() == "mine"
 
 
 def test_short_options_become_overrides_and_win() -> None:

@@ -16,7 +16,8 @@ from fdi_torch.config.logged_config import logged_plant
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.gap.answer import Amount, Answer, Cause, adopted
-from fdi_torch.gap.diagnose import Settings
+from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.stage_progress import StageProgress
 from fdi_torch.jobs.gap import run_gap
 from fdi_torch.jobs.replay import settings_of
 from fdi_torch.logbook import own_signals, read_run, series
@@ -59,6 +60,33 @@ def test_the_log_tells_the_likeliest_causes_while_they_are_searched(logged: Path
     said = [message.payload["message"] for message in read_run(logged).messages("/log")]
     assert "which effects, so far pump gain at Q2" in said
     assert "where, so far pump gain at Q2" in said
+
+
+def test_the_share_done_follows_the_steps_and_never_falls() -> None:
+    """The steps known so far grow with what is found."""
+    told: list[tuple[float, str]] = []
+    progress = StageProgress(lambda share, text: told.append((share, text)), "where", 0.6, 0.8)
+    progress.remaining(4)
+    progress.step()
+    progress.so_far({("leak", "T1")})
+    progress.remaining(8)
+    for _ in range(10):
+        progress.step()
+    shares = [share for share, _ in told]
+    assert shares[:3] == pytest.approx([0.65] * 3) and shares[3] == pytest.approx(0.6 + 0.2 * 3 / 9)
+    assert shares == sorted(shares) and shares[-1] == 0.8
+    assert [text for _, text in told[:2]] == ["where", "where, so far leak at T1"]
+
+
+def test_the_progress_of_a_diagnosis_moves_on_within_its_stages() -> None:
+    told: list[tuple[float, str]] = []
+    recording = recorded(GAIN, 3, samples=400)
+    library = Settings(library=("leak", "pump_gain"))
+    diagnose(nominal_plant(), recording, settings=library, progress=lambda share, text: told.append((share, text)))
+    shares = [share for share, _ in told]
+    assert shares == sorted(shares) and shares[-1] <= 1.0
+    for begin, end in ((0.2, 0.6), (0.6, 0.8)):
+        assert len({share for share in shares if begin < share < end}) > 2
 
 
 def test_a_verdict_replays_from_its_log_to_the_last_bit(logged: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,9 +17,10 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.cause_hypothesis import CauseHypothesis, influence
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
-from fdi_torch.gap.diagnose import Settings, diagnose, verdict_of
+from fdi_torch.gap.diagnose import Settings, diagnose, is_sure, verdict_of
 from fdi_torch.gap.localization.regressors import lagged
 from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior
+from fdi_torch.gap.posterior import Posterior
 from tests.rigs import three_tank
 from tests.test_gap import nominal_plant, recorded
 
@@ -84,6 +86,15 @@ def test_no_gap_needs_95_percent_as_any_other_verdict() -> None:
     assert verdict_of([nothing, leak], False, []) == "ambiguous"
     assert verdict_of([nothing, leak], False, [("unknown", "h1")]) == "unknown"
     assert verdict_of([leak], True, []) == "named"
+
+
+def test_causes_are_named_only_by_a_fit_that_has_converged() -> None:
+    for converged in (True, False):
+        explanation: Any = SimpleNamespace(fit=SimpleNamespace(converged=converged))
+        leak, nothing = (CauseHypothesis(explanation, causes, 0.0) for causes in ((("leak", "T1"),), ()))
+        assert is_sure(Posterior((leak,), (0.96,), 0.04, ())) is converged
+        assert is_sure(Posterior((nothing,), (0.96,), 0.04, ())), "nothing is named"
+        assert not is_sure(Posterior((leak, nothing), (0.94, 0.06), 0.0, ()))
 
 
 @pytest.mark.slow

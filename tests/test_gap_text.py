@@ -152,6 +152,16 @@ def test_a_single_explanation_that_does_not_suffice_states_the_unfitted_probabil
     )
 
 
+def test_an_explanation_whose_fit_has_not_converged_says_so() -> None:
+    alone = [ProbableExplanation((("leak", "T1"),), 0.9999)]
+    answer = replace(BOTH, verdict="ambiguous", ambiguity_set=[alone[0].causes], posterior=alone, converged=False)
+    assert verdict_sentence(answer.to_dict()) == (
+        "There is a gap; the likeliest is leak at T1, probability over 99.9 %. "
+        "Its fit has not converged, so that its sizes and its probability may be wrong."
+    )
+    assert not any("two explanations" in step for step in next_steps(answer, True, None, None, None))
+
+
 def test_where_the_plant_as_it_is_remains_plausible_there_may_be_a_gap() -> None:
     posterior = [ProbableExplanation((), 0.88), ProbableExplanation((("unknown", "T1"),), 0.11)]
     answer = replace(BOTH, verdict="ambiguous", ambiguity_set=[(), (("unknown", "T1"),)], posterior=posterior)

@@ -32,6 +32,7 @@ from fdi_torch.config.loaded_recordings import known_segments_of, read_recording
 from fdi_torch.config.logged_config import logged_plant
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import dump_plant
+from fdi_torch.config.problems import Source
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.run_file import build_run
 from fdi_torch.config.simulation import planned_recording
@@ -67,7 +68,7 @@ def read_plant(data: bytes, folder: Path) -> None:
 
 
 def read_run_file(data: bytes, folder: Path) -> None:
-    run = build_run(parse_yaml(data, "run.yaml"), folder, "run.yaml")
+    run = build_run(parse_yaml(data, "run.yaml"), folder, Source("run.yaml"))
     requested_space(run)
     if run.config.simulate is not None:
         planned_recording(run.config.simulate, run.plant)
@@ -76,7 +77,7 @@ def read_run_file(data: bytes, folder: Path) -> None:
 
 
 def read_study(data: bytes, folder: Path) -> None:
-    build_study(parse_yaml(data, "study.yaml"), folder, "study.yaml")
+    build_study(parse_yaml(data, "study.yaml"), folder, Source("study.yaml"))
 
 
 def read_csv(data: bytes, folder: Path) -> None:

@@ -19,6 +19,7 @@ from fdi_torch import Pipe, PlacedEffect, Plant, Pump, Recording, Sensor, Tank
 from fdi_torch.config import plant_in_code
 from fdi_torch.config.plant_file import build_plant
 from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.problems import Source
 from fdi_torch.config.run_file import build_run
 from fdi_torch.config.yaml_files import shipped_plants
 from fdi_torch.quantities import displayed_in
@@ -451,7 +452,7 @@ def test_the_traceback_of_a_mistake_shows_its_message_alone(here: Path, what: st
 
 def test_one_recording_and_one_effect_need_no_list(tmp_path: Path) -> None:
     blank, estimate = simulated(), {"parameters": ["A.leak"]}
-    run = build_run({"plant": RIG, "recordings": blank, "estimate": estimate}, tmp_path, "train")
+    run = build_run({"plant": RIG, "recordings": blank, "estimate": estimate}, tmp_path, Source("train"))
     assert [recording is blank for recording in run.given.values()] == [True]
     found = fdi_torch.gap(RIG, blank, library="leak", out=tmp_path)
     assert found.answer.verdict

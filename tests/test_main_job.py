@@ -273,13 +273,14 @@ KILLED = """
 import os, signal, sys, time
 import yaml
 from pathlib import Path
+from fdi_torch.config.problems import Source
 from fdi_torch.config.run_file import build_run
 from fdi_torch.jobs.train import TrainResult, train
 def tell(share, text):
     if f"generation {sys.argv[2]}," in text:
         time.sleep(1.2)
         os.kill(os.getpid(), signal.SIGKILL)
-train(build_run(yaml.safe_load(sys.argv[1]), Path.cwd(), "default.yaml"), tell)
+train(build_run(yaml.safe_load(sys.argv[1]), Path.cwd(), Source("default.yaml")), tell)
 """
 
 

@@ -275,7 +275,10 @@ def test_a_fault_free_part_that_is_none_is_named(
 ) -> None:
     written(tmp_path / "rig.csv")
     assert main(["monitor", "--config", config(tmp_path, fault_free=part), "--quiet"]) == 2
-    assert capsys.readouterr().err.startswith(f"fdi monitor: fault_free: {tmp_path}")
+    assert f"watch.yaml: fault_free: {tmp_path}" in capsys.readouterr().err
+    override = f"fault_free=[{', '.join(part)}]"
+    assert main(["monitor", "--config", config(tmp_path), "--set", override, "--quiet"]) == 2
+    assert capsys.readouterr().err.startswith(f"fdi monitor: --set {override}: fault_free: {tmp_path}")
 
 
 def test_a_fault_that_was_there_before_the_recording_is_said_to_be(

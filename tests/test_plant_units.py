@@ -250,6 +250,20 @@ def test_doubts_about_a_recording_come_first(
     assert terminal.splitlines()[:4] == ["Doubts about the recording:", *(f"- {sentence}" for sentence in said), ""]
     page = fdi_torch.report("logs/train.mcap").page.read_text()
     assert all(page.index(doubt) < page.index("<svg") for doubt in doubts)
+    (tmp_path / "files.yaml").write_text("recordings: [{file: run.csv, columns: {h1: {column: first_cm, unit: mm}}}]\n")
+    here = ["--plant", "three_tank", "--recording", "files.yaml"]
+    logs = []
+    windows = ["train", "--config", "train.yaml", "--set", "estimate.windows=150 s"]
+    for words in (windows, ["predict", *here], ["refit", *here]):
+        assert main(words) != MISUSE
+        assert capsys.readouterr().out.splitlines()[:4] == terminal.splitlines()[:4], words
+        assert main([*words, "--json"]) != MISUSE
+        result = json.loads(capsys.readouterr().out)
+        assert result["doubts"] == said, words
+        logs.append(result.get("log"))
+    page = fdi_torch.report(logs[0]).page.read_text()
+    assert "window" in page and all(page.index(doubt) < page.index("<table") for doubt in doubts)
+    assert fdi_torch.predict("three_tank", replace(run, outputs=run.outputs * torch.tensor([0.1, 1.0, 1.0]))).doubts
 
 
 def test_flows_follow_from_levels_not_from_readings(folder: Path) -> None:

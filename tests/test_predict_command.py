@@ -97,15 +97,16 @@ def test_a_plant_that_does_not_explain_the_recording_is_said_first(
     shown = capsys.readouterr().out
     warning = "Unreliable: the model does not explain the recording (residuals 19 times the sensors' noise)"
     assert (
-        shown.startswith(f"{warning}.\n- next: fdi gap distinguishes")
-        and warning[:40] in (folder / "run.svg").read_text()
+        f"\n\n{warning}.\n- next: fdi gap distinguishes" in shown and warning[:40] in (folder / "run.svg").read_text()
     )
     assert "constants with a tolerance" not in shown
     (folder / "uncertain.yaml").write_text((folder / "rig.yaml").read_text() + 'tolerances: {"*.area": 10 %}\n')
     assert main([*words, "--plant", "uncertain.yaml"]) == NOT_EXPLAINED
     assert "have the values of the plant file here; fdi refit --adopt fits them" in capsys.readouterr().out
     run = fdi_torch.predict("rig.yaml", "novalve.csv", start_samples=3)
-    assert run.headline == f"{warning}; free run of rig along {folder / 'novalve.csv'}"
+    doubt = "t: the sampling interval of 1 s varies by up to 1 s"
+    assert shown.startswith(f"Doubts about the recording:\n- {doubt}\n\n") and run.doubts == (doubt,)
+    assert run.headline == f"{warning}; free run of rig along {folder / 'novalve.csv'}; {doubt}"
 
 
 def test_of_several_recordings_the_one_that_is_not_explained_is_named(
@@ -116,7 +117,11 @@ def test_of_several_recordings_the_one_that_is_not_explained_is_named(
     words = ["predict", "--plant", "rig.yaml", "--start-samples", "3"]
     assert main([*words, "fast.csv", "novalve.csv"]) == NOT_EXPLAINED
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("Unreliable") and lines[1] == "- of 2 free runs, that along fast.csv is the worst"
+    first = lines.index("") + 1
+    assert (
+        lines[first].startswith("Unreliable")
+        and lines[first + 1] == "- of 2 free runs, that along fast.csv is the worst"
+    )
     assert main([*words, "fast.csv"]) == NOT_EXPLAINED
     assert "the worst" not in capsys.readouterr().out
 

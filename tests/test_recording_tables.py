@@ -22,6 +22,7 @@ from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.recording import Recording
 from fdi_torch.recordings import parquet as parquet_reader
+from fdi_torch.recordings import table_files
 from fdi_torch.recordings.csv_files import read_csv
 from fdi_torch.recordings.source import ChannelSource
 
@@ -86,6 +87,16 @@ NUMBERS: Columns = {
     "Q1_cm3_s": [50.0, 50.25, 49.9, 0.7],
     "h1_cm": [10.12345678901234, None, -0.5, 12.0],
 }
+
+
+def test_each_format_has_a_writer_here(tmp_path: Path) -> None:
+    modules = set()
+    for ending, write in FORMATS.items():
+        write(path := tmp_path / f"run.{ending}", NUMBERS)
+        known = table_files.format_of(path.read_bytes()[:16])
+        assert known
+        modules.add(known.module)
+    assert modules == {known.module for known in table_files.FORMATS}
 
 
 @pytest.mark.parametrize("ending", FORMATS)

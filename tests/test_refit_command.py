@@ -64,7 +64,7 @@ def test_a_calibration_reports_how_far_constants_moved_and_writes_what_was_learn
 
     right = replace(wrong, pumps=rig.pumps, tolerances={"Q2.gain": 0.03, "T1.area": 1e-6})
     (here / "wrong.yaml").write_text(dump_plant(right))
-    assert cli.main([*words, "--narrow"]) == cli.DONE
+    assert cli.main([*words, "--narrow", "--replace"]) == cli.DONE
     shown = capsys.readouterr().out
     assert "constants fitted  unit" in shown and "effects" not in shown
     assert re.search(r"- Q2\.gain lies 3\.\d tolerances from its value in the plant file", shown)

@@ -8,8 +8,10 @@ import pytest
 import torch
 
 from fdi_torch.config.plant_file import build_plant
+from fdi_torch.config.problems import ConfigError, Source
 from fdi_torch.config.run_file import Run, build_run
 from fdi_torch.estimate.windows import Window, WindowFault, cut_up, noise_of, state_of, stretches_of
+from fdi_torch.jobs.train import train
 from fdi_torch.jobs.windowed_fit import fit_windows
 from fdi_torch.recording import Recording
 
@@ -82,7 +84,13 @@ def leaking(folder: Path, duration: str, step: str) -> Run:
         },
         "output": {"folder": str(folder)},
     }
-    return build_run(simulated, folder, "windows.yaml")
+    return build_run(simulated, folder, Source("windows.yaml"))
+
+
+def test_a_fit_of_whole_recordings_refuses_windows_instead_of_ignoring_them(tmp_path: Path) -> None:
+    keys = {"plant": "three_tank", "simulate": {"duration": "100 s"}, "estimate": {"windows": "50 s"}}
+    with pytest.raises(ConfigError, match="windows: expected none, got 50 s; fdi train fits windows"):
+        train(build_run(keys, tmp_path, Source("train")))
 
 
 def test_the_step_is_the_one_asked_for(tmp_path: Path) -> None:
@@ -118,7 +126,7 @@ def test_levels_at_rest_do_not_tell_four_faults_apart(tmp_path: Path) -> None:
         },
         "output": {"folder": str(tmp_path)},
     }
-    found = fit_windows(build_run(rest, tmp_path, "rest.yaml"))
+    found = fit_windows(build_run(rest, tmp_path, Source("rest.yaml")))
     (window,) = found.windows
     assert window.faults[0].size == 0.0 and all(f.std > 0.08 for f in window.faults) and not found.stretches
 

@@ -73,7 +73,7 @@ class CaseDraft:
 
 
 def plans(cases: int, seed: int, kinds: Sequence[str]) -> list[CasePlan]:
-    """Plans with the kinds in turn, shuffled anew each round, so that a case's number does not reveal its kind."""
+    """Plans of cases: rounds with one case of each kind, in random order, so that a number does not reveal its kind."""
     unknown = [k for k in kinds if k not in KINDS]
     if unknown or not kinds:
         raise ValueError(

@@ -263,9 +263,9 @@ UNKNOWN = (
 
 def unknown_to(library: Collection[str]) -> tuple[Unknown, ...]:
     """The laws that a library of these effects does not contain."""
-    left = tuple(u for u in UNKNOWN if not set(u.aliases) & set(library))
-    if not left:
+    outside = tuple(u for u in UNKNOWN if not set(u.aliases) & set(library))
+    if not outside:
         raise ValueError(
             "expected a library that lacks some effect, got one that names all; leave 'unknown' out of kinds"
         )
-    return left
+    return outside

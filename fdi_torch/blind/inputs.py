@@ -199,7 +199,7 @@ def draw_control(
     """The control of one level, for recordings with the lengths of `levels` ((T, N) m, undisturbed, open loop).
 
     limits (M, 2): lowest and highest flow of each pump, quantum (M,): its smallest change, m^3/s. Set points lie
-    between the fifth and the four fifths of the levels that the open loop reaches, so that the pump can hold them.
+    between the quantiles of 20 and 80 % of the levels in open loop, so that the pump can hold them.
     Raises ValueError where no pump feeds a measured tank.
     """
     tanks, measured = [t.name for t in plant.tanks], {s.tank for s in plant.sensors}

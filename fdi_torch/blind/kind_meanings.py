@@ -6,7 +6,7 @@ KIND_MEANINGS = {
     "coloured": "one effect, correlated noise",
     "null": "no discrepancy",
     "pair": "two effects",
-    "unknown": "a law outside the library: the right answer is `unknown` at its location",
+    "unknown": "a law outside the library: the right answer is unknown at its location",
     "messy": "one full effect and three weak ones",
     "poor": "one effect, inputs with little excitation",
     "twins": "one of several nearly collinear effects",

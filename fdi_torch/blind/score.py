@@ -121,7 +121,7 @@ def _judge_unknown(
 
 
 def _judge_messy(full: Cause, causes: list[Cause], verdict: Any) -> Row:
-    """Scores of a case with one effect of full size among faint ones: only the former has to be named."""
+    """Scores of a case with one effect of full size among faint ones, which need not be named."""
     return {
         "right": full in causes,
         "place": any(place == full[1] for _, place in causes),

@@ -125,7 +125,7 @@ def _carried_out(name: str, words: list[str]) -> int:
         if arguments.traceback:
             raise
         for problem in getattr(error, "problems", [str(error)]):
-            screen.complain(f"fdi {name}: {_of_option(problem, getattr(arguments, 'set', None) or ())}")
+            screen.complain(f"fdi {name}: {problem}")
         return MISUSE
     except (MemoryError, RuntimeError) as error:
         sentence = _resource_problem(error)
@@ -133,19 +133,6 @@ def _carried_out(name: str, words: list[str]) -> int:
             raise
         screen.complain(f"fdi {name}: {sentence}")
         return MISUSE
-
-
-def _of_option(problem: str, overrides: Sequence[str]) -> str:
-    """The problem, said of --set in place of the file if it is about a key or value given there."""
-    _, _, said = problem.partition(": ")
-    place = said.partition(": ")[0] if " " not in said.partition(": ")[0] else ""
-    for override in overrides:
-        key = override.partition("=")[0]
-        rest = key.removeprefix(f"{place}.") if place else key
-        within = f"{place}.".startswith(f"{key}.")
-        if within or (key.startswith(place) and f"got '{rest}'" in said):
-            return f"--set {override}: {said}"
-    return problem
 
 
 def _resource_problem(error: Exception) -> str:

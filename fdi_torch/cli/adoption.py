@@ -9,8 +9,19 @@ from pathlib import Path
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant_patch import patched_plant
 from fdi_torch.config.yaml_files import find_plant
-from fdi_torch.disk import write_text
+from fdi_torch.disk import expect_writable, write_text
 from fdi_torch.plant.description import PlantDescription
+
+
+def expect_adoptable(target: str | None, replace: bool) -> None:
+    """Raises ValueError if the file of --adopt exists and --replace is not given, before long work for it."""
+    if target is None:
+        return
+    if Path(target).is_file() and not replace:
+        raise ValueError(
+            f"{target}: expected a new file for --adopt, but it exists; choose another name, or add --replace"
+        )
+    expect_writable(Path(target))
 
 
 def write_adopted(

@@ -9,12 +9,12 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.estimate.misfit import Misfit
 
 
-def say_first(misfit: Misfit, screen: Screen, *hints: str, doubts: Sequence[str] = ()) -> None:
-    """Print the warning, doubts and what to do next if the model does not explain the recording."""
+def say_first(misfit: Misfit, screen: Screen, *hints: str, about: Sequence[str] = ()) -> None:
+    """Print the warning, what it is about and what to do next if the model does not explain the recording."""
     if misfit.warning:
         screen.say(f"{misfit.warning}.")
-        for doubt in doubts:
-            screen.say(f"- {doubt}")
+        for sentence in about:
+            screen.say(f"- {sentence}")
         gap = (
             "next: fdi gap distinguishes random disturbances of the flows from an error of the plant file, and names "
             "its place and cause"

@@ -16,14 +16,14 @@ from contextlib import suppress
 from pathlib import Path
 
 from fdi_torch.cli import DONE
-from fdi_torch.cli.adoption import write_adopted
+from fdi_torch.cli.adoption import expect_adoptable, write_adopted
 from fdi_torch.cli.gap_text import next_steps, show
 from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.clock import show_clock
 from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant_file import chosen_plant
-from fdi_torch.disk import expect_writable, write_text
+from fdi_torch.disk import write_text
 from fdi_torch.gap.answer import UNKNOWN, Answer, adopted
 from fdi_torch.gap.diagnose import Settings
 from fdi_torch.gap.experiment_design import planned_recording
@@ -51,8 +51,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     show_clock(r.clock_zero for r in recordings)
     library = library_entries(names(arguments.library)) or None
     settings = Settings(library, names(arguments.leave_out), arguments.step, arguments.most, arguments.named_only)
-    if arguments.adopt:
-        expect_writable(Path(arguments.adopt))
+    expect_adoptable(arguments.adopt, arguments.replace)
     arguments.with_constants |= arguments.narrow
     folder = Path(arguments.out)
     log = free_path(folder, "gap")
@@ -123,7 +122,7 @@ def _errors(answer: Answer) -> dict[str, float]:
 
 
 def _written(plant: PlantDescription, answer: Answer, folder: Path) -> Path | None:
-    """Write gap.json, and next_input.csv if several explanations are plausible. Returns the path of the latter."""
+    """Write gap.json and, if several explanations are plausible, next_input.csv, whose path is returned."""
     write_text(folder / "gap.json", json.dumps(answer.to_dict(), indent=1) + "\n")
     if not answer.next_input:
         return None

@@ -81,7 +81,7 @@ def next_steps(
         samples = answer.next_input.get("parted_after_samples")
         when = f"after some {samples} samples" if samples else "in a longer run"
         steps.append(f"record the input {planned}; it should distinguish the two likeliest explanations {when}")
-    elif answer.verdict == "ambiguous":
+    elif answer.verdict == "ambiguous" and len(answer.ambiguity_set) > 1:
         steps.append("no input within the limits of pumps and levels soon distinguishes the two explanations")
     if answer.verdict == "unknown" and library is None:
         steps.append("--library all also searches the other effects; the report draws the discrepancy's shape")

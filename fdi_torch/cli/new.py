@@ -1,6 +1,6 @@
 """`fdi new`: what it does and prints. Its options: `options/new.py`.
 
-Path: cli.new.run → config.file_templates.template (or config.file_templates.plant_from_recording)
+Path: cli.new.run → config.file_templates.template (or config.plant_from_columns.plant_from_recording)
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def _text(arguments: argparse.Namespace, name: str) -> str:
 
         return template(arguments.kind, chosen_plant(arguments.plant), arguments.plant, name, arguments.recording)
     if arguments.recording:
-        from fdi_torch.config.file_templates import plant_from_recording
+        from fdi_torch.config.plant_from_columns import plant_from_recording
         from fdi_torch.config.yaml_files import find_data
 
         return plant_from_recording(find_data(arguments.recording, Path.cwd()), name)

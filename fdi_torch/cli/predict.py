@@ -1,7 +1,7 @@
 """`fdi predict`: what it does and prints. Its options: `options/predict.py`.
 
 Path: cli.predict.run → config.loaded_recordings.named_recordings → gap.free_runs.prediction.predict →
-estimate.misfit.misfit_of → recordings.plant_limits.denied_by → cli.explained.say_first → report.fit_figure.fit_figure
+estimate.misfit.misfit_of → recordings.check.doubts_about → cli.explained.say_first → report.fit_figure.fit_figure
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from fdi_torch.cli.explained import exit_code, say_first
+from fdi_torch.cli.explained import exit_code, say_doubts, say_first
 from fdi_torch.cli.gap_text import MOVED
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.channels import expect_columns
@@ -27,7 +27,7 @@ from fdi_torch.gap.free_runs.prediction import Prediction, predict
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.plant_limits import denied_by
+from fdi_torch.recordings.check import doubts_about
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import save
 
@@ -40,8 +40,6 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     if not names:
         raise ValueError("expected a recording, got none; name a CSV, MCAP or YAML file")
     recordings = [r for name in names for r in _recordings(name, plant, arguments)]
-    for note in dict.fromkeys(note for r in recordings for note in r.notes):
-        screen.note(note)
     with screen.progress("predict") as advance:
         predictions = []
         for k, recording in enumerate(recordings):
@@ -52,9 +50,10 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     worst = max(misfits, key=lambda misfit: misfit.ratio)
     name = Path(recordings[misfits.index(worst)].source).name
     which = [f"of {len(recordings)} free runs, that along {name} is the worst"] if len(recordings) > 1 else []
-    doubts = [rim.text for rim in denied_by(plant, recordings)]
     calibrate = ["constants with a tolerance have the values of the plant file here; fdi refit --adopt fits them"]
-    say_first(worst, screen, *(calibrate if plant.tolerances else []), doubts=[*which, *doubts])
+    doubts = doubts_about(recordings, plant)
+    say_doubts(doubts, screen)
+    say_first(worst, screen, *(calibrate if plant.tolerances else []), about=which)
     first = (
         f"the first {arguments.start_samples} samples"
         if arguments.settle is None

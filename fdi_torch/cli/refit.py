@@ -14,8 +14,8 @@ from pathlib import Path
 import torch
 
 from fdi_torch.amounts import rounded
-from fdi_torch.cli.adoption import write_adopted
-from fdi_torch.cli.explained import exit_code, say_first
+from fdi_torch.cli.adoption import expect_adoptable, write_adopted
+from fdi_torch.cli.explained import exit_code, say_doubts, say_first
 from fdi_torch.cli.gap_text import MOVED
 from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
@@ -32,6 +32,7 @@ from fdi_torch.names import counted
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_unit, parse_level_deviation
+from fdi_torch.recordings.check import doubts_about
 
 DISTURBED = (
     "the standard errors below take the residual for noise of the sensors; fdi gap --adopt FILE --narrow calibrates "
@@ -41,10 +42,9 @@ DISTURBED = (
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     plant = chosen_plant(arguments.plant)
+    expect_adoptable(arguments.adopt, arguments.replace)
     recordings = named_recordings(arguments.recording, plant, Path.cwd())
     holdouts = [r for name in arguments.holdout for r in named_recordings(name, plant, Path.cwd())]
-    for note in dict.fromkeys(note for r in (*recordings, *holdouts) for note in r.notes):
-        screen.note(note)
     white = parse_level_deviation(arguments.white, "--white") if arguments.white else None
     hold, vary, leave_out = (names(text) for text in (arguments.hold, arguments.vary, arguments.leave_out))
 
@@ -55,6 +55,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         with screen.progress("refit") as advance:
             fitted = fitted_to(recordings, tell=advance)
         misfit = misfit_of(fitted.rmse, recordings, plant)
+        doubts = doubts_about([*recordings, *holdouts], plant)
+        say_doubts(doubts, screen)
         say_first(misfit, screen, DISTURBED)
         _show(fitted, plant, screen)
         _show_run_specific(fitted, screen)
@@ -85,6 +87,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         {
             "format": "fdi_torch.refit/1",
             **misfit.to_dict(),
+            "doubts": doubts,
             "before": dict(fitted.before),
             "rmse": dict(fitted.rmse),
             "parameters": fitted.parameters,

@@ -191,6 +191,7 @@ MARKS = {"absent": "-", "cannot tell": "?"}
 
 def show_windows(fit: WindowedFit, screen: Screen) -> None:
     """Print one line per window and per period. Sizes without a unit are relative, flows hold at the mean levels."""
+    say_doubts(fit.doubts, screen)
     names = [_name(fault) for fault in fit.windows[0].faults] if fit.windows else []
     rows = [[f"{w.start:g}", f"{w.stop:g}", *(_cell(fault) for fault in w.faults)] for w in fit.windows]
     title = "windows (?: not determined, for example with levels at rest or an empty tank)"
@@ -206,6 +207,7 @@ def show_windows(fit: WindowedFit, screen: Screen) -> None:
     screen.result(
         {
             "format": "fdi_torch.windows/1",
+            "doubts": fit.doubts,
             "windows": fit.windows,
             "stretches": fit.stretches,
             "step": fit.step,

@@ -163,15 +163,15 @@ def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()
         lines = [f"tags: {{tag: {tags.tag}, value: {tags.value}{quality}}}    # one row per value", "columns:"]
         return [*lines, *(f"  {name}: {{column: TAG, unit: ...}}" for name in missing)]
     legible = [column for column in header if column == shortened(column)]
-    found = {
+    of_kind = {
         column: si_unit_of(pair[1]) for column in legible if (pair := header_unit(column)) and pair[0] not in kinds
     }
     without_unit = [column for column in legible if header_unit(column) is None]
     lines = ["columns:    # units only where the header has none"]
     for name in missing:
         own = next((c for c in without_unit if re.match(rf"{re.escape(name)}(?![^\W_])", c)), None)
-        same_kind = None if own else next((c for c, kind in found.items() if kind == kinds[name]), None)
-        found.pop(same_kind or "", None)
+        same_kind = None if own else next((c for c, kind in of_kind.items() if kind == kinds[name]), None)
+        of_kind.pop(same_kind or "", None)
         column = f'"{own or same_kind}"' if own or same_kind else "..."
         lines.append(f"  {name}: {{column: {column}" + ("}" if same_kind else ", unit: ...}"))
     return lines

@@ -10,11 +10,11 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from fdi_torch.config.problems import ConfigError, naming, shown
-from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity, quantity_at
+from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity, quantity_at, with_known_keys
 from fdi_torch.effects import all_placements, build_network, full_name, placements_for, unknown_parameter
 from fdi_torch.estimate.evolution_settings import STRATEGIES, EvolutionSettings
 from fdi_torch.estimate.objectives import Objective
-from fdi_torch.names import shortened, unknown
+from fdi_torch.names import shortened
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
@@ -49,11 +49,7 @@ def _auto_or_seconds(value: Any) -> Any:
 
 
 def _known_settings(value: Any) -> Any:
-    known = [field.name for field in fields(EvolutionSettings)]
-    for key in value if isinstance(value, dict) else ():
-        if key not in known:
-            raise ValueError(unknown("a known key", str(key), known))
-    return value
+    return with_known_keys(value, [field.name for field in fields(EvolutionSettings)])
 
 
 class ObjectiveConfig(Strict):
@@ -124,7 +120,7 @@ def names_in_full(names: Iterable[str], plant: PlantDescription, field: str) -> 
         constants = build_network(plant, placements_for(full)).constants
     for name, name_in_full in zip(short, full, strict=True):
         if name_in_full not in constants:
-            raise ConfigError([f"{field}: {unknown_parameter(name, constants, plant)}"])
+            raise ConfigError([unknown_parameter(name, constants, plant)], field)
     return full
 
 
@@ -156,9 +152,9 @@ def _chosen(
     config: ParameterConfig, place: str, name: str, constants: ParameterSpace, plant: PlantDescription
 ) -> Parameter:
     if name not in constants:
-        raise ConfigError([f"{place}: {unknown_parameter(name, constants, plant)}"])
+        raise ConfigError([unknown_parameter(name, constants, plant)], place)
     unit = constants[name].unit
-    with naming(f"{place} ({config.name})"):
+    with naming(place), naming(config.name):
         given = {field: getattr(config, field) for field in ("nominal", "low", "high", "std")}
         changes = {field: quantity(value, unit) for field, value in given.items() if value is not None}
         return constants.with_changes(name, **changes)[name]
@@ -173,7 +169,7 @@ def _calibrated(
     for pattern in config.calibrate:
         matched = [name for name in constants.names if fnmatchcase(name, pattern)]
         if not matched:
-            raise ConfigError([f"estimate.calibrate: {unknown_parameter(pattern, constants, plant)}"])
+            raise ConfigError([unknown_parameter(pattern, constants, plant)], "estimate.calibrate")
         names |= dict.fromkeys(matched)
     return list(names)
 
@@ -182,17 +178,13 @@ def parameter_values(values: dict[str, Amount], constants: ParameterSpace, plant
     """{'T1.leak': 0.3} -> {'T1.leak.size': 0.3} in SI. Raises ConfigError for unknown names and wrong units."""
     si: dict[str, float] = {}
     for given, value in values.items():
-        name = full_name(given, plant)
+        name, place = full_name(given, plant), f"simulate.faults.{given}"
         if name not in constants:
-            raise ConfigError([f"simulate.faults: {unknown_parameter(name, constants, plant)}"])
-        si[name] = quantity_at(f"simulate.faults.{given}", value, constants[name].unit)
+            raise ConfigError([unknown_parameter(name, constants, plant)], place)
+        si[name] = quantity_at(place, value, constants[name].unit)
         low, high = constants[name].low, constants[name].high
         if not low <= si[name] <= high:
             unit, scale = display_unit(constants[name].unit, name)
-            raise ConfigError(
-                [
-                    f"simulate.faults.{given}: expected a size from {scale * low:g} to {scale * high:g} {unit}".rstrip()
-                    + f", got {scale * si[name]:g}"
-                ]
-            )
+            expected = f"expected a size from {scale * low:g} to {scale * high:g} {unit}".rstrip()
+            raise ConfigError([f"{expected}, got {scale * si[name]:g}"], place)
     return si

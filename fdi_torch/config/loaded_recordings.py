@@ -21,7 +21,7 @@ from fdi_torch.config.channels import (
     without_column,
 )
 from fdi_torch.config.plant_file import AnyPlant, chosen_plant
-from fdi_torch.config.problems import ConfigError, explain
+from fdi_torch.config.problems import ConfigError, Source, explain
 from fdi_torch.config.recording_config import (
     ColumnConfig,
     FileConfig,
@@ -130,7 +130,7 @@ def listed_recordings(
     try:
         return [RecordingConfig.model_validate(entry) for entry in listed], path.parent
     except ValidationError as error:
-        raise explain(error, f"{path}: recordings") from None
+        raise explain(error, Source(f"{path}: recordings")) from None
 
 
 def separate_recordings(recordings: Sequence[Any]) -> tuple[list[Any], dict[str, Recording]]:
@@ -214,7 +214,7 @@ def read_frame(frame: Any, plant: AnyPlant, **keys: Any) -> Recording:
             config = RecordingConfig.model_validate({"file": str(path), **keys})
             return replace(read_recording(config, plant), source="data frame", sha256="")
         except ValidationError as error:
-            raise explain(error, "data frame") from None
+            raise explain(error, Source("data frame")) from None
         except ConfigError as error:
             raise ConfigError([problem.replace(str(path), "data frame") for problem in error.problems]) from None
 

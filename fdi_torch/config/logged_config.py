@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import PositiveFloat, PositiveInt, ValidationError
 
 from fdi_torch.config.plant_file import build_plant, load_plant
-from fdi_torch.config.problems import ConfigError, explain
+from fdi_torch.config.problems import ConfigError, Source, explain
 from fdi_torch.config.strict import Strict
 from fdi_torch.config.yaml_files import parse_yaml, shipped_plants
 from fdi_torch.logbook import Run as LoggedRun
@@ -69,4 +69,4 @@ def logged_gap_settings(log: LoggedRun, overrides: Iterable[str]) -> dict[str, A
     try:
         return GapSettings(**values).model_dump(exclude_unset=True)
     except ValidationError as error:
-        raise explain(error, "--set") from None
+        raise explain(error, Source("--set")) from None

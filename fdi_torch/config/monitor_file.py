@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 from fdi_torch.config.estimation import matching_names, names_in_full
 from fdi_torch.config.live_source import SourceConfig
 from fdi_torch.config.loaded_recordings import separate_recordings
-from fdi_torch.config.problems import naming, naming_source
+from fdi_torch.config.problems import Source, naming, naming_source
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.strict import ScaledSeconds, Seconds, Strict
@@ -40,7 +40,7 @@ class WindowConfig(Strict):
 
 class MonitorConfig(Strict):
     plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
-    recording: RecordingConfig = Field(description="the recording to follow; none beside `source`")
+    recording: RecordingConfig = Field(description="the recording to follow; leave it out with `source`")
     source: SourceConfig | None = Field(None, description="a live source in place of a recording")
     fault_free: tuple[Seconds, Seconds] = Field(
         description="interval from which the noise is estimated, as in [0 s, 300 s]"
@@ -90,11 +90,10 @@ class MonitorRun(ResolvedFile[MonitorConfig]):
 
 def load_monitor(path: str | Path, overrides: Iterable[str] = ()) -> MonitorRun:
     """A monitor file with overrides. Raises ConfigError with one sentence per problem."""
-    data, file = values_in(path, overrides, "monitor")
-    return build_monitor(data, file.parent, str(file))
+    return build_monitor(*values_in(path, overrides, "monitor"))
 
 
-def build_monitor(data: Mapping[str, Any], base: Path, source: str) -> MonitorRun:
+def build_monitor(data: Mapping[str, Any], base: Path, source: Source) -> MonitorRun:
     """A monitor run from the mapping of a monitor file; base: folder of relative paths.
 
     A `Plant` or a `Recording` object may replace the name of the plant or of the recording's file.

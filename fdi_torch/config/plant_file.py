@@ -13,7 +13,7 @@ import pydantic
 from pydantic import Field, ValidationError
 
 from fdi_torch.config.plant_in_code import Plant, effect_in_si, effect_parameters, si_value, tolerances_in_si
-from fdi_torch.config.problems import explain, naming
+from fdi_torch.config.problems import Source, explain, naming
 from fdi_torch.config.strict import Acceleration, Amount, Strict, quantity, quantity_of
 from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import expect_kind, find_plant, read_yaml
@@ -165,7 +165,7 @@ def build_plant(data: dict[str, Any], source: str) -> Plant:
     try:
         config = PlantConfig.model_validate(data)
     except ValidationError as error:
-        raise explain(error, source) from None
+        raise explain(error, Source(source)) from None
     with naming(source):
         plant = _plant(config)
         return replace(plant, units=written_units(data) | _valid_units(config.units, plant))

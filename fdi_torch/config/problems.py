@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 from pydantic import ValidationError
@@ -12,11 +13,39 @@ from fdi_torch.quantities import NO_COMMAS
 
 
 class ConfigError(ValueError):
-    """A configuration that cannot be used. problems: one sentence each; the message has one sentence per line."""
+    """A configuration that cannot be used. problems: one sentence each; the message has one sentence per line.
 
-    def __init__(self, problems: Sequence[str]) -> None:
-        super().__init__("\n".join(problems))
-        self.problems = tuple(problems)
+    place: the path of the key that the problems are about, with which each begins.
+    """
+
+    def __init__(self, problems: Sequence[str], place: str = "") -> None:
+        self.place = place
+        self.problems = tuple(f"{place}: {problem}" if place else problem for problem in problems)
+        super().__init__("\n".join(self.problems))
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a configuration comes from: its file, or other words for it, and overrides 'KEY=VALUE' of its values."""
+
+    file: str
+    overrides: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return self.file
+
+    def of(self, place: str) -> str:
+        """Where the value of a key comes from: an override, the file, or the file with overrides of values within."""
+        keys = {override: override.partition("=")[0] for override in self.overrides}
+        whole = [override for override, key in keys.items() if f"{place}.".startswith(f"{key}.")]
+        if whole:
+            return f"--set {whole[-1]}"
+        within = [f"--set {override}" for override, key in keys.items() if place and key.startswith(f"{place}.")]
+        return " with ".join([self.file, *within])
+
+    def at(self, place: str) -> str:
+        """The beginning of a message about a key."""
+        return f"{self.of(place)}: {place}" if place else self.file
 
 
 class UnknownKeyError(ValueError):
@@ -27,11 +56,22 @@ class UnknownKeyError(ValueError):
         self.key = key
 
 
-def explain(error: ValidationError, source: str, known: Mapping[str, str] | None = None) -> ConfigError:
-    """Pydantic's findings as sentences. known: the meaning of each key by its path, see `meanings`."""
-    known = known or {}
-    sentences = [f"{source}: {_path(e['loc'])}{_sentence(e, known)}" for e in error.errors(include_url=False)]
-    return ConfigError(list(dict.fromkeys(sentences)))
+def explain(
+    error: ValidationError, source: Source, known: Mapping[str, str] | None = None, within: tuple[str, ...] = ()
+) -> ConfigError:
+    """Pydantic's findings as sentences.
+
+    known: the meaning of each key by its path, see `meanings`. within: the keys around what was validated.
+    """
+    findings = [finding | {"loc": (*within, *finding["loc"])} for finding in error.errors(include_url=False)]
+    return ConfigError(list(dict.fromkeys(_explained(finding, source, known or {}) for finding in findings)))
+
+
+def _explained(finding: Mapping[str, Any], source: Source, known: Mapping[str, str]) -> str:
+    place = ".".join(map(str, finding["loc"]))
+    unknown_key = getattr(finding.get("ctx", {}).get("error"), "key", "")
+    origin = source.of(".".join(filter(None, (place, unknown_key))))
+    return ": ".join(filter(None, (origin, place, _sentence(finding, known))))
 
 
 @contextmanager
@@ -40,20 +80,18 @@ def naming(place: str) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise ConfigError([f"{place}: {error}"]) from None
+        raise ConfigError([str(error)], place) from None
 
 
 @contextmanager
-def naming_source(source: str) -> Iterator[None]:
-    """A context in which ConfigErrors are prefixed with the file."""
+def naming_source(source: Source) -> Iterator[None]:
+    """A context in which ConfigErrors about a key begin with the file or the override that it comes from."""
     try:
         yield
     except ConfigError as error:
-        raise ConfigError([p if p.startswith(source) else f"{source}: {p}" for p in error.problems]) from None
-
-
-def _path(location: tuple[int | str, ...]) -> str:
-    return ".".join(str(part) for part in location) + ": " if location else ""
+        if not error.place:
+            raise
+        raise ConfigError([f"{source.of(error.place)}: {problem}" for problem in error.problems]) from None
 
 
 def _sentence(finding: Any, known: Mapping[str, str]) -> str:

@@ -11,7 +11,7 @@ from zoneinfo import ZoneInfo
 
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
 
-from fdi_torch.config.problems import explain, shown
+from fdi_torch.config.problems import Source, explain, shown
 from fdi_torch.config.strict import Amount, HeldFor, Seconds, Strict, quantity
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.database import expect_no_password, is_query
@@ -175,4 +175,4 @@ def config_of(entry: Any) -> RecordingConfig:
     try:
         return RecordingConfig.model_validate(str(entry) if isinstance(entry, PurePath) else entry)
     except ValidationError as error:
-        raise explain(error, "recording") from None
+        raise explain(error, Source("recording")) from None

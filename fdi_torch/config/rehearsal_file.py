@@ -90,12 +90,12 @@ class Rehearsal(ResolvedFile[RehearsalConfig]):
 
 def load_rehearsal(path: str | Path, overrides: Iterable[str] = ()) -> Rehearsal:
     """A rehearsal file with overrides. Raises ConfigError with one sentence per problem."""
-    data, file = values_in(path, overrides, "rehearsal")
-    config, plant, text = resolve(RehearsalConfig, data, file.parent, str(file))
+    data, base, source = values_in(path, overrides, "rehearsal")
+    config, plant, text = resolve(RehearsalConfig, data, base, source)
     plans = tuple(_plans(config, plant))
     if not plans:
-        raise ValueError(f"{file}: expected false_alarms, faults_found or naming, got none of them; add one")
-    return Rehearsal(config, plant, file.parent, str(file), text, plans)
+        raise ValueError(f"{source}: expected false_alarms, faults_found or naming, got none of them; add one")
+    return Rehearsal(config, plant, base, source, text, plans)
 
 
 def _plans(c: RehearsalConfig, plant: PlantDescription) -> Iterable[Plan]:

@@ -12,9 +12,9 @@ from pydantic import Field, ValidationError, field_validator
 from fdi_torch.config.key_reference import meanings
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
-from fdi_torch.config.problems import ConfigError, explain, shown
+from fdi_torch.config.problems import ConfigError, Source, explain, naming_source, shown
 from fdi_torch.config.strict import Config, Strict, scaled_to_plant
-from fdi_torch.config.yaml_files import expect_kind, find_file, read_extended, with_overrides, write_yaml
+from fdi_torch.config.yaml_files import expect_kind, find_file, find_plant, read_extended, with_overrides, write_yaml
 from fdi_torch.effects import units_for_display
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
@@ -54,18 +54,19 @@ AnyConfig = TypeVar("AnyConfig", bound=_WithOutput)
 class ResolvedFile(Generic[AnyConfig]):
     """A run, monitor or rehearsal file with its plant.
 
-    base: folder of relative paths. source: the file's path. text: YAML of the same configuration, including the plant.
+    base: folder of relative paths. source: the file and the overrides of its values. text: YAML of the same
+    configuration, including the plant.
     """
 
     config: AnyConfig
     plant: PlantDescription
     base: Path
-    source: str
+    source: Source
     text: str
 
     @property
     def name(self) -> str:
-        return self.config.output.name or Path(self.source).stem
+        return self.config.output.name or Path(self.source.file).stem
 
     @property
     def resolved(self) -> dict[str, Any]:
@@ -78,16 +79,17 @@ class ResolvedFile(Generic[AnyConfig]):
         return {"config_text": self.text, "config": self.resolved, "seeds": seeds, "data": list(data)}
 
 
-def values_in(path: str | Path, overrides: Iterable[str], kind: str) -> tuple[dict[str, Any], Path]:
-    """The mapping of a file of that kind with overrides, and the file's path. Raises ConfigError."""
+def values_in(path: str | Path, overrides: Iterable[str], kind: str) -> tuple[dict[str, Any], Path, Source]:
+    """The mapping of a file of that kind with overrides, the file's folder, and both. Raises ConfigError."""
     file = find_file(str(path), Path.cwd())
     data = read_extended(file)
     expect_kind(data, kind, file)
-    return with_overrides(data, overrides), file
+    source = Source(str(file), tuple(overrides))
+    return with_overrides(data, source.overrides), file.parent, source
 
 
 def resolve(
-    model: type[Config], data: Mapping[str, Any], base: Path, source: str
+    model: type[Config], data: Mapping[str, Any], base: Path, source: Source
 ) -> tuple[Config, PlantDescription, str]:
     """The validated configuration, its plant, and YAML of the same configuration including the plant.
 
@@ -98,21 +100,20 @@ def resolve(
         config = model.model_validate(dict(data))
     except ValidationError as error:
         raise explain(error, source, meanings(model)) from None
-    try:
-        plant = plant_of(data.get("plant", model.model_fields["plant"].default), base, source)
-    except ConfigError as error:  # errors within a plant file already name that file
-        raise ConfigError([f"{source}: {p}" if p.startswith("plant: ") else p for p in error.problems]) from None
+    plant = plant_of(data.get("plant", model.model_fields["plant"].default), base, source)
     config = scaled_to_plant(config, time_scale(plant))
     display_in(units_for_display(plant))
     return config, plant, write_yaml({**data, "plant": plant_mapping(plant)})
 
 
-def plant_of(entry: Any, base: Path, source: str) -> PlantDescription:
+def plant_of(entry: Any, base: Path, source: Source) -> PlantDescription:
     """The plant of an entry: a shipped name, a plant file, its mapping or the plant itself. Raises ConfigError."""
     if isinstance(entry, PlantDescription):
         return entry
     if isinstance(entry, str | Path):
-        return load_plant(entry, base)
+        with naming_source(source):
+            file = find_plant(str(entry), base)
+        return load_plant(file)
     if isinstance(entry, dict):
-        return build_plant({"name": "plant", **entry}, f"{source}: plant")
-    raise ConfigError([f"{source}: plant: expected a shipped plant, a plant file or a plant, got {shown(entry)}"])
+        return build_plant({"name": "plant", **entry}, source.at("plant"))
+    raise ConfigError([f"{source.at('plant')}: expected a shipped plant, a plant file or a plant, got {shown(entry)}"])

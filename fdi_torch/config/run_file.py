@@ -12,6 +12,7 @@ from pydantic import Field, field_validator, model_validator
 
 from fdi_torch.config.estimation import EstimationConfig
 from fdi_torch.config.loaded_recordings import separate_recordings
+from fdi_torch.config.problems import Source
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.simulation import SimulationConfig
@@ -58,11 +59,10 @@ def load_run(path: str | Path | None = None, overrides: Iterable[str] = ()) -> R
 
     Raises ConfigError with one sentence per problem.
     """
-    data, file = values_in(DEFAULT_RUN if path is None else path, overrides, "run")
-    return build_run(data, file.parent, str(file))
+    return build_run(*values_in(DEFAULT_RUN if path is None else path, overrides, "run"))
 
 
-def build_run(data: Mapping[str, Any], base: Path, source: str) -> Run:
+def build_run(data: Mapping[str, Any], base: Path, source: Source) -> Run:
     """A run from the mapping of a run file; base: folder of relative paths.
 
     A `Plant` or a `Recording` object may replace the name of a plant or of a recording's file.

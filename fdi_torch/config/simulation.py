@@ -27,7 +27,8 @@ from fdi_torch.simulate.simulated_recording import noise_level
 class InputConfig(Strict):
     value: Amount | None = Field(None, description="constant value, in the unit of the plant's channel")
     steps: list[tuple[Seconds, Amount]] = Field(
-        default_factory=list, description="[[0 s, 50 cm^3/s], [200 s, 60 cm^3/s], ...]: from each time on"
+        default_factory=list,
+        description="[[0 s, 50 cm^3/s], [200 s, 60 cm^3/s], ...]: each value holds from its time on",
     )
 
 
@@ -93,10 +94,12 @@ def planned_recording(config: SimulationConfig, plant: PlantDescription) -> Reco
     units = plant.channel_units()
     for name in config.inputs:
         if name not in units:
-            raise ConfigError([f"simulate.inputs.{name}: {unknown('a channel of the plant', name, units)}"])
+            raise ConfigError([unknown("a channel of the plant", name, units)], f"simulate.inputs.{name}")
     missing = [name for name in units if name not in config.inputs]
     if missing:
-        raise ConfigError([f"simulate.inputs: expected every channel of the plant, got none for {', '.join(missing)}"])
+        raise ConfigError(
+            [f"expected every channel of the plant, got none for {', '.join(missing)}"], "simulate.inputs"
+        )
     columns = [_series(name, config.inputs[name], unit, time, config) for name, unit in units.items()]
     inputs = torch.stack(columns, dim=1) if columns else time.new_zeros(len(time), 0)
     unread = time.new_full((len(time), len(plant.sensors)), torch.nan)
@@ -114,13 +117,13 @@ def noise_std(config: NoiseConfig, plant: PlantDescription, clean: Tensor) -> Te
         std = noise_level(clean, config.snr_db, config.definition)
         if bool((std <= 0).any()):
             constant_output = names[int((std <= 0).nonzero()[0])]
-            raise ConfigError(
-                [f"simulate.noise.snr_db: expected outputs that vary, got a constant {constant_output}; give std"]
-            )
+            sentence = f"expected outputs that vary, got a constant {constant_output}; give std"
+            raise ConfigError([sentence], "simulate.noise.snr_db")
     for name, value in config.std.items():
+        place = f"simulate.noise.std.{name}"
         if name not in names:
-            raise ConfigError([f"simulate.noise.std.{name}: {unknown('an output of the plant', name, names)}"])
-        std[names.index(name)] = quantity_at(f"simulate.noise.std.{name}", value, plant.sensors[names.index(name)].unit)
+            raise ConfigError([unknown("an output of the plant", name, names)], place)
+        std[names.index(name)] = quantity_at(place, value, plant.sensors[names.index(name)].unit)
     return std
 
 
@@ -137,14 +140,14 @@ def _clock(config: SimulationConfig, plant: PlantDescription) -> Tensor:
     intervals = round(config.duration / config.sample_time)
     if intervals < 1 or abs(intervals * config.sample_time - config.duration) > 1e-9 * config.duration:
         expected = f"a multiple of sample_time ({config.sample_time:g} s)"
-        raise ConfigError([f"simulate.duration: expected {expected}, got {config.duration:g} s"])
+        raise ConfigError([f"expected {expected}, got {config.duration:g} s"], "simulate.duration")
     return torch.arange(intervals + 1, dtype=torch.float64) * config.sample_time
 
 
 def _series(name: str, config: InputConfig, unit: str, time: Tensor, run: SimulationConfig) -> Tensor:
     place = f"simulate.inputs.{name}"
     if (config.value is None) == (not config.steps):
-        raise ConfigError([f"{place}: expected either value or steps, got {'neither' if not config.steps else 'both'}"])
+        raise ConfigError([f"expected either value or steps, got {'both' if config.steps else 'neither'}"], place)
     if config.value is not None:
         return torch.full_like(time, quantity_at(place, config.value, unit))
     times = torch.tensor([t for t, _ in config.steps], dtype=torch.float64)
@@ -152,13 +155,13 @@ def _series(name: str, config: InputConfig, unit: str, time: Tensor, run: Simula
     wrong = [f"{b:g} s after {a:g} s" for a, b in pairwise(times.tolist()) if not b > a]
     if wrong or float(times[0]) != 0.0:
         got = wrong[0] if wrong else f"{float(times[0]):g} s first"
-        raise ConfigError([f"{place}.steps: expected times that start at 0 s and increase, got {got}"])
+        raise ConfigError([f"expected times that start at 0 s and increase, got {got}"], f"{place}.steps")
     if run.hold == "linear":
         return interpolate(time, times, values)
     between = times[(times / run.sample_time - (times / run.sample_time).round()).abs() > 1e-9].tolist()
     if between:
         every = f"(every {run.sample_time:g} s)"
-        raise ConfigError([f"{place}.steps: expected times at samples {every}, got {between[0]:g} s"])
+        raise ConfigError([f"expected times at samples {every}, got {between[0]:g} s"], f"{place}.steps")
     return values[torch.searchsorted(times, time + 1e-9 * run.sample_time, right=True) - 1]
 
 

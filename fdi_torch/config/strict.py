@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from typing import Annotated, Any, TypeVar
 
 from pydantic import AllowInfNan, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -22,11 +23,15 @@ class Strict(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _known_keys_only(cls, data: Any) -> Any:
-        known = [field.alias or name for name, field in cls.model_fields.items()]
-        for key in data if isinstance(data, dict) else ():
-            if key not in known:
-                raise UnknownKeyError(unknown("a known key", str(key), known), str(key))
-        return data
+        return with_known_keys(data, [field.alias or name for name, field in cls.model_fields.items()])
+
+
+def with_known_keys(data: Any, known: Collection[str]) -> Any:
+    """The data. Raises UnknownKeyError if it is a mapping with another key."""
+    for key in data if isinstance(data, dict) else ():
+        if key not in known:
+            raise UnknownKeyError(unknown("a known key", str(key), known), str(key))
+    return data
 
 
 def quantity(value: Any, unit: str) -> float:

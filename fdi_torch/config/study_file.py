@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError
 from fdi_torch.capacity import expect_room
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
 from fdi_torch.config.key_reference import meanings
-from fdi_torch.config.problems import ConfigError, explain
+from fdi_torch.config.problems import ConfigError, Source, explain
 from fdi_torch.config.resolved_config import values_in
 from fdi_torch.config.run_file import Run, RunConfig, build_run
 from fdi_torch.config.simulation import planned_recording
@@ -84,11 +84,10 @@ class Study:
 
 def load_study(path: str | Path, overrides: list[str] | None = None) -> Study:
     """A study file with overrides. Raises ConfigError with one sentence per problem."""
-    data, file = values_in(path, overrides or (), "study")
-    return build_study(data, file.parent, str(file))
+    return build_study(*values_in(path, overrides or (), "study"))
 
 
-def build_study(data: Mapping[str, Any], base: Path, source: str) -> Study:
+def build_study(data: Mapping[str, Any], base: Path, source: Source) -> Study:
     """A study from the mapping of a study file; base: folder of relative paths."""
     if "study" not in data:
         raise ConfigError([f"{source}: expected a block study, got none; fdi train estimates a single run"])
@@ -97,7 +96,7 @@ def build_study(data: Mapping[str, Any], base: Path, source: str) -> Study:
     try:
         config = scaled_to_plant(StudyConfig.model_validate(block), time_scale(run.plant))
     except ValidationError as error:
-        raise explain(error, f"{source}: study", meanings(StudyFile)) from None
+        raise explain(error, source, meanings(StudyFile), within=("study",)) from None
     text = run.text + write_yaml({"study": block})
     return Study(config, run, _plan(config, run), text)
 
@@ -128,7 +127,7 @@ def _fitting(run: Run) -> Fitting:
     if simulated is None:
         raise ConfigError([f"{run.source}: expected simulate, got recordings; a study makes its own readings"])
     if not estimate.parameters:
-        raise ConfigError([f"{run.source}: estimate.parameters: expected at least one, got none"])
+        raise ConfigError([f"{run.source.at('estimate.parameters')}: expected at least one, got none"])
     network = build_network(run.plant, placements_of([p.name for p in estimate.parameters], run.plant))
     space = estimated_space(estimate, network.constants, run.plant, real_data=False)
     space = bounded_by_recording(space, simulated.duration)
@@ -151,17 +150,14 @@ def _settings(config: StudyConfig, run: Run, fitting: Fitting) -> list[Setting]:
     expect_room(numbers, f"{config.trials:.3g} trials of each setting", "lower study.trials")
     settings = float(len(config.snr_db)) * (2 ** len(space) - 1 if config.faults == "modes" else 1)
     if not settings <= MOST_SETTINGS or not settings * config.trials <= MOST_TRIALS:
-        raise ConfigError(
-            [
-                f"{run.source}: study: expected at most {MOST_SETTINGS} settings and {MOST_TRIALS} trials in all, got "
-                f"{settings:.4g} settings of {config.trials} trials; take fewer of these, or split the study"
-            ]
-        )
+        most = f"{MOST_SETTINGS} settings and {MOST_TRIALS} trials in all"
+        got = f"{settings:.4g} settings of {config.trials} trials; take fewer of these, or split the study"
+        raise ConfigError([f"{run.source.at('study')}: expected at most {most}, got {got}"])
     longest = run.config.simulate.duration if run.config.simulate else 0.0
     too_long = [step for step in (config.search_step, config.data_step, *config.steps) if step > longest]
     if too_long:
         raise ConfigError(
-            [f"{run.source}: study: expected steps within the {longest:g} s simulated, got {too_long[0]:g} s"]
+            [f"{run.source.at('study')}: expected steps within the {longest:g} s simulated, got {too_long[0]:g} s"]
         )
     for snr in config.snr_db:
         noise = "no noise" if snr is None else f"SNR {snr:g} dB"
@@ -186,5 +182,5 @@ def _simulated(run: Run, fitting: Fitting) -> torch.Tensor:
     for name in values:
         if name not in fitting.space:
             sentence = unknown("an estimated parameter", name, fitting.space.names)
-            raise ConfigError([f"{run.source}: simulate.faults: {sentence}; estimate it too"])
+            raise ConfigError([f"{run.source.at('simulate.faults')}: {sentence}; estimate it too"])
     return fitting.space.vector(values)

@@ -228,7 +228,7 @@ def find_plant(name: str, base: Path) -> Path:
         return plants[name]
     if Path(name).suffix in YAML_ENDINGS:
         return find_file(name, base)
-    raise ConfigError([f"plant: {unknown('a plant file (.yaml) or a shipped plant', name, plants)}"])
+    raise ConfigError([unknown("a plant file (.yaml) or a shipped plant", name, plants)], "plant")
 
 
 _OWN_KEYS = {

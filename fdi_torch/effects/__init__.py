@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 def _loaded(name: str) -> Effect:
     """The effect of a file: pump_lag.py holds the class PumpLag."""
-    found: Effect = getattr(import_module(f"fdi_torch.effects.{name}"), name.title().replace("_", ""))()
-    return found
+    effect: Effect = getattr(import_module(f"fdi_torch.effects.{name}"), name.title().replace("_", ""))()
+    return effect
 
 
 # Of two effects at one place, the earlier one acts first.

@@ -93,8 +93,8 @@ def log_volume(
     volume = -0.5 * log_det(inside / (2.0 * math.pi))
     if slope is None or not bool(held.any()):
         return volume
-    left = scaled[held][:, held].diagonal() - (across @ torch.linalg.pinv(inside, hermitian=True) * across).sum(-1)
-    root = (2.0 * left.clamp(min=1e-12)).sqrt()
+    remaining = scaled[held][:, held].diagonal() - (across @ torch.linalg.pinv(inside, hermitian=True) * across).sum(-1)
+    root = (2.0 * remaining.clamp(min=1e-12)).sqrt()
     integral = math.sqrt(math.pi) / root * torch.special.erfcx(slope[held] * width[held] / root)
     return volume + float(integral.clamp(max=1.0).log().sum())
 

@@ -91,7 +91,7 @@ def worst(misfits: Iterable[Misfit]) -> Misfit:
 
 
 def least_noise(values: Float[torch.Tensor, "S C"], weight: Float[torch.Tensor, "S C"]) -> Float[torch.Tensor, " C"]:
-    """The smallest standard deviation (C,) that such readings can have: of their rounding, or of simulated ones.
+    """Smallest standard deviation (C,) that noise of such readings can have: that of rounding, or of the simulation.
 
     Rounding in steps of q adds q^2 / 12 to the variance of the readings, which second differences of a slow level do
     not show.

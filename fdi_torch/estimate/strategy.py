@@ -121,8 +121,8 @@ class Strategy(Protocol):
 
 def strategy_named(name: str) -> Strategy:
     """The strategy of this name in `STRATEGIES`."""
-    found: Strategy = import_module(f"fdi_torch.estimate.{STRATEGIES[name][0]}").STRATEGY
-    return found
+    strategy: Strategy = import_module(f"fdi_torch.estimate.{STRATEGIES[name][0]}").STRATEGY
+    return strategy
 
 
 def state_from_dict(tensors: dict[str, Tensor]) -> SearchState:

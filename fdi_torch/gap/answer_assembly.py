@@ -162,8 +162,8 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
 def amounts_of(fitter: Fitter, fit: Fit, placement: Placement, stds: Mapping[str, float]) -> dict[str, Amount]:
     """Fitted parameters of an effect. stds: standard errors of all parameters of the fit.
 
-    A ramp that has not ended when the recording does shows a rate only, in which size and ramp cancel. It is told as
-    one that ends with the recording, with the size that it has reached.
+    A ramp that has not ended when the recording does shows a rate only, in which size and ramp cancel. It is reported
+    as one that ends with the recording, with the size that it has reached.
     """
     fitted = fit.values_of([placement])
     size, *_ = (placement.full_name(p.name) for p in placement.effect.parameters(placement.location, fitter.data.plant))

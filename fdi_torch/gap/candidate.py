@@ -32,7 +32,7 @@ class Candidate:
 class Fit:
     """The best fit of a candidate: parameters theta (P,), cost (chi-square with priors), linearised trajectory.
 
-    trajectory: computes the latter. converged: as that of `DescentResult`.
+    trajectory: computes the latter. converged: as that of `DescentResult`; of an explanation, under its own noise.
     """
 
     candidate: Candidate

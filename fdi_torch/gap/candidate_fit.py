@@ -181,6 +181,11 @@ class Fitter:
         """Chi-square of a fit under this fitter's noise, with priors."""
         return float(self.chi_square(fit.space, fit.theta, self.residual(fit.linearised.readings)))
 
+    def converged(self, fit: Fit) -> bool:
+        """Whether a fit is at a minimum under this fitter's noise, which may differ from that of its descent."""
+        problem = TrajectoryProblem(self, self.engine(fit.candidate, list(fit.effect_values)))
+        return bool(problem.converged(fit.theta.unsqueeze(0), fit.linearised, int(self.data.mask.sum())))
+
     def white(self, linearised: Linearised) -> tuple[Tensor, Tensor]:
         """Whitened residual (L, S, C) and Jacobian (L, S, C, P)."""
         return self.residual(linearised.readings), self.whiten(linearised.jacobian)

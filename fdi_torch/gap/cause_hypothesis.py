@@ -28,7 +28,7 @@ class CauseHypothesis:
     """An explanation with or without a discrepancy at one place.
 
     causes: effects of the explanation, without those that an unknown replaces. weight: log posterior, not normalised.
-    discrepancy: an unknown, or the error of the law of an effect at the same place. inexact: whether it is the latter.
+    discrepancy: an unknown, or the error of the law of an effect at the same place (then `inexact` is True).
     """
 
     explanation: RankedExplanation

@@ -25,7 +25,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-RELEVANT = 0.01  # share of the variance of the noise that rounding must add to be told
+RELEVANT = 0.01  # share of the variance of the noise that rounding must add to be considered
 DECAY_SHARE = 0.3  # share of a quantization step over which its error decorrelates
 MOST_BINS = 512  # bins of a spectrum
 CACHED = 2  # layouts whose spectra are cached, 40 MB each: of a recording and of its hold-out

@@ -68,7 +68,7 @@ class DataSet:
 
     @property
     def experiment(self) -> Experiment:
-        """Of the first recording."""
+        """The experiment of the first recording."""
         return self.experiments[0]
 
     @property

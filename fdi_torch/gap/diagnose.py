@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import torch
 
@@ -27,15 +26,14 @@ from fdi_torch.gap.preprocess.outliers import sensor_with_outliers
 from fdi_torch.gap.preprocess.sensor_limits import noise_before_clipping, with_noise_limits
 from fdi_torch.gap.problem import PLAIN, DiagnosisProblem, Settings, problem_of
 from fdi_torch.gap.screening import options_of
+from fdi_torch.gap.stage_progress import ProgressCallback, StageProgress
 from fdi_torch.gap.structure_search import search
-from fdi_torch.gap.verdict_words import explanation_words
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of_all, with_simulated_levels
 from fdi_torch.recording import Recording
 
 CONTENT = 0.95
-ProgressCallback = Callable[[float, str], None]
 
 
 def diagnose(
@@ -63,11 +61,11 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     progress(0.2, "which effects")
     present = {p.prefix for p in problem.known_effects} | {ParameterName.parse(name).prefix for name in data.nuisance}
     options = options_of([p for p in library if not p.effect.quantizes and p.prefix not in present], fitter, reach)
-    pool = ExplanationPool(fitter, null, len(library))
-    result = search(pool, options, problem.settings.most, partial(_report, progress, 0.2, "which effects"))
+    pool = ExplanationPool(fitter, null, len(library), StageProgress(progress, "which effects", 0.2, 0.6))
+    result = search(pool, options, problem.settings.most)
     progress(0.6, "where")
-    report = partial(_report, progress, 0.6, "where")
-    posterior = posterior_of(pool, result, options, plant, possible_places(plant), problem.settings.named_only, report)
+    pool.progress = StageProgress(progress, "where", 0.6, 0.8)
+    posterior = posterior_of(pool, result, options, plant, possible_places(plant), problem.settings.named_only)
     credible_set = posterior.credible_set(CONTENT)
     rounded = {s.name for s, step in zip(plant.sensors, quantization_steps, strict=True) if step > 0.0}
     from_readings = [p.cause for p in library if p.effect.quantizes and p.location in rounded]
@@ -75,8 +73,7 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     if not problem.settings.named_only and (sensor := sensor_with_outliers(problem.outliers[0])):
         from_readings.append((UNKNOWN, sensor))
     free_form_fit = _free_form(posterior, reach)
-    sure = posterior.probabilities[0] >= CONTENT
-    verdict = verdict_of(credible_set, sure, from_readings)
+    verdict = verdict_of(credible_set, is_sure(posterior), from_readings)
     progress(0.8, "hold-out")
     diagnosis = DiagnosisResult(
         fitter,
@@ -96,16 +93,19 @@ def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda
     return replace(answer, remarks=[*dict.fromkeys(problem.remarks), *answer.remarks])
 
 
-def _report(progress: ProgressCallback, share: float, stage: str, causes: Collection[CauseName]) -> None:
-    """Tell the likeliest causes so far."""
-    named = [{"effect": effect, "location": place} for effect, place in sorted(causes)]
-    progress(share, f"{stage}, so far {explanation_words(named)}")
+def is_sure(posterior: Posterior) -> bool:
+    """Whether the likeliest hypothesis has 95 % and, if it names causes, its fit has converged.
+
+    Laplace's approximation holds at a maximum. Away from it, the evidence and the sizes depend on where the fit ended.
+    """
+    best = posterior.best
+    return posterior.probabilities[0] >= CONTENT and (not best.causes or best.fit.converged)
 
 
 def verdict_of(credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: Sequence[CauseName]) -> Verdict:
     """The verdict of a credible set of hypotheses.
 
-    sure: whether the likeliest alone has 95 %. from_readings: causes that the readings show without a model.
+    sure: as `is_sure`. from_readings: causes that the readings show without a model.
     """
     best = credible_set[0]
     if not best.causes and not best.unknown and not from_readings:

@@ -30,6 +30,7 @@ from fdi_torch.gap.marginal_likelihood import (
 from fdi_torch.gap.onsets import with_fine_onsets
 from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.screening import Option, ScreeningResult, pairs_of, screen
+from fdi_torch.gap.stage_progress import StageProgress
 from fdi_torch.gap.trajectory_problem import BEHIND, SHARE
 
 # BEAM, FITTED, STARTS, EVALUATED and PAIRS are budgets of computing. An extension that FITTED and EVALUATED leave out
@@ -39,17 +40,19 @@ FITTED = 8  # effects fitted about each explanation and noise, by first-order ga
 STARTS = 8  # initial values of one effect, by first-order gain
 EVALUATED = 3  # of these fits, the best whose evidence is computed
 PAIRS = 3  # pairs of effects fitted together
+EXTENSION = FITTED + EVALUATED  # fits and evaluations about one explanation
 
 
 class ExplanationPool:
     """The explanations evaluated so far, by their effects.
 
     fitter: with sensor noise alone. null: the recalibrated plant, fitted by it. choices: number of effects at places in
-    the library.
+    the library. progress: counts fits and evaluations.
     """
 
-    def __init__(self, fitter: Fitter, null: Fit, choices: int) -> None:
+    def __init__(self, fitter: Fitter, null: Fit, choices: int, progress: StageProgress | None = None) -> None:
         self.fitter, self.null, self.choices = fitter, null, choices
+        self.progress = progress or StageProgress()
         self.explanations: dict[Key, RankedExplanation] = {}
         self._expected_gains: dict[Key, dict[Key, ExpectedGain]] = {}
         self._failed: set[Key] = set()
@@ -91,8 +94,10 @@ class ExplanationPool:
             # The search for the correlation time, which takes longest, begins where the rest has converged.
             climb = not gain > TOLERANCE
             fit, start = (best.fit, best.noise) if climb else (there.fit, there.noise)
+        best = replace(best, fit=replace(best.fit, converged=best.fitter.converged(best.fit)))
         if before is None or best.log_evidence > before.log_evidence:
             self.explanations[fit.key] = best
+        self.progress.step()
         return best
 
     def _explanation(self, fitter: Fitter, fit: Fit, noise: StateNoise) -> RankedExplanation:
@@ -187,6 +192,7 @@ class ExplanationPool:
         for candidate in candidates:
             if again or candidate.key not in self.explanations:
                 fit = fitter.fit(candidate, base, least)
+                self.progress.step()
                 least = min(least, fit.cost)
                 if fit.cost < cost:
                     fits.append(fit)

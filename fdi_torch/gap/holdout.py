@@ -129,8 +129,8 @@ def free_run(data: DataSet, noise: Noise, model: Model) -> Tensor:
 def transferable_values(values: Mapping[str, float]) -> dict[str, float]:
     """Values of a model that hold for another recording.
 
-    Of a free form's function of time its mean holds; its sinusoids are dropped, because their phase belongs to the
-    recording's clock.
+    A function of time is replaced by its mean, and sinusoids are dropped, because their phase belongs to the clock of
+    the diagnosed recording.
     """
     transferable = dict(values)
     free = [ParameterName.parse(n) for n in values if is_free_coefficient(n)]

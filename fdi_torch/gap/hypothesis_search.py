@@ -21,7 +21,7 @@ from fdi_torch.gap.cause_hypothesis import (
     causes_in_order,
     likeliest,
 )
-from fdi_torch.gap.explanation_pool import ExplanationPool
+from fdi_torch.gap.explanation_pool import EXTENSION, ExplanationPool
 from fdi_torch.gap.hypothesis_weights import HypothesisWeights
 from fdi_torch.gap.localization.localize import localize, localize_beside
 from fdi_torch.gap.localization.localized_discrepancy import (
@@ -31,23 +31,17 @@ from fdi_torch.gap.localization.localized_discrepancy import (
 from fdi_torch.gap.marginal_likelihood import log_prior, with_disturbances
 from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.screening import Option
-from fdi_torch.gap.structure_search import Report, SearchResult
+from fdi_torch.gap.structure_search import SearchResult
 
 
 class HypothesisSearch:
     """The hypotheses about a pool of explanations, which grows.
 
-    options: effects that may be added. places: where something unknown may be. report: called after each step.
+    options: effects that may be added. places: where something unknown may be.
     """
 
-    def __init__(
-        self,
-        pool: ExplanationPool,
-        options: Sequence[Option],
-        places: Sequence[str],
-        report: Report = lambda causes: None,
-    ) -> None:
-        self.pool, self.options, self.places, self._report = pool, options, places, report
+    def __init__(self, pool: ExplanationPool, options: Sequence[Option], places: Sequence[str]) -> None:
+        self.pool, self.options, self.places = pool, options, places
         self.weights = HypothesisWeights(pool, options, len(places))
         # By the explanation's id, and the place; and the explanations' ids.
         self._evaluated: dict[tuple[int, str], list[CauseHypothesis]] = {}
@@ -58,9 +52,11 @@ class HypothesisSearch:
     def search(self, result: SearchResult, named: Sequence[CauseHypothesis]) -> list[CauseHypothesis]:
         """All hypotheses that were examined. named: those without a discrepancy."""
         hypotheses = list(named)
-        for explanation in {e.key: e for e in (result.null, likeliest(named).explanation)}.values():
+        first = {e.key: e for e in (result.null, likeliest(named).explanation)}.values()
+        for k, explanation in enumerate(first):
+            self.pool.progress.remaining((len(first) - k) * len(self.places) + EXTENSION)
             hypotheses += self._everywhere(explanation, likeliest(hypotheses))
-            self._report(likeliest(hypotheses).all_causes)
+            self.pool.progress.so_far(likeliest(hypotheses).all_causes)
         hypotheses = self._after_fits_at_unknowns(hypotheses)
         trials = self._climbed(likeliest(hypotheses))
         best = likeliest([*hypotheses, *trials])
@@ -96,7 +92,8 @@ class HypothesisSearch:
             return [h for place in at for h in self._evaluated[id(explanation), place]]
         needed, rival = (self._needed(explanation, best), best.noise) if best else (-math.inf, None)
         fitter, fit, noise = explanation.fitter, explanation.fit, explanation.noise
-        localization = localize(fitter, fit, noise, at, needed=needed, rival=rival, log_odds=self.weights.log_odds)
+        odds, step = self.weights.log_odds, self.pool.progress.step
+        localization = localize(fitter, fit, noise, at, needed=needed, rival=rival, log_odds=odds, step=step)
         hypotheses = {
             (id(explanation), d.location): self.weights.with_discrepancy(explanation, d)
             for d in localization.discrepancies
@@ -111,7 +108,8 @@ class HypothesisSearch:
         that improves it. The discrepancy moves beside the same effects, or beside one more in its former place."""
         evaluated: list[CauseHypothesis] = []
         while True:
-            self._report(best.all_causes)
+            self.pool.progress.remaining(2 * EXTENSION)  # this round, and one that may follow
+            self.pool.progress.so_far(best.all_causes)
             trials = [*self._with_fewer_effects(best), *self._with_more_effects(best)]
             if best.discrepancy and all(h.weight <= best.weight for h in trials):
                 trials += self._everywhere(best.explanation, best)
@@ -161,7 +159,7 @@ class HypothesisSearch:
         return hypotheses
 
     def _needed(self, explanation: RankedExplanation, best: CauseHypothesis) -> float:
-        """Log evidence that a discrepancy must add to an explanation, for the share RARE of the best one's weight."""
+        """Log evidence that a discrepancy must add to give the explanation the share RARE of the best one's weight."""
         return best.weight + math.log(RARE) - explanation.log_weight - self.weights.log_odds
 
     def _after_fits_at_unknowns(

@@ -13,7 +13,7 @@ from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.hypothesis_search import HypothesisSearch
 from fdi_torch.gap.library import equivalence_class
 from fdi_torch.gap.screening import Option
-from fdi_torch.gap.structure_search import Report, SearchResult
+from fdi_torch.gap.structure_search import SearchResult
 from fdi_torch.plant.description import PlantDescription
 
 
@@ -49,14 +49,13 @@ def posterior_of(
     plant: PlantDescription,
     places: Sequence[str],
     named_only: bool,
-    report: Report = lambda causes: None,
 ) -> Posterior:
     """Posterior over the explanations of a search, with and without an unknown discrepancy at each place.
 
     pool: pool of the evaluated explanations, which may grow. options: effects that are fitted before something at their
-    place is called unknown. named_only: without unknown discrepancies. report: called with the likeliest causes so far.
+    place is called unknown. named_only: without unknown discrepancies.
     """
-    search = HypothesisSearch(pool, options, places, report)
+    search = HypothesisSearch(pool, options, places)
     best = max(e.log_weight for e in result.explanations)
     named = [search.alone(e, best) for e in result.explanations]
     hypotheses = named if named_only else search.search(result, named)

@@ -11,16 +11,13 @@ however, overrates effects that only compensate a wrong equation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from fdi_torch.estimate.evidence import RARE
-from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.explanation_pool import BEAM, ExplanationPool
+from fdi_torch.gap.explanation_pool import BEAM, EXTENSION, ExplanationPool
 from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, pairs_of, screen, screen_under_each
-
-Report = Callable[[Collection[CauseName]], None]  # told the causes that are the likeliest so far
 
 # Budgets of computing.
 DEEPEST = 4  # effects in one explanation
@@ -45,22 +42,23 @@ class SearchResult:
         return self.explanations[0]
 
 
-def search(
-    pool: ExplanationPool, options: Sequence[Option], most: int = DEEPEST, report: Report = lambda causes: None
-) -> SearchResult:
-    """Search from the recalibrated plant. most: effects in one explanation. report: called after each extension."""
+def search(pool: ExplanationPool, options: Sequence[Option], most: int = DEEPEST) -> SearchResult:
+    """Search from the recalibrated plant. most: effects in one explanation."""
+    pool.progress.remaining(EXTENSION * (1 + BEAM * (most - 1)))
     base = pool.evaluate(pool.null)
     alarm, of_sensors = screen_under_each([base.fitter, pool.fitter], base.fit, options)
     pool.extend(base, alarm, of_sensors)
-    report(pool.best.key)
+    pool.progress.so_far(pool.best.key)
     frontier = pool.best_of(1)[:BEAM]
     for depth in range(2, most + 1):
         if not frontier or frontier[0].log_evidence < pool.best_of(depth - 2)[0].log_evidence:
             break
-        for parent in frontier:
+        for k, parent in enumerate(frontier):
+            pool.progress.remaining(EXTENSION * (len(frontier) - k + BEAM * (most - depth)))
             pool.extend_by(parent, options)
-            report(pool.best.key)
+            pool.progress.so_far(pool.best.key)
         frontier = pool.best_of(depth)[:BEAM]
+    pool.progress.remaining(EXTENSION * (1 + len(pool.best.key)))
     pool.exchange_effects(options)
     for _ in range(TURNS):
         if pool.unexamined() < RARE:

@@ -9,6 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from fdi_torch.estimate.damped_step import Quadratic, newton_decrement
 from fdi_torch.estimate.evidence import TOLERANCE
 from fdi_torch.estimate.levenberg_marquardt import Competition, RefineSettings, levenberg_marquardt
 from fdi_torch.estimate.linearisation import ABANDONED, Linearisation, are_all_lanes
@@ -117,7 +118,7 @@ class TrajectoryProblem:
     def attempt(
         self, theta: Tensor, known: Linearisation, step: Tensor, near: TrialTrajectory | None = None
     ) -> TrialTrajectory:
-        """The trajectories at theta, a `step` away from `known` or from `near`."""
+        """The trajectories at theta, found from those of `near` (otherwise `known`), which lie a `step` away."""
         linearised = _fitted(known).linearised
         guess = (near or linearised).levels + _along(linearised.slopes, step)
         levels = self.engine.trajectories(theta, guess)
@@ -135,6 +136,12 @@ class TrajectoryProblem:
     def model(self, theta: Tensor, trial: TrialTrajectory) -> Linearisation:
         """Readings and Jacobian at the parameters of a trial step."""
         return self._model(theta, self.engine.linearise(theta, trial.levels))
+
+    def converged(self, theta: Tensor, linearised: Linearised, readings: int) -> Tensor:
+        """Whether each lane is at a minimum, (L,) bool. readings: number of valid ones."""
+        model, (low, high, _) = self._model(theta, linearised), self.box
+        decrement, _ = newton_decrement(Quadratic(theta, model.gradient, model.curvature, low, high))
+        return _near_minimum(decrement, 2.0 * model.cost, readings)
 
     def _model(self, theta: Tensor, linearised: Linearised) -> Linearisation:
         scale = self.box[2]
@@ -181,9 +188,13 @@ def descend(
     minimum = levenberg_marquardt(problem.linearise, theta, low, high, settings, neighbourhood=problem)
     assert isinstance(minimum.state, FittedTrajectory)
     cost = 2.0 * minimum.cost
-    near = minimum.newton_decrement < TOLERANCE * (cost / max(readings, 1)).clamp(min=1.0)
-    converged = near & (minimum.status != ABANDONED)
+    converged = _near_minimum(minimum.newton_decrement, cost, readings) & (minimum.status != ABANDONED)
     return DescentResult(minimum.theta, cost, minimum.state.linearised, converged)
+
+
+def _near_minimum(decrement: Tensor, cost: Tensor, readings: int) -> Tensor:
+    """`DescentResult.converged` from Newton decrements and costs, (L,) each, but for starts that were given up."""
+    return decrement < TOLERANCE * (cost / max(readings, 1)).clamp(min=1.0)
 
 
 def _fitted(model: Linearisation) -> FittedTrajectory:

@@ -130,6 +130,8 @@ def _verdict(answer: Named, best: str) -> str:
         whether = "is" if all(map(apart_from_rounding, explanations)) else "may be"
         plausible = f"{count} explanations are plausible at 95 %, " if count > 1 else ""
         rest = "" if count > 1 else _unfitted(answer)
+        if answer.get("converged") is False:
+            rest, surely = " Its fit has not converged, so that its sizes and its probability may be wrong.", ""
         return f"There {whether} a gap; {plausible}the likeliest is {best}{chance}.{rest}{surely}"
     if verdict != "unknown":
         return ""

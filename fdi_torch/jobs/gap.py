@@ -13,8 +13,9 @@ from torch import Tensor
 
 from fdi_torch.config.plant_writer import dump_plant, plant_mapping
 from fdi_torch.gap.answer import Answer
-from fdi_torch.gap.diagnose import ProgressCallback, solve_problem
+from fdi_torch.gap.diagnose import solve_problem
 from fdi_torch.gap.problem import PLAIN, Settings, problem_of
+from fdi_torch.gap.stage_progress import ProgressCallback
 from fdi_torch.jobs.log_paths import STARTS_OVER
 from fdi_torch.jobs.logged_recordings import log_prediction, log_recording
 from fdi_torch.logbook import RunLog
@@ -54,8 +55,13 @@ def run_gap(
             log_recording(log, each, group)
         log.flush()
 
+        said = ""
+
         def say(share: float, text: str) -> None:
-            log.say(text)
+            nonlocal said
+            if text != said:
+                log.say(text)
+            said = text
             tell(share, text)
 
         with one_thread():

@@ -50,9 +50,9 @@ def find_unfinished(folder: Path, name: str, text: str) -> tuple[Path, Log | Non
     name. Raises ValueError if all are finished, or if their configuration is not `text`.
     """
     pattern = re.compile(re.escape(name) + r"(_\d+)?\.mcap(\.partial)?")
-    found = sorted((p for p in folder.glob("*.mcap*") if pattern.fullmatch(p.name)), reverse=True)
+    files = sorted((p for p in folder.glob("*.mcap*") if pattern.fullmatch(p.name)), reverse=True)
     # Of a log and its `.partial` file, which comes first, the log itself counts.
-    paths = {p.with_suffix("") if p.suffix == ".partial" else p: p for p in found}
+    paths = {p.with_suffix("") if p.suffix == ".partial" else p: p for p in files}
     if not paths:
         return None
     logs = {path: _read_log(path) for path in paths.values()}

@@ -20,7 +20,7 @@ from torch import Tensor
 from fdi_torch.amounts import faults_in_words
 from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.monitor_file import MonitorRun
-from fdi_torch.config.problems import naming
+from fdi_torch.config.problems import naming, naming_source
 from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.jobs.monitor_rows import CLOCK, FROM_SOURCE, event_fields, samples_of_rows
 from fdi_torch.logbook import Listener, RunLog, as_array
@@ -252,8 +252,8 @@ class LoggedMonitor:
 
 
 def _positions(clock: Sequence[float], times: Sequence[tuple[float, bool]], tested: Container[int] = ()) -> list[int]:
-    """Index on the clock of each of the times, which follow it in order; True: after that of the time before, and not
-    among `tested`. The clock may jump back, which causes a notice. No two notices belong to one sample."""
+    """Index on the clock of each of the times, in their order. A time with True comes after the previous one, and not
+    among `tested`: the clock may jump back, which causes a notice, and each sample has at most one notice."""
     positions, k = [], -1
     for time_of_item, is_later in times:
         k = clock.index(time_of_item, k + 1 if is_later else max(k, 0))
@@ -265,7 +265,7 @@ def _positions(clock: Sequence[float], times: Sequence[tuple[float, bool]], test
 
 def _prepare(run: MonitorRun, whole: Recording, end: float) -> PreparedMonitor:
     c = run.config
-    with naming("fault_free"):
+    with naming_source(run.source), naming("fault_free"):
         part = usable_part(run.plant, fault_free_part(whole, *c.fault_free))
         if end <= c.fault_free[1]:
             raise ValueError(

@@ -1,4 +1,4 @@
-"""Progress of a job, as told to a function of the caller."""
+"""Progress of a job, reported to a function of the caller."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 Tell = Callable[[float, str], None]
 """Receives the completed share of a job, from 0 to 1, and a line about it."""
 TellEndless = Callable[[float | None, str], None]
-"""The same; the share is None for a job without a known end, such as one along a live source."""
+"""As `Tell`, but the share is None for a job without a known end, such as one along a live source."""
 DIGITS = 3
 """Decimals of a share."""
 

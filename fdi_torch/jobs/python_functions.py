@@ -14,7 +14,7 @@ from typing import Any
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings, read_recording
 from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monitor
 from fdi_torch.config.plant_file import AnyPlant, chosen_plant
-from fdi_torch.config.problems import ConfigError
+from fdi_torch.config.problems import ConfigError, Source
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.study_file import Study, build_study, load_study
 from fdi_torch.effects.catalogue import Catalogue
@@ -37,6 +37,7 @@ from fdi_torch.monitor.events import Event
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.check import doubts_about
 
 AnyRecording = Recording | Mapping[str, Any] | str | Path
 AnyRun = Run | Mapping[str, Any] | str | Path
@@ -57,7 +58,7 @@ def _run_of(run: Any, job: str) -> Run:
     """The run of a file, of its keys, or the built-in example for None. job: named in messages about a mapping."""
     if run is None or isinstance(run, str | Path):
         return load_run(run)
-    return run if isinstance(run, Run) else build_run(_keys(run), Path.cwd(), job)
+    return run if isinstance(run, Run) else build_run(_keys(run), Path.cwd(), Source(job))
 
 
 def _plant_and_recordings(plant: Any, recordings: Any, job: str) -> tuple[PlantDescription, list[Recording]]:
@@ -103,7 +104,7 @@ def simulate(
         raise TypeError("simulate: expected either a run or a plant with the keys of simulate, got both; keep one")
     named = {} if plant is None else {"plant": plant}
     try:
-        return simulate_recording(build_run({**named, "simulate": given}, Path.cwd(), "simulate"))
+        return simulate_recording(build_run({**named, "simulate": given}, Path.cwd(), Source("simulate")))
     except ConfigError as error:  # in a run file, the arguments are the keys of simulate
         problems = [problem.removeprefix("simulate: ").removeprefix("simulate.") for problem in error.problems]
         raise ConfigError([f"simulate: {problem}" for problem in problems]) from None
@@ -193,7 +194,7 @@ def monitor(
     if isinstance(run, str | Path):
         run = load_monitor(run)
     elif not isinstance(run, MonitorRun):
-        run = build_monitor(_keys(run), Path.cwd(), "monitor")
+        run = build_monitor(_keys(run), Path.cwd(), Source("monitor"))
     events: list[Event] = []
     summary = run_monitor(run, MonitorCallbacks(rounded(tell), events.append, lambda prepared: None))
     return MonitorResult(tuple(events), summary.lasted, summary.spent, summary.log)
@@ -246,7 +247,7 @@ def refit(
     plant, segments = _plant_and_recordings(plant, recordings, "refit")
     with one_thread():
         fit = refitted(plant, segments, step=step, tell=rounded(tell), **choices)
-    return RefitResult(fit, misfit_of(fit.rmse, segments, plant))
+    return RefitResult(fit, misfit_of(fit.rmse, segments, plant), doubts_about(segments, plant))
 
 
 def study(
@@ -265,7 +266,7 @@ def study(
     if isinstance(study, str | Path):
         study = load_study(study)
     elif not isinstance(study, Study):
-        study = build_study(_keys(study, advice=""), Path.cwd(), "study")
+        study = build_study(_keys(study, advice=""), Path.cwd(), Source("study"))
     return study_job.run_study(study, resume, cluster, rounded(tell))
 
 

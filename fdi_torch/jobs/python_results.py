@@ -20,7 +20,7 @@ from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.plant_limits import denied_by
+from fdi_torch.recordings.check import doubts_about
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.material import gather
 from fdi_torch.report.sections.gap import posterior_bars
@@ -130,8 +130,13 @@ class FreeRun(Shown):
     @property
     @in_its_units
     def headline(self) -> str:
-        doubts = "".join(f"; {rim.text}" for rim in denied_by(self.plant, [self.recording]))
-        return self.title + doubts
+        return "; ".join([self.title, *self.doubts])
+
+    @property
+    @in_its_units
+    def doubts(self) -> tuple[str, ...]:
+        """What limits the trust in the recording, one sentence each."""
+        return doubts_about([self.recording], self.plant)
 
     @property
     def title(self) -> str:
@@ -163,10 +168,11 @@ class FreeRun(Shown):
 @dataclass(frozen=True, repr=False)
 class RefitResult(Shown):
     """plant: the plant with fitted constants and effects. fit: errors, values and standard errors, SI.
-    misfit: of all recordings."""
+    misfit: of all recordings. doubts: what limits the trust in these, one sentence each."""
 
     fit: Refit
     misfit: Misfit
+    doubts: tuple[str, ...] = ()
 
     @property
     def plant(self) -> PlantDescription:

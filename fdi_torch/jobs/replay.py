@@ -10,6 +10,7 @@ from typing import Any
 from fdi_torch.config.loaded_recordings import LoadedRecording
 from fdi_torch.config.logged_config import logged_gap_settings, logged_mapping, logged_plant
 from fdi_torch.config.monitor_file import build_monitor
+from fdi_torch.config.problems import Source
 from fdi_torch.config.run_file import Run, build_run
 from fdi_torch.config.study_file import build_study
 from fdi_torch.config.yaml_files import with_overrides
@@ -83,7 +84,7 @@ def replay_estimate(log: LoggedRun, path: Path, overrides: Sequence[str], tell: 
 def replay_monitor(log: LoggedRun, path: Path, overrides: Sequence[str], tell: TellEndless, parent: str) -> None:
     """Repeat a monitor run along the samples in the log."""
     _expect_no_data(overrides, ("recording",))
-    run = build_monitor(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
+    run = build_monitor(*_logged_values(log, overrides))
     callbacks = MonitorCallbacks(tell, lambda event: None, lambda prepared: None)
     items = logged_items(log, run)
     about = log.about("data")
@@ -100,7 +101,7 @@ def replay_study(
     log: LoggedRun, path: Path, overrides: Sequence[str], tell: TellEndless, parent: str, *, trials: Sequence[int]
 ) -> None:
     """Repeat trials of a study, and its summary if all trials are repeated."""
-    study = build_study(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
+    study = build_study(*_logged_values(log, overrides))
     logged = range(study.plan.trials) if overrides else (m.payload["trial"] for m in log.messages([TRIAL]))
     numbers = sorted(set(trials or logged))
     done: dict[int, Trial] = {}
@@ -143,7 +144,12 @@ def logged_run(log: LoggedRun, overrides: Iterable[str] = ()) -> Run:
     """The run as its log describes it, with overrides."""
     overrides = list(overrides)
     _expect_no_data(overrides, _DATA_KEYS)
-    return build_run(with_overrides(logged_mapping(log), overrides), log.path.parent, str(log.path))
+    return build_run(*_logged_values(log, overrides))
+
+
+def _logged_values(log: LoggedRun, overrides: Sequence[str]) -> tuple[dict[str, Any], Path, Source]:
+    """The mapping of a log's configuration with overrides, the log's folder, and both."""
+    return with_overrides(logged_mapping(log), overrides), log.path.parent, Source(str(log.path), tuple(overrides))
 
 
 def _expect_no_data(overrides: Iterable[str], keys: Sequence[str]) -> None:

@@ -73,11 +73,12 @@ def simulate_recording(run: Run) -> Recording:
     with naming_source(run.source):
         values = parameter_values(config.faults, network.constants, run.plant)
         _expect_onsets_within(config.duration, values)
-    clean = clean_readings(network, planned, values)
+        clean = clean_readings(network, planned, values)
+        std = noise_std(config.noise, run.plant, clean)
     seed = run.config.seed if config.seed is None else config.seed
     generator = torch.Generator().manual_seed(seed)
     notes = tuple(f"{finding.channel} {finding.text}" for finding in input_findings(planned, run.plant))
-    recording = with_noise(planned, clean, noise_std(config.noise, run.plant, clean), generator, network)
+    recording = with_noise(planned, clean, std, generator, network)
     return replace(recording, notes=notes)
 
 
@@ -86,7 +87,7 @@ def _expect_onsets_within(duration: float, values: Mapping[str, float]) -> None:
     for name, onset in values.items():
         if ParameterName.parse(name).field == "onset" and onset >= duration:
             expected = f"less than the duration of {duration:g} s"
-            raise ConfigError([f"simulate.faults.{name}: expected {expected}, got {onset:g} s"])
+            raise ConfigError([f"expected {expected}, got {onset:g} s"], f"simulate.faults.{name}")
 
 
 def simulated_truth(run: Run) -> dict[str, float]:
@@ -101,12 +102,11 @@ def requested_space(run: Run) -> ParameterSpace:
     """The parameters to estimate, and the constants to calibrate with them."""
     config = run.config.estimate
     if not config.parameters:
-        raise ValueError(
-            f"{run.source}: estimate.parameters: expected at least one, got none; name some, as in T1.leak"
-        )
-    with naming(f"{run.source}: estimate.parameters"):
-        network = build_network(run.plant, placements_of([p.name for p in config.parameters], run.plant))
+        place = run.source.at("estimate.parameters")
+        raise ValueError(f"{place}: expected at least one, got none; name some, as in T1.leak")
     with naming_source(run.source):
+        with naming("estimate.parameters"):
+            network = build_network(run.plant, placements_of([p.name for p in config.parameters], run.plant))
         return estimated_space(config, network.constants, run.plant, bool(run.config.recordings))
 
 

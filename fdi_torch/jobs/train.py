@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.config.loaded_recordings import LoadedRecording
+from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.run_file import Run
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.estimate.fitting import Fitting
@@ -33,9 +34,7 @@ from fdi_torch.jobs.run_setup import (
 )
 from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.recording import Recording
-from fdi_torch.recordings.check import data_warnings
+from fdi_torch.recordings.check import doubts_about
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import notebook_svg, save
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
@@ -120,6 +119,9 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False, listener: Li
     interruption. listener: receives every log message.
     """
     tell = tell or silent
+    if run.config.estimate.windows is not None:
+        place = run.source.at("estimate.windows")
+        raise ConfigError([f"{place}: expected none, got {run.config.estimate.windows:g} s; fdi train fits windows"])
     space = requested_space(run)
     tell(0.0, "reading" if run.config.recordings else "simulating the recording")
     loaded = recordings_of(run)
@@ -136,12 +138,6 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False, listener: Li
         pictures = draw(run, fitting, result, path)
     tell(1.0, "done")
     return TrainResult(result, fitting, truth, path, pictures, profiles, doubts)
-
-
-def doubts_about(recordings: Sequence[Recording], plant: PlantDescription) -> tuple[str, ...]:
-    """Corrections by the readers of the files, and findings that limit the trust in an estimate."""
-    notes = [note for recording in recordings for note in recording.notes]
-    return tuple(dict.fromkeys([*notes, *(s for recording in recordings for s in data_warnings(recording, plant))]))
 
 
 def estimate_logged(

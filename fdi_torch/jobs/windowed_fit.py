@@ -20,16 +20,21 @@ from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of,
 from fdi_torch.jobs.train import log_recordings
 from fdi_torch.logbook import RunLog
 from fdi_torch.parameters import is_effect_parameter
+from fdi_torch.recordings.check import doubts_about
 
 
 @dataclass(frozen=True)
 class WindowedFit:
-    """windows: fitted windows. stretches: periods in which each fault was present. step: of the integration, s."""
+    """windows: fitted windows. stretches: periods in which each fault was present. step: of the integration, s.
+
+    doubts: what limits the trust in the recordings, one sentence each.
+    """
 
     windows: tuple[Window, ...]
     stretches: tuple[Stretch, ...]
     step: float
     log: Path
+    doubts: tuple[str, ...]
 
 
 def fit_windows(run: Run, tell: Tell = silent) -> WindowedFit:
@@ -40,7 +45,8 @@ def fit_windows(run: Run, tell: Tell = silent) -> WindowedFit:
     """
     run = replace(run, plant=without_startup_effects(run.plant, run.plant.channels()))
     if run.config.device != "cpu":
-        raise ConfigError([f"device: expected cpu with estimate.windows, got {run.config.device}; leave it out"])
+        place = run.source.at("device")
+        raise ConfigError([f"{place}: expected cpu with estimate.windows, got {run.config.device}; leave it out"])
     length = run.config.estimate.windows
     assert length is not None
     loaded = recordings_of(run)
@@ -54,20 +60,22 @@ def fit_windows(run: Run, tell: Tell = silent) -> WindowedFit:
         noise = [noise_of(part.recording, run.plant) for part in loaded]
         cuts = [(c, std) for part, std in zip(loaded, noise, strict=True) for c in cut_up(part.recording, length)]
         if not cuts:
-            got = f"{length:g} s; shorten them"
-            raise ConfigError([f"{run.source}: estimate.windows: expected windows shorter than a recording, got {got}"])
+            place = run.source.at("estimate.windows")
+            raise ConfigError([f"{place}: expected windows shorter than a recording, got {length:g} s; shorten them"])
         fittings = [fitting_of(run, space, [LoadedRecording(cut, free)]) for cut, _ in cuts]
         step = hybrid_settings(run.config.estimate).refine_step or window_step(fittings, noise[0])
         windows = []
         for k, (fitting, (cut, std)) in enumerate(zip(fittings, cuts, strict=True)):
             tell(k / len(cuts), f"window at {float(cut.time[0]):g} s")
             windows.append(window_of(fitting, std, suspects, step))
-        result = WindowedFit(tuple(windows), tuple(stretches_of(windows)), step, path)
+        doubts = doubts_about([part.recording for part in loaded], run.plant)
+        result = WindowedFit(tuple(windows), tuple(stretches_of(windows)), step, path, doubts)
         fields = [
             {"start": w.start, "stop": w.stop, "misfit": w.misfit}
             | {f.name: {"size": f.size, "std": f.std, "state": f.state} for f in w.faults}
             for w in windows
         ]
-        log.result({"step": step, "windows": fields, "stretches": [vars(s) for s in result.stretches]})
+        stretches = [vars(s) for s in result.stretches]
+        log.result({"step": step, "doubts": list(doubts), "windows": fields, "stretches": stretches})
     tell(1.0, "done")
     return result

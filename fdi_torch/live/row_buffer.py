@@ -123,14 +123,14 @@ class RowBuffer:
 
     def _release(self, stamp: float) -> Row | None:
         """The row with that stamp; None before the first reading."""
-        found = self._pending.pop(stamp).values
-        if self.origin is None and max(found, default=-1) >= self._inputs:
+        received = self._pending.pop(stamp).values
+        if self.origin is None and max(received, default=-1) >= self._inputs:
             self.origin = stamp
         self._last = stamp
         self._released[stamp] = None
         if len(self._released) > MOST_REMEMBERED:
             self._released.pop(next(iter(self._released)))
-        values = [self._filled(k, found, stamp) for k in range(len(self.channels))]
+        values = [self._filled(k, received, stamp) for k in range(len(self.channels))]
         if self.origin is None:
             return None
         t = round(stamp - self.origin, 6) if self.origin else stamp

@@ -33,13 +33,13 @@ def export(run: Run, topic: str, form: str, stream: BinaryIO) -> int:
     csv: one row per message, units in the header (`h1_m`, `Q1_m3_s`), lists as JSON. ndjson: the messages unchanged.
     npz: one array per field of numbers or text. Raises LogError if the topic has no messages.
     """
-    if form not in _FORMS:
-        raise ValueError(f"expected one of the formats {', '.join(_FORMS)}, got {form}")
+    if form not in FORMATS:
+        raise ValueError(f"expected one of the formats {', '.join(FORMATS)}, got {form}")
     messages = list(run.messages([topic]))
     if not messages:
         known = ", ".join(sorted({message.topic for message in run.messages()})) or "(none)"
         raise LogError(f"{run.path}: expected one of the topics {known}, got {topic}")
-    _FORMS[form](run, messages, stream)
+    FORMATS[form](run, messages, stream)
     return len(messages)
 
 
@@ -90,7 +90,7 @@ def _npz(_run: Run, messages: Sequence[Message], stream: BinaryIO) -> None:
     np.savez_compressed(stream, **usable)  # type: ignore[arg-type]
 
 
-_FORMS: dict[str, Callable[[Run, Sequence[Message], BinaryIO], None]] = {"csv": _csv, "ndjson": _ndjson, "npz": _npz}
+FORMATS: dict[str, Callable[[Run, Sequence[Message], BinaryIO], None]] = {"csv": _csv, "ndjson": _ndjson, "npz": _npz}
 
 
 def _columns(messages: Sequence[Message]) -> tuple[list[str], dict[str, str]]:

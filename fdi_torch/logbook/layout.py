@@ -70,12 +70,12 @@ def foxglove_layout(run: Run) -> dict[str, Any]:
 def numeric_fields(run: Run) -> dict[str, dict[str, str]]:
     """For each topic, its numeric fields with their units."""
     fields: dict[str, dict[str, str]] = {}
-    seen = set()
+    channels = set()
     for message in run.messages():
         channel = message.channel
-        if channel in seen or not _PLAIN_TOPIC.fullmatch(channel.topic):
+        if channel in channels or not _PLAIN_TOPIC.fullmatch(channel.topic):
             continue
-        seen.add(channel)
+        channels.add(channel)
         units = channel.units
         known = fields.setdefault(channel.topic, {})
         for name, part in _properties(channel.schema_data).items():
@@ -87,8 +87,8 @@ def numeric_fields(run: Run) -> dict[str, dict[str, str]]:
 def _properties(schema: bytes) -> dict[str, Any]:
     """The properties of a JSON schema; empty for other schemas."""
     try:
-        found = orjson.loads(schema)["properties"]
-        return {name: part for name, part in found.items() if isinstance(part, dict)}
+        properties = orjson.loads(schema)["properties"]
+        return {name: part for name, part in properties.items() if isinstance(part, dict)}
     except (ValueError, KeyError, TypeError, AttributeError):
         return {}
 
@@ -130,7 +130,7 @@ def _residual_plots(fields: Fields) -> list[Panel]:
 
 
 def _tests(present: Mapping[str, str]) -> list[str]:
-    """What the monitor's statistics are of: a sensor, or all of them by a chart such as cusum."""
+    """The subject of a test statistic of the monitor: a sensor, or all sensors together by a detector such as cusum."""
     return [name.removesuffix(_TEST[0]) for name in present if name.endswith(_TEST[0])]
 
 

@@ -87,6 +87,14 @@ def fault_warnings(
     return [f"{fault} {since}, explains the part taken for fault-free: {QUESTION}"]
 
 
+def learning_times(noise: NoiseModel, detector: Detector) -> tuple[float, float]:
+    """How long the noise was learnt, and how long would determine the false-alarm rate within a factor of RATE_FACTOR
+    (95 %), s.
+    """
+    seconds = noise.whitening.samples * detector.design.interval
+    return seconds, seconds * detector.design.learning_factor(RATE_FACTOR)
+
+
 def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -> str:
     """Text: the expected time between false alarms, the 95 % interval of their number in it, and how long a fault-free
     part would determine their rate within a factor of RATE_FACTOR (95 %).
@@ -94,10 +102,8 @@ def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -
     The text gives no interval of the rate itself, because the mean rate may lie outside of it: a small share of the
     posterior of the noise may dominate the mean.
     """
-    design = detector.design
-    seconds = noise.whitening.samples * design.interval
-    needed = seconds * design.learning_factor(RATE_FACTOR)
-    fewest, most = (design.count_quantile(every, p) for p in (0.025, 0.975))
+    seconds, needed = learning_times(noise, detector)
+    fewest, most = (detector.design.count_quantile(every, p) for p in (0.025, 0.975))
     text = (
         f"the noise is learnt from {quantity_text(seconds, 's')} ({quantity_text(needed, 's')} needed); expect one "
         f"false alarm in {quantity_text(every, 's', 5)} ({fewest} to {most} with a probability of 95 %)"

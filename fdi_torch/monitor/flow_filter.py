@@ -171,7 +171,7 @@ class FlowFilter:
     def error_of_sums(self, length: int) -> Tensor:
         """Standard error (sensors,) of ln of the standard deviation of sums of `length` innovations.
 
-        It is for innovations that were scaled to unit variance in the recording (delta method).
+        Computed by the delta method, for innovations that were scaled to unit variance over the recording.
         """
         power, half = self.spectra.abs().square() @ self._by_parameters, 0.5 * _frequencies(self.transition)
         of_sums = (torch.sin(length * half) / torch.sin(half)).square() / length

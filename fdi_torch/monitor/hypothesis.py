@@ -71,7 +71,7 @@ class Hypothesis:
         return len(self.new) + bool(self.recovered)
 
     def with_fault(self, fault: Fault) -> Hypothesis:
-        """The same with a further fault at the same onset."""
+        """The hypothesis with a further fault at the same onset."""
         columns, shape = {*self.columns, *fault.columns}, {*self.shape, *fault.shape}
         return Hypothesis(tuple(sorted(columns)), self.incipient, tuple(sorted(shape)), self.recovered)
 

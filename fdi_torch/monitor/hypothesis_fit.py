@@ -190,7 +190,7 @@ class _Slots:
         return torch.where(self.used, values.gather(1, self.columns), 0.0)
 
     def inserted(self, points: Tensor, values: Tensor, lanes: Tensor) -> Tensor:
-        """Those of the points (H, P+1) in `lanes` (L,), with values (L, Q) in their free columns."""
+        """The points (H, P+1) at the indices `lanes` (L,), with values (L, Q) in their free columns."""
         result, (row, slot) = points[lanes], self.used[lanes].nonzero(as_tuple=True)
         result[row, self.columns[lanes][row, slot]] = values[row, slot]
         return result

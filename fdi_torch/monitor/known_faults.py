@@ -76,9 +76,9 @@ def _relative_effect(
 def effect_of_value(
     observer: ObserverBank, window: ObserverWindow, before: Tensor, change: ChangeHypotheses, column: int, value: float
 ) -> tuple[float, float]:
-    """What another value of a parameter after a change adds to the white innovations since then: its root mean square,
-    and the misfit (half a sum of squares) with it less that without it.
+    """Effect on the white innovations of setting one parameter to another value after a change.
 
+    Returns the root mean square of the difference, and the increase of the misfit (half the sum of squares).
     before (P,): parameters before the change, which has one lane.
     """
     theta = change.theta.repeat(2, 1)

@@ -105,7 +105,7 @@ class LawErrors:
         return own.as_calibrated()
 
     def as_calibrated(self) -> LawErrors:
-        """The same if the constants are known as in `constants`: as at the end of the fault-free part."""
+        """The errors, with those of constants reset to `constants`, what the fault-free part tells about them."""
         own, constants = self._of_constants, self.constants
         mean, covariance = self.mean.clone(), self.covariance.clone()
         mean[own], covariance[own], covariance[:, own] = 0.0, 0.0, 0.0
@@ -117,8 +117,11 @@ class LawErrors:
         return slice(2 * len(self.columns), 2 * len(self.columns) + len(self.constants.columns))
 
     def as_learnt(self) -> LawErrors:
-        """The same at the end of the fault-free part. What it tells about constants that were calibrated on it is known
-        already, so that it counts for the others only."""
+        """The errors at the end of the fault-free part, as a prior for what follows.
+
+        `constants` already holds what that part tells about the constants that were calibrated on it, so that only the
+        errors of the others are updated.
+        """
         own, constants, count = self._of_constants, self.constants, self.constants.calibrated
         mean, covariance = self.mean[own].clone(), self.covariance[own, own].clone()
         mean[:count], covariance[:count], covariance[:, :count] = 0.0, 0.0, 0.0
@@ -126,7 +129,7 @@ class LawErrors:
         return replace(self, constants=replace(constants, mean=mean, covariance=covariance)).as_calibrated()
 
     def with_unknown_deviation(self) -> LawErrors:
-        """The same if nothing is known about b from now on."""
+        """The errors, with nothing known about b from now on."""
         known = 2 * len(self.columns) + len(self.constants.columns)
         mean, covariance = torch.zeros_like(self.mean), torch.zeros_like(self.covariance)
         mean[:known], covariance[:known, :known] = self.mean[:known], self.covariance[:known, :known]

@@ -48,7 +48,7 @@ class Monitor:
     """Monitor of one plant. It holds no state of its own: `advance` takes a state and returns the next one.
 
     The first `watched` parameters of `space` (all by default) are faults that may occur, and the last `unlisted` ones
-    faults that are not on the list: none of them is told by its name, nor used by the observer. The others are
+    faults that are not on the list: none of them is reported by its name, nor used by the observer. The others are
     calibrated constants, which stay fixed.
     """
 

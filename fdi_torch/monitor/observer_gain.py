@@ -33,12 +33,12 @@ class Gain:
     inflation: Tensor
 
     def table(self, first: int, count: int) -> Tensor:
-        """The gains of `count` samples from the `first` of a run on, (count, *batch, tanks, sensors)."""
+        """Gains of `count` samples, of which the first has the number `first`: (count, *batch, tanks, sensors)."""
         opening = self.opening[first : first + count]
         return torch.cat([opening, self.steady.expand(count - len(opening), *self.steady.shape)])
 
     def spread(self, first: int, count: int) -> Tensor:
-        """`inflation` (*batch, count, sensors) of `count` samples from the `first` of a run on; 1 after its opening."""
+        """Inflation (*batch, count, sensors) of the same samples; 1 after the first K samples of a run."""
         opening = self.inflation[first : first + count]
         steady = torch.ones_like(self.steady[..., 0, :]).expand(count - len(opening), *self.steady[..., 0, :].shape)
         return torch.cat([opening, steady]).movedim(0, -2)

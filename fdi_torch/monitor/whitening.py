@@ -79,7 +79,7 @@ class Whitening:
         return self.flows(residual, number, memory)
 
     def of_innovations(self, innovations: Tensor) -> Tensor:
-        """White e of innovations (*batch, S, C). Those before the first sample equal the mean."""
+        """White e of innovations (*batch, S, C). Innovations before the first sample are taken to equal their mean."""
         deviation = innovations - self.mean
         own = deviation
         for lag, matrix in enumerate(self.coefficients, start=1):

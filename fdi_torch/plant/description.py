@@ -185,7 +185,7 @@ class PlantDescription:
         return pairs.get(location, tuple(t.name for t in self.tanks if t.name == location))
 
     def floor_outlets(self, tank: str) -> tuple[str, ...]:
-        """Names of the outlets from a tank's floor without a valve; each, wider, is the same as a leak there."""
+        """Names of a tank's outlets at its floor without a valve; a leak of the tank is the same as a wider outlet."""
         outlets = (p for p in self.pipes if p.source == tank and p.target == OUTSIDE)
         return tuple(p.name for p in outlets if p.elevation == 0.0 and p.valve is None)
 

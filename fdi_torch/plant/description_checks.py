@@ -18,11 +18,11 @@ def check_names(plant: PlantDescription) -> None:
     """Raise ValueError for a plant without tanks, or with a name that is used twice."""
     if not plant.tanks:
         raise ValueError(f"{plant.title}: expected at least one tank, got none; add one under tanks")
-    seen: set[str] = {OUTSIDE}
+    names: set[str] = {OUTSIDE}
     for name in plant.locations():
-        if name in seen:
+        if name in names:
             raise ValueError(f"{plant.title}: expected each name once, got '{name}' twice; rename one")
-        seen.add(name)
+        names.add(name)
 
 
 def check_references(plant: PlantDescription) -> None:

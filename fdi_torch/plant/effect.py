@@ -51,7 +51,7 @@ class Effect:
     reading. startup_only: whether it acts only until its component has run for the first time. capacity_share: whether
     its size is a share of the capacity of its tank's reference pipe. instants: its parameters that are times, of which
     its starts form a grid: an onset, or the begin and the duration of an interval. searched: whether a gap diagnosis
-    searches it without being told to.
+    searches it by default.
 
     The first parameter is the effect's size: at its nominal value the effect is absent. The others are its shape; their
     nominal values are typical ones, or those that keep the effect simple (onset 0, ramp 0).

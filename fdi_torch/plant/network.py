@@ -152,12 +152,12 @@ class TankNetwork(nn.Module):
     def _at_states(self, point: OperatingPoint) -> list[FlowBefore]:
         """Each effect with states, the flow before it and its conditions, in the order of the state vector."""
         places = {p.location for p in self._with_states}
-        found = [each for c in self._first_flows if c.name in places for each in self._through_effects(point, c)[1]]
+        flows = [each for c in self._first_flows if c.name in places for each in self._through_effects(point, c)[1]]
         for placement in self._with_states:
             if placement.effect.stage is Stage.BALANCE:
                 local = self._at_balance(point, placement)
-                found.append((placement, torch.zeros_like(local.level), local))
-        return sorted(found, key=lambda each: self._with_states.index(each[0]))
+                flows.append((placement, torch.zeros_like(local.level), local))
+        return sorted(flows, key=lambda each: self._with_states.index(each[0]))
 
     def commands(
         self, channels: Sequence[Tensor], memory: Memory, clock: Clock, values: PlaceValues
@@ -174,11 +174,11 @@ class TankNetwork(nn.Module):
         return self._command_chain.delays(values)
 
     def flows(self, point: OperatingPoint) -> dict[str, Tensor]:
-        """FLOW of each component whose flow does not depend on net inflows, by its name, m^3/s."""
+        """Flow of each component whose flow does not depend on net inflows, with its FLOW effects, by name, m^3/s."""
         return {component.name: self.flow(point, component) for component in self._first_flows}
 
     def flow(self, point: OperatingPoint, component: FlowComponent, net: Tensor | None = None) -> Tensor:
-        """FLOW of one component, m^3/s, positive from source to target: its law, changed by its effects, limited.
+        """Flow of one component, m^3/s, positive from source to target: its law, changed by its FLOW effects, limited.
 
         net: inflow of its source by the flows that are computed before it, m^3/s.
         """
@@ -211,7 +211,7 @@ class TankNetwork(nn.Module):
         return net
 
     def last_flows(self, point: OperatingPoint, net: Sequence[Tensor]) -> tuple[dict[str, Tensor], list[Tensor]]:
-        """FLOW of each component that depends on the net inflow of its source, and the net inflows after it, m^3/s."""
+        """Flow of each component that depends on the net inflow of its source, and the net inflows after it, m^3/s."""
         inflows, flows = list(net), {}
         for component in self._last_flows:
             flow = self.flow(point, component, inflows[self._tank_index[component.source]])

@@ -86,10 +86,10 @@ def limit_spill(
 ) -> torch.Tensor:
     """Flow over a crest (m^3/s), limited so that the tank is stable at a step of `resolution` (s).
 
-    The law has the flow w = `flow` and the derivative w' = `slope` (m^2/s) at the excess (m) above the crest. Its time
-    constant A / w' is much shorter than that of the tank. Where w' r / A, with r = `resolution`, exceeds its stable
-    limit by a > 0, the flow is taken linearly implicitly (Rosenbrock, 1963): (w + a q) / (1 + a), with the net inflow
-    q = `inflow` (m^3/s) of the tank. The steady state is w = q for every step.
+    The law has the flow w = `flow` and the derivative w' = `slope` (m^2/s) at the excess (m) above the crest. The time
+    constant A / w' of the overflow is much shorter than that of the tank. Where w' r / A, with r = `resolution`,
+    exceeds its stable limit by a > 0, the flow is taken linearly implicitly (Rosenbrock, 1963): (w + a q) / (1 + a),
+    with the net inflow q = `inflow` (m^3/s) of the tank. The steady state is w = q for every step.
     """
     stiffness = torch.clamp(slope * resolution / tank_area - STABLE_SPILL_TIMES_STEP, min=0.0)
     spill = torch.clamp((flow + stiffness * inflow) / (1.0 + stiffness), min=0.0)

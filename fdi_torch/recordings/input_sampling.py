@@ -1,7 +1,7 @@
 """Commands that move faster than they are sampled, so that the flow between two samples is not known.
 
 A command with a low correlation of successive samples is *undersampled*, unless it is held from each sample to the
-next. Whether it is held follows from the level of its tank, which cannot depend on a command that is yet to come:
+next. A regression of the tank's rate of change shows whether it is held, because no level depends on a later command:
 
     A (h[k+1] - h[k]) / d = a + b[-2] u[k-2] + b[-1] u[k-1] + b[0] u[k] + b[1] u[k+1] + error
 

@@ -16,7 +16,7 @@ from fdi_torch.plant.description import PlantDescription, Sensor, Tank, with_tol
 from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.plant_units import refusal
+from fdi_torch.recordings.plant_units import doubtful_units, refusal
 from fdi_torch.sample_noise import sample_noise
 
 
@@ -110,9 +110,17 @@ def with_rims_unknown(plant: PlantDescription, recordings: Sequence[Recording]) 
     return with_tolerances(replace(plant, tanks=tanks), lambda name: str(name) not in unknown)
 
 
-def plant_limit_findings(recording: Recording, plant: PlantDescription) -> Iterator[ChannelFinding]:
+def plant_findings(recording: Recording, plant: PlantDescription) -> list[ChannelFinding]:
+    """Findings by the plant's limits and, where these call no unit wrong, by the volume balance of its tanks."""
+    findings = list(_limit_findings(recording, plant))
+    settled = recording.trusted or any(finding.kind == "unit" for finding in findings)
+    doubts = [] if settled else doubtful_units(plant, recording)
+    return findings + [ChannelFinding("unit", columns, text) for columns, text in doubts]
+
+
+def _limit_findings(recording: Recording, plant: PlantDescription) -> Iterator[ChannelFinding]:
     """Findings of all sensors, pumps, transfers and valves that the recording has."""
-    denied = {each.sensor.column: each for each in denied_rims(plant, recording)}
+    denied = {each.sensor.column: each for each in denied_by(plant, [recording])}
     for sensor in plant.sensors:
         if sensor.column in recording.output_names:
             column = recording.output_names.index(sensor.column)
@@ -166,7 +174,7 @@ def _level_findings(
 
 
 def _level(value: float, sensor: Sensor) -> str:
-    """A level, m, in the unit of a sensor's readings if they are levels."""
+    """A level (given in m) as text, in the unit in which the sensor reads levels."""
     return quantity_text(value, "m", name=sensor.column)
 
 

@@ -101,7 +101,7 @@ def _credible(as_is: Balance, corrections: list[Correction], unrelated: float) -
 def _lead(correction: Correction, as_is: Balance, unrelated: float) -> float:
     """Gain in log evidence by a correction.
 
-    One that puts a level above a pump's cut-out leaves no flow, hence no balance: it is no better for that.
+    A correction that puts a level above a pump's cut-out leaves a tank without a balance, which counts as no gain.
     """
     return float((correction.balance.log_evidence(unrelated) - as_is.log_evidence(unrelated)).nansum())
 

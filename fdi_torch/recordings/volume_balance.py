@@ -59,7 +59,7 @@ class TankBalance:
     intervals: int
 
     def scaled(self, metered: float, by_laws: float) -> TankBalance:
-        """The same with other numbers for metered flows and for flows by laws."""
+        """The balance with other values for metered flows and for flows by laws."""
         return replace(self, by_flow=self.by_flow * torch.where(self.metered, metered, by_laws))
 
     def log_evidence(self, rounding: float, unrelated: float = UNRELATED) -> float:
@@ -79,7 +79,8 @@ class TankBalance:
         """
         if not self.intervals:
             return math.nan
-        information, directions, off, left = _regression(self.by_flow, self.measured - self.by_flow.sum(-1), rounding)
+        excess = self.measured - self.by_flow.sum(-1)
+        information, directions, off, residual = _regression(self.by_flow, excess, rounding)
         if not len(information):
             return math.nan
         variance = SCALE**2 * torch.logspace(-2, 16, 73).to(off)
@@ -90,7 +91,7 @@ class TankBalance:
         without_flows = -0.5 * (information * ((1.0 + off) @ directions).square()).sum()
         weights = torch.tensor([1.0 - unrelated, unrelated]).log()
         either = torch.logsumexp(torch.stack([related, without_flows]) + weights, dim=0)
-        return float(either - 0.5 * GROUPS * (left + self.digits**2).log())
+        return float(either - 0.5 * GROUPS * (residual + self.digits**2).log())
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ class Balance:
     tanks: tuple[TankBalance, ...]
 
     def scaled(self, metered: Tensor, by_laws: Tensor) -> Balance:
-        """The same with other numbers for metered flows and for flows by laws, of each tank (tanks)."""
+        """The balances with other values for metered flows and for flows by laws, of each tank (tanks)."""
         factors = zip(self.tanks, metered.tolist(), by_laws.tolist(), strict=True)
         return Balance(tuple(tank.scaled(*each) for tank, *each in factors))
 
@@ -172,7 +173,7 @@ def _levels(network: TankNetwork, recording: Recording, values: PlaceValues) -> 
 
 
 def _regression(flows: Tensor, excess: Tensor, rounding: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Eigenvalues (D,) and eigenvectors (F, D) of the information of b, b - 1 (F,) and the mean square that is left.
+    """Eigenvalues (D,) and eigenvectors (F, D) of the information of b, b - 1 (F,) and the mean square of the residual.
 
     flows (GROUPS, SUMS, F), excess (GROUPS, SUMS): m. In steady state without noise, the sums differ by rounding only,
     and their scatter does not measure their errors; each counts as uncertain by `rounding`, m, at least. Which D
@@ -185,14 +186,14 @@ def _regression(flows: Tensor, excess: Tensor, rounding: float) -> tuple[Tensor,
     scaled = flows / size
     product = torch.einsum("gni,gnj->ij", scaled, scaled)
     off = _inverse(product) @ torch.einsum("gni,gn->i", scaled, excess)
-    left = excess - scaled @ off
-    scores = torch.einsum("gni,gn->gi", scaled, left)
+    residual = excess - scaled @ off
+    scores = torch.einsum("gni,gn->gi", scaled, residual)
     variance = scores.T @ scores * GROUPS / max(GROUPS - count, 1) + rounding**2 * product
     variances, axes = torch.linalg.eigh(variance)
     known = variances > HALF_OF_DIGITS * variances[-1]
     root = product @ axes[:, known] / variances[known].sqrt()
     directions, lengths, _ = torch.linalg.svd(torch.where(flowing, size, 0.0)[:, None] * root, full_matrices=False)
-    return lengths.square(), directions, off / size, left.square().mean()
+    return lengths.square(), directions, off / size, residual.square().mean()
 
 
 def _inverse(matrix: Tensor) -> Tensor:

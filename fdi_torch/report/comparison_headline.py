@@ -114,15 +114,15 @@ def _differences(compared: Comparison, runs: Sequence[Material]) -> str:
 def setting_differences(compared: Comparison, runs: Sequence[Material]) -> tuple[dict[str, tuple[str, ...]], int]:
     """Settings and seeds that differ, in words: key -> one text per run, and the number of keys that are left out.
 
-    A part that some runs lack, such as a tank, is named without its settings, which are left out if they differ in
-    nothing else: plant.tanks -> ("A, B", "T1, T2, T3").
+    If some runs lack a part of the plant, such as a tank, the parts of each run are listed by name, as in
+    plant.tanks -> ("A, B", "T1, T2, T3"), and the settings of parts that only some runs have are left out.
     """
-    found = compared.differences.get("config", {}) | compared.differences.get("seeds", {})
+    differing = compared.differences.get("config", {}) | compared.differences.get("seeds", {})
     records = [run.about("config") | run.about("seeds") for run in runs]
     has = [{part for key, text in each.items() if text not in NONE for part in _parts(key)} for each in records]
     settings: dict[str, tuple[str, ...]] = {}
     lacking: dict[str, dict[str, str]] = {}  # section -> key -> its part that some runs lack
-    for key, texts in found.items():
+    for key, texts in differing.items():
         words = tuple(plain_text(text) for text in texts)
         if key in NOT_IN_WORDS or len(set(words)) == 1 or _are_one_amount(words):
             continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -17,6 +18,8 @@ from fdi_torch.report.html import short
 from fdi_torch.report.numbers import axis, shown_unit
 from fdi_torch.report.style import MARK, MODEL, SOFT, label_lines, set_panel_title, set_title, styled
 
+ABREAST = 4
+
 
 def fit_figure(
     recording: Recording,
@@ -25,21 +28,25 @@ def fit_figure(
     plant: PlantDescription,
     columns: Sequence[str] | None = None,
 ) -> Figure:
-    """Readings and predictions above, residuals below; one column per sensor.
+    """Readings and predictions of each sensor above its residuals; at most `ABREAST` sensors stand side by side.
 
     predictions: readings (T, N) in SI by the name of the model, the better one last. columns (N,): the outputs of the
     recording that are predicted; by default all. plant: names the sensors.
     """
     columns = recording.output_names if columns is None else columns
-    count = len(columns)
+    rows = math.ceil(len(columns) / ABREAST)
+    abreast = math.ceil(len(columns) / rows)
     with styled():
-        figure = Figure(figsize=(max(4.2 * count, 6.0), 5.2), layout="constrained")
+        figure = Figure(figsize=(max(4.2 * abreast, 6.0), 5.2 * rows), layout="constrained")
         FigureCanvasAgg(figure)
-        axes = figure.subplots(2, count, sharex=True, squeeze=False, height_ratios=(2, 1))
-        for i, column in enumerate(columns):
-            set_panel_title(axes[0, i], short(plant.channel_words(column)))
+        axes = figure.subplots(2 * rows, abreast, sharex=True, squeeze=False, height_ratios=(2, 1) * rows)
+        pairs = [(axes[2 * row, k], axes[2 * row + 1, k]) for row in range(rows) for k in range(abreast)]
+        for i, (column, (upper, lower)) in enumerate(zip(columns, pairs, strict=False)):
+            set_panel_title(upper, short(plant.channel_words(column)))
             of_sensor = {name: predicted[:, i] for name, predicted in predictions.items()}
-            _draw_sensor(axes[0, i], axes[1, i], recording, recording.output_names.index(column), of_sensor)
+            _draw_sensor(upper, lower, recording, recording.output_names.index(column), of_sensor)
+        for unused in (axis for pair in pairs[len(columns) :] for axis in pair):
+            unused.remove()
         set_title(figure, title)
     return figure
 
@@ -58,4 +65,5 @@ def _draw_sensor(upper: Axes, lower: Axes, recording: Recording, i: int, predict
     upper.set_ylabel(axis("reading", unit))
     lower.set_ylabel(axis("residual", unit))
     lower.set_xlabel("time, s")
+    lower.tick_params(labelbottom=True)
     label_lines(upper)

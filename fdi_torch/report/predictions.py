@@ -90,8 +90,8 @@ def progress_of(material: Material) -> Progress:
         return Progress(f"{counted(trials, 'trial')} done" if share is None else f"{trials} of {total} trials", share)
     if material.kind == "monitor" and material.recordings and len(material.recordings[0].time):
         return Progress(f"monitored until {number(float(material.recordings[0].time[-1]), 6)} s")
-    said = material.of("/log")
-    return Progress(str(said[-1].get("message", "")) if said else "started")
+    messages = material.of("/log")
+    return Progress(str(messages[-1].get("message", "")) if messages else "started")
 
 
 def _share(done: Any, total: str) -> float | None:

@@ -1,4 +1,4 @@
-"""What terminal and page say of a gap answer in the same words: the models whose free runs it compares on its
+"""Words about a gap answer that terminal and page share: the models whose free runs it compares on its
 hold-outs, and the random flows that people need to know of.
 """
 
@@ -27,7 +27,7 @@ def has_causes(answer: Mapping[str, Any]) -> bool:
 
 
 def reference_models(answer: Mapping[str, Any]) -> dict[str, str]:
-    """Names of models and noise by their key in the closure; free functions are the best of an unknown cause."""
+    """Names of the compared models and of the noise, by their key in the closure of the answer."""
     if not has_causes(answer):
         return {key: _NAMES[key] for key in ("nominal", "recalibrated", "noise_floor")}
     if answer.get("verdict") == "unknown":

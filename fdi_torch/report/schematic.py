@@ -224,7 +224,7 @@ class _Drawing:
         side = 0.5 if to_x > x else -0.5
         same = [c.name for c in flows if {c.source, c.target} == {component.source, component.target}]
         rise += LOWEST + 0.28 * same.index(component.name)
-        if y == to_y and abs(to_x - x) <= self.column:
+        if y == to_y and abs(to_x - x) < 1.01 * self.column:  # the next tank
             return [(x + side, y + rise), (to_x - side, to_y + rise)]
         if x == to_x and sketch.arrow:
             return self.route_beside((x - 0.5, y + rise), to_x, to_y)
@@ -241,7 +241,7 @@ class _Drawing:
         return [(x, y + self.tall + 0.55 - sketch.round), (x, y + self.tall + 0.06)]
 
     def route_over_wall(self, component: FlowComponent, rise: float) -> list[Point]:
-        """Over a wall of the source at the height `rise`: down outside it, or into the target."""
+        """Points of a line over the source's wall at the height `rise`, then down outside or into the target."""
         x, y = self.corner(component.source)
         if component.target == OUTSIDE:
             return [(x - 0.5, y + rise), (x - ASIDE, y + rise), (x - ASIDE, y - 0.45)]
@@ -252,7 +252,7 @@ class _Drawing:
         return [(x + side, y + rise), (to_x - side, y + rise)]
 
     def route_beside(self, start: Point, to_x: float, to_y: float) -> list[Point]:
-        """From the left wall of a tank past it to the rim of a tank in another row."""
+        """Points of a line from the left wall of a tank, past this tank, to the rim of a tank in another row."""
         self.besides += 1
         lane, above = start[0] + 0.5 - ASIDE - LANE * (self.besides - 1), to_y + self.tall + 0.14 + 0.1 * self.besides
         end = to_x - 0.2 - 0.12 * self.besides

@@ -13,6 +13,7 @@ from fdi_torch.report.material import Material
 from fdi_torch.report.style import inline_svg
 
 REM_PER_INCH = 7.6  # width of a wide picture; its text then has the size of the page's text
+LEAST_REM_PER_INCH = 4.7  # on a small screen, where a picture that is wider still scrolls
 
 
 @dataclass(frozen=True)
@@ -82,5 +83,5 @@ def _figure(picture: Picture, prefix: str) -> Markup:
         return tag("figure", svg, *caption, data_chart=chart_json(picture.chart), data_clock=clock)
     if not picture.wide:
         return tag("figure", svg, *caption)
-    width = f"max-width: {REM_PER_INCH * picture.figure.get_figwidth():.1f}rem"
-    return tag("figure", svg, *caption, class_="wide", style=width)
+    usual, least = (rem * picture.figure.get_figwidth() for rem in (REM_PER_INCH, LEAST_REM_PER_INCH))
+    return tag("figure", svg, *caption, class_="wide", style=f"max-width: {usual:.1f}rem; --least: {least:.1f}rem")

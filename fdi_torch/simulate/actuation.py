@@ -79,7 +79,8 @@ class Actuation:
 class NetworkStage:
     """The actuators or the sensors of a network as a stage whose parameters `names` are free.
 
-    outputs: outputs and new memory, steady: the memory at rest; both of signals, a clock and values.
+    outputs: computes the outputs and the new memory from the signals, the memory, the clock and the effects' values.
+    steady: computes the memory in steady state from the signals, the clock and these values.
     """
 
     outputs: Callable[[Signals, Memory, Clock, PlaceValues], tuple[Signals, Memory]]

@@ -170,7 +170,7 @@ class Collocation:
         return self._output_map.look(levels.movedim(1, 2), values, self._columns(theta))
 
     def apart(self, theta: Tensor, near: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:
-        """The same as of `JointCollocation`, for one recording."""
+        """As `JointCollocation`, for one recording."""
         return [(self, theta, near)]
 
     def _columns(self, theta: Tensor) -> list[Tensor]:
@@ -246,7 +246,7 @@ class Collocation:
         network = self.network if reaches_rim else self._without_overflow
         values, moving = self.network.bind(self.space, theta.unsqueeze(-2)), self._columns(theta) if slopes else []
         commands, command_slopes, columns = self._commands(values, moving, len(theta))
-        found = traced_rates(network, self.space.names)(
+        traced = traced_rates(network, self.space.names)(
             middle,
             commands,
             theta,
@@ -256,14 +256,14 @@ class Collocation:
             moved=self._moved if slopes else [],
         )
         by_theta = middle.new_zeros(*middle.shape[:2], len(self.by) if slopes else 0, middle.shape[-1])
-        for (i, p), slope in found.by_parameter.items():
+        for (i, p), slope in traced.by_parameter.items():
             by_theta[:, i, self._column_of[p]] = slope
-        for (i, d), slope in found.by_command.items():
+        for (i, d), slope in traced.by_command.items():
             course = command_slopes[d]
             assert course is not None
             for q, column in enumerate(columns):
                 by_theta[:, i, self._moving[column]] += slope * course[:, q]
-        return found.rates, found.by_state, by_theta
+        return traced.rates, traced.by_state, by_theta
 
     def _commands(
         self, values: PlaceValues, moving: Sequence[Tensor], lanes: int

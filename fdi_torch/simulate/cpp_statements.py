@@ -141,10 +141,10 @@ class Statements:
 def guarded(graph: Graph, order: Sequence[int], outputs: Collection[int]) -> dict[int, int]:
     """Nodes of `order` that matter only where a condition holds -> the node of that condition.
 
-    Such a node is used only in the first branch of `where`s with that condition, or by other such nodes, and is no
-    output. A level rarely exceeds its rim, so the square roots and quotients of the weir are skipped for a vector of
-    lanes in which none does. How lanes share vectors affects what is computed but no result: each lane selects by its
-    own condition. Conditions that would save no expensive operation are left out.
+    Such a node is no output, and is used only in the first branch of `where(condition, ...)`, or by other such nodes. A
+    level rarely exceeds its rim, so the square roots and quotients of the weir are skipped for a vector of lanes in
+    which none does. How lanes share vectors affects what is computed but no result: each lane selects by its own
+    condition. Conditions that would save no expensive operation are left out.
     """
     conditions: dict[int, set[int | None]] = {i: {None} for i in outputs}
     owner: dict[int, int] = {}

@@ -132,7 +132,8 @@ def grid_nodes(
     """Step ends (K+1,) s from the first to the last sample.
 
     A step ends at every switch of the inputs (S, M), and at every sample of time (S,) unless samples are denser than
-    `step` s; `every` forces the latter. If inputs switch faster than half a step on average, they are averaged instead.
+    `step` s. every: end a step at every sample even then. Inputs that switch faster than half a step on average are
+    averaged over steps.
     """
     is_anchor, span = torch.ones_like(time, dtype=torch.bool), float(time[-1] - time[0])
     if hold == "zero_order":

@@ -91,7 +91,7 @@ class Interpreter:
         return values
 
     def _plan(self, needed: list[int]) -> _Plan:
-        """What varies from step to step, in order; everything else is computed here."""
+        """The values that vary from step to step, in order; all others are computed here."""
         plan, graph = _Plan(), self.program.graph
         for i in graph.reach(needed):
             node = graph.nodes[i]

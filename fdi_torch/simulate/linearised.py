@@ -32,7 +32,7 @@ class Linearised:
         return Linearised(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
 
     def replaced(self, which: Tensor, new: Linearised) -> Linearised:
-        """The same with the lanes at indices `which` replaced by those of `new`."""
+        """The trajectory, with the lanes at indices `which` replaced by those of `new`."""
         if len(which) == len(self.defect):
             return new
         names = self.__dataclass_fields__

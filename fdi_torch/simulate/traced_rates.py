@@ -120,20 +120,21 @@ class TracedRates:
                 {node: i for i, node in enumerate(self._theta) if i in moved},
             ]
             rows = self._graph.partials(self._rates, [node for kind in kinds for node in kind])
-            found = [
+            slopes = [
                 {(i, kind[n]): slope for i, row in enumerate(rows) for n, slope in row.items() if n in kind}
                 for kind in kinds
             ]
-            nodes = [*self._rates, *(node for each in found for node in each.values())]
+            nodes = [*self._rates, *(node for each in slopes for node in each.values())]
             self._programs[key] = _Slopes(
-                list(found[0]), list(found[1]), list(found[2]), ArrayProgram(self._graph, nodes)
+                list(slopes[0]), list(slopes[1]), list(slopes[2]), ArrayProgram(self._graph, nodes)
             )
         return self._programs[key]
 
 
 @dataclass(frozen=True)
 class _Slopes:
-    """The program of the rates and then of these slopes, each by its two indices."""
+    """The program that computes the rates and then these slopes. Each slope is named by two indices, of its rate and of
+    the state, command or parameter."""
 
     by_state: list[Entry]
     by_command: list[Entry]

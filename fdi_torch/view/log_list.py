@@ -53,8 +53,8 @@ class LogList:
 
     def paths(self) -> dict[str, Path]:
         """Paths of all logs by name, complete and unfinished."""
-        found = (p for ending in ("mcap", f"mcap{PARTIAL}") for p in self.folder.rglob(f"*.{ending}") if p.is_file())
-        return {path.relative_to(self.folder).as_posix(): path for path in sorted(found)}
+        files = (p for ending in ("mcap", f"mcap{PARTIAL}") for p in self.folder.rglob(f"*.{ending}") if p.is_file())
+        return {path.relative_to(self.folder).as_posix(): path for path in sorted(files)}
 
     def path(self, name: str) -> Path | None:
         """The log of that name; for an unfinished log that has ended meanwhile, the finished one. None if unknown."""

@@ -128,8 +128,8 @@ def follow_page(entry: Entry, material: Material | None) -> str:
     content += [tag("p", _bar(entry.progress)), tag("p", f"running, started {entry.started or 'just now'} UTC")]
     content.append(tag("p", tag("a", "report of what is logged so far", href=address("/report", log=entry.name))))
     if material is not None:
-        said = [*material.of("/observer/alarm"), *material.of("/log")]
-        rows = [[number(float(m.get("t", math.nan)), 6), m.get("message", "")] for m in said]
+        messages = [*material.of("/observer/alarm"), *material.of("/log")]
+        rows = [[number(float(m.get("t", math.nan)), 6), m.get("message", "")] for m in messages]
         if rows:
             content.append(
                 tag("section", tag("h3", "Newest events"), table(("t, s", "event"), rows[-NEWEST:][::-1], 2))

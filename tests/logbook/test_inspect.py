@@ -13,7 +13,7 @@ from example_logs import FIXED, write_chunks
 from mcap.reader import make_reader
 
 from fdi_torch.logbook import LogError, RunLog, export, export_attachment, inspect_log, read_run
-from fdi_torch.logbook.export import safe_name
+from fdi_torch.logbook.export import FORMATS, safe_name
 from fdi_torch.logbook.reader import Run
 from fdi_torch.logbook.sink import Sink
 from fdi_torch.logbook.topic_definitions import TOPICS
@@ -118,7 +118,7 @@ def test_npz_holds_numbers_and_texts(finished: Path) -> None:
         assert "values" not in found and found["status"].tolist() == ["converged"]
 
 
-@pytest.mark.parametrize("form", ["csv", "ndjson", "npz"])
+@pytest.mark.parametrize("form", FORMATS)
 def test_an_export_reads_the_log_once(finished: Path, form: str, monkeypatch: pytest.MonkeyPatch) -> None:
     passes: list[Path] = []
     walk = Run.walk
@@ -127,7 +127,7 @@ def test_an_export_reads_the_log_once(finished: Path, form: str, monkeypatch: py
     assert len(passes) == 1
 
 
-@pytest.mark.parametrize("form", ["csv", "ndjson", "npz"])
+@pytest.mark.parametrize("form", FORMATS)
 def test_a_topic_that_is_not_there(finished: Path, form: str) -> None:
     with pytest.raises(LogError, match=r"expected one of the topics /diagnosis/fault, .*, got /no"):
         export(read_run(finished), "/no", form, stream := io.BytesIO())

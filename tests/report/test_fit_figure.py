@@ -8,7 +8,9 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
+from fdi_torch import Plant
 from fdi_torch.config.plant_file import load_plant
+from fdi_torch.plant.description import Sensor, Tank
 from fdi_torch.recording import Recording
 from fdi_torch.report.chart import Chart, Line, draw
 from fdi_torch.report.fit_figure import fit_figure
@@ -65,3 +67,12 @@ def test_a_value_stays_beside_its_error() -> None:
     for words in range(1, 14):
         set_title(figure, "word " * words + "size 0.15030 ± 0.00018")
         assert "±\n" not in figure.get_suptitle() and "\n±" not in figure.get_suptitle()
+
+
+def test_many_sensors_stand_in_rows() -> None:
+    plant = Plant([Tank(f"T{k}", 0.1, 1.0) for k in range(7)], sensors=[Sensor(f"h{k}", f"T{k}") for k in range(7)])
+    time, read = torch.arange(5.0, dtype=torch.float64), torch.ones(5, 7, dtype=torch.float64)
+    recording = plant.recording(time, read[:, :0], read, source="run.csv")
+    figure = fit_figure(recording, {"estimate": read}, "run", plant)
+    assert figure.get_figwidth() < 20.0 and len(figure.axes) == 14
+    assert all(axes.xaxis.get_tick_params()["labelbottom"] for axes in figure.axes if "residual" in axes.get_ylabel())

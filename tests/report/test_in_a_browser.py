@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import re
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +26,13 @@ from sample_runs import (
     write_train,
 )
 
+from fdi_torch import Plant
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.jobs.report import comparison_of
-from fdi_torch.report.page import RunReport, page, report_of
+from fdi_torch.plant.description import Pipe, Sensor, Tank
+from fdi_torch.report.page import RunReport, document, page, report_of
+from fdi_torch.report.schematic import Overlay, schematic
+from fdi_torch.report.section import Picture, Section, section_html
 from fdi_torch.view.log_list import LogList
 from fdi_torch.view.pages import list_page, query_of
 
@@ -228,3 +233,21 @@ def test_an_estimate_beside_the_rig_shows_all_its_columns(browser: Any, tmp_path
     rig, window = tab.locator(".lead > section").first.bounding_box(), tab.evaluate("document.body.scrollWidth")
     assert hidden <= 0 and rig["width"] >= 280 and window <= width
     tab.context.close()
+
+
+def test_a_wide_rig_scrolls_on_a_phone_at_a_scale_that_can_be_read(browser: Any, tmp_path: Path) -> None:  # noqa: F811
+    names = [f"T{k}" for k in range(8)]
+    pipes = [Pipe(f"from{a}", a, b, 1e-4, 0.6) for a, b in pairwise(names)]
+    plant = Plant([Tank(name, 0.1, 1.0) for name in names], pipes, sensors=[Sensor("h", "T0")])
+    rig = schematic(plant, Overlay(marks={"T7": ["leak 0.3"]}))
+    (tmp_path / "rig.html").write_text(
+        document("rig", [section_html(Section("rig", [[Picture("rig", rig, "The rig", wide=True)]]), "a", "s")])
+    )
+    for width, scrolls in ((390, True), (1280, False)):
+        tab, _ = opened(browser, tmp_path / "rig.html", width)
+        high = tab.evaluate("document.querySelector('figure text').getBoundingClientRect().height")
+        assert high >= 9.0, width
+        assert tab.evaluate("(f => f.scrollWidth > f.clientWidth)(document.querySelector('figure'))") is scrolls
+        assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        box = tab.get_by_text("leak 0.3").bounding_box()
+        assert 0 < box["x"] < width - box["width"], "what is diagnosed is in view"

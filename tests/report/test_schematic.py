@@ -144,3 +144,12 @@ def test_no_text_stands_on_another_with_effects_everywhere(name: str, effects: i
         assert across < 1.0 or along < 0.25 * min(a.height, b.height), f"{one} stands on {other}"
     for text, box in boxes:
         assert box.x0 >= 0 and box.y0 >= 0 and box.x1 <= figure.bbox.width and box.y1 <= figure.bbox.height, text
+
+
+def test_a_pipe_between_neighbours_is_straight_in_a_long_row() -> None:
+    """Positions of columns are rounded, by more the further right they are."""
+    names = [f"T{k}" for k in range(12)]
+    pipes = [Pipe(f"from{a}", a, b, 1e-4, 0.6) for a, b in pairwise(names)]
+    plant = Plant([Tank(name, 0.1, 1.0) for name in names], pipes, sensors=[Sensor("h", "T0")])
+    lines = [line.get_xydata() for line in schematic(plant).axes[0].lines]
+    assert sum(len(line) == 2 and line[0, 1] == line[1, 1] for line in lines) == len(pipes)

@@ -41,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--named-only", action="store_true", help="report the best named effect instead of `unknown`")
     parser.add_argument("--adopt", metavar="FILE", help="write the plant file with the causes added to its effects")
+    parser.add_argument("--replace", action="store_true", help="--adopt overwrites a file that exists")
     parser.add_argument(
         "--with-constants", action="store_true", help="--adopt also writes the constants fitted with the causes"
     )

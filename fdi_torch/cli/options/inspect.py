@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 STEP, SUMMARY = "look", "show what a log contains and whether it is intact, or export its messages"
+FORMATS = ("csv", "ndjson", "npz")  # those of logbook.export
 EXAMPLES = """
 examples:
   fdi inspect logs/own.mcap                        contents and integrity
@@ -17,9 +18,7 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("log", metavar="RUN.mcap", help="an MCAP file, complete or not")
     parser.add_argument("--topic", metavar="T", help="write the messages of this topic instead")
-    parser.add_argument(
-        "--format", choices=("csv", "ndjson", "npz"), default="csv", help="output format (default: csv)"
-    )
+    parser.add_argument("--format", choices=FORMATS, default="csv", help="output format (default: csv)")
     parser.add_argument("--attachment", metavar="NAME", help="write this attachment instead, such as config.yaml")
     parser.add_argument(
         "--layout", metavar="FILE.json", help="write a layout for Foxglove and Lichtblick that shows this very log"

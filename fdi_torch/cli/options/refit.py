@@ -44,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_start_samples(parser)
     parser.add_argument("--adopt", metavar="FILE", help="write the plant file with the fitted values")
+    parser.add_argument("--replace", action="store_true", help="--adopt overwrites a file that exists")
     parser.add_argument(
         "--narrow", action="store_true", help="there, use the standard errors of the fit as tolerances where smaller"
     )

@@ -165,7 +165,7 @@ def _start_from_samples(fitter: Fitter) -> tuple[Collocation, Tensor]:
 
 
 def _start_from_segment(fitter: Fitter, samples: int) -> tuple[Collocation, Tensor]:
-    """The same from the first samples as an initial segment with unknown inflows."""
+    """The engine and its parameters (1, P) from the first samples as an initial segment with unknown inflows."""
     data = fitter.data
     plant = replace(data.plant, tolerances={n: data.plant.tolerances[n] for n in data.plant.varying})
     first, step = data.recording.stretch(0, samples), float(data.experiment.steps.max())

@@ -75,12 +75,12 @@ class LocalSignals:
         return low, max(high, low + 1e-9 * (max(abs(low), abs(high)) or 1.0))
 
     def smooth(self, signal: str, count: int, factor: str = "") -> Terms:
-        """A piecewise linear function with 2 `count` nodes; kinks FINER times as close."""
+        """A piecewise linear function with 2 `count` nodes, and kinks between these, at FINER times as many places."""
         grid = smooth_function(self.signals[signal], self.ends(signal), 2 * count)
         return self._terms(factor, grid, self._breakpoints(signal, 2 * FINER * count, factor, jump=False))
 
     def jumps(self, signal: str, count: int, factor: str = "") -> Terms:
-        """Steps at 3 `count` values; jumps FINER times as close."""
+        """Steps at 3 `count` values, and jumps between these, at FINER times as many places."""
         grid = steps_in_value(self.signals[signal], self.ends(signal), 3 * count)
         return self._terms(factor, grid, self._breakpoints(signal, 3 * FINER * count + 2, factor, jump=True))
 

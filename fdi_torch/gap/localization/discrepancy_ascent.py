@@ -109,7 +109,7 @@ class EvaluatedDiscrepancy:
 
     @property
     def _quantities(self) -> frozenset[str]:
-        """What the regressors in use change; those of the cross-section are the first ones of a tank."""
+        """Quantities that the regressors in use change. Those that change a tank's cross-section come first."""
         areas = self.regression.at(self.location)[0][0].areas
         of_area, of_flow = self.regressed.used.tensor_split([0 if areas is None else len(areas)])
         return frozenset(name for name, used in (("area", of_area), ("flow", of_flow)) if bool(used.any()))
@@ -166,7 +166,7 @@ class Ascent:
         a discrepancy at a sensor would be.
 
         explained: part of the readings (S, C) that the discrepancy explains. selection: the regressors from which the
-        regression starts. Without any, it would select a hundred where little noise is left.
+        regression starts. A regression that starts without regressors selects about a hundred if little noise is left.
         """
         data, right = self.fitter.data, Fitter(self.fitter.data, self.fitter.noise)
         if any(s.name == place for s in data.plant.sensors):
@@ -236,7 +236,7 @@ class Ascent:
         return self._changed(current, positions.with_best_frequency(at, others))
 
     def _changed(self, current: EvaluatedDiscrepancy, discrepancy: Discrepancy) -> EvaluatedDiscrepancy:
-        """The same with a discrepancy that differs in some columns."""
+        """The evaluated discrepancy, with other values of some columns."""
         whitened = current.whitened.with_columns(discrepancy.columns)
         costs = regressor_costs(discrepancy.choices, self.largest)
         regressed = whitened.sparse_fit(discrepancy.regressor, costs, current.regressed.precision)

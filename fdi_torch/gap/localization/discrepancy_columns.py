@@ -75,7 +75,7 @@ class Discrepancy:
     positions: tuple[Position, ...] = ()
 
     def with_column(self, column: Tensor, position: Position) -> Discrepancy:
-        """The same with one more column (S, C), that of a regressor at a position between those of the grid."""
+        """The columns and one more (S, C), of a regressor at a position between those of the grid."""
         return replace(
             self,
             columns=Columns((*self.columns.blocks, column.unsqueeze(-1))),
@@ -95,6 +95,6 @@ class Discrepancy:
         return Selection(torch.cat([on_grid, precision[grid:][used[grid:]]]), positions, frequency)
 
     def with_sinusoids(self, frequency: float, columns: Tensor) -> Discrepancy:
-        """The same with sinusoids of another frequency; columns (S, C, W): their influence."""
+        """The columns with sinusoids of another frequency; columns (S, C, W): their influence."""
         grid, _, *added = self.columns.blocks
         return replace(self, columns=Columns((grid, columns, *added)), frequency=frequency)

@@ -71,7 +71,7 @@ class Positions:
         self._signs = self._weights(random_signs(self._residual, generator), basis)
 
     def _basis(self, discrepancy: Discrepancy, precision: Tensor) -> Tensor:
-        """What the parameters of the fit, and the columns in use, explain."""
+        """The part of the readings that the parameters of the fit and the columns in use explain."""
         used = torch.isfinite(precision)
         columns = discrepancy.columns[used]
         return parameter_basis(self.under, self.fit, discrepancy.linearised, columns, precision[used])

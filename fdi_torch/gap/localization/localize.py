@@ -9,7 +9,7 @@ effects: `marginal_likelihood.py`). Random processes at one tank or sensor compe
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
 
@@ -55,12 +55,13 @@ def localize(
     needed: float = -math.inf,
     rival: StateNoise | None = None,
     log_odds: float = 0.0,
+    step: Callable[[], None] = lambda: None,
 ) -> Localization:
     """Evaluate a discrepancy at each of the places. One that selects no regressor is not in the result.
 
     fitter: with the disturbance noise of the fit. needed: gain in log evidence below which a discrepancy is irrelevant;
     there are none in the result if none can reach it. rival: the noise that a likelier hypothesis left. log_odds: prior
-    log odds of a discrepancy at one place against none.
+    log odds of a discrepancy at one place against none. step: called when a place has been examined.
     """
     base = log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     scale = torch.minimum(noise.scale, rival.scale) if rival else noise.scale
@@ -85,6 +86,7 @@ def localize(
             continue
         best = ascent.climbed(ascent.under_less_and_less_noise(regression, place, likely), needed)
         examined += 1
+        step()
         growth = max(growth, (best.gain - expected) / max(alone, 1.0))
         selected = bool(best.regressed.used.any())
         itself = max(itself, best.without if best.regression is regression or not selected else -math.inf)

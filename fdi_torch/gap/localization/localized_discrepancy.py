@@ -46,10 +46,10 @@ class Estimate:
         return Estimate(fit.theta + scaled @ (basis.T @ right), scaled @ scaled.T)
 
     def log_density(self, i: int, value: float, bounds: tuple[float, float], held: Sequence[int] = ()) -> float:
-        """Log density of parameter i at a value, with other parameters `held` at theirs: normal, and zero outside its
-        bounds.
+        """Log density of parameter i at a value: normal between its bounds, and zero outside.
 
-        If the readings tell nothing of the parameter, it is uniform between them.
+        held: other parameters that keep their values. If the readings show nothing of the parameter, the density is
+        uniform between its bounds.
         """
         size = torch.sqrt(torch.diagonal(self.covariance))
         correlation, others = self.covariance / size / size.unsqueeze(1), list(held)

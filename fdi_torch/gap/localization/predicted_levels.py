@@ -4,8 +4,8 @@ An innovation is independent of all that follows from earlier readings (Ljung, 1
 3.2). Smoothed levels contain the disturbance of the same step; functions of them, in particular of their rates, would
 explain random flows.
 
-The filter that predicts is linearised itself: about the trajectory of a fit or, where a wrong law leads that far away
-from the readings, for example to a dry tank, about the levels that the sensors measure.
+The Kalman filter that predicts the levels needs a linearised plant: about the trajectory of a fit or, if a wrong law
+leads this trajectory far away from the readings, for example to a dry tank, about the levels that the sensors measure.
 """
 
 from __future__ import annotations

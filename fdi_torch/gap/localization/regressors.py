@@ -213,8 +213,10 @@ SURROUNDINGS = 15  # frequencies of the recording to each side, for the median
 
 
 def likely_frequencies(white: Tensor, spacing: float, duration: float) -> list[float]:
-    """Frequencies (Hz) of sinusoids and pulses that a whitened residual (S, C) may contain: of its dominant line, which
-    may be a harmonic, and slower ones, which random flows hide in its spectrum.
+    """Frequencies (Hz) of sinusoids and pulses that a whitened residual (S, C) may contain.
+
+    These are the frequency of the highest line of its spectrum, whole fractions of it (the line may be a harmonic), and
+    lower frequencies, whose lines random flows may hide.
 
     spacing: of the samples, s. duration: of the longest recording, s.
     """

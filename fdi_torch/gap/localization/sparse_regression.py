@@ -49,7 +49,7 @@ class SparseFit:
         return torch.isfinite(self.precision)
 
     def among(self, columns: Tensor) -> SparseFit:
-        """The fit of some columns as a fit of all. columns (M,) bool: those that were fitted."""
+        """This fit of some columns, extended to all M columns. columns (M,) bool: those that were fitted."""
         mean, precision = torch.zeros(columns.shape).to(self.mean), torch.full(columns.shape, math.inf).to(self.mean)
         mean[columns], precision[columns] = self.mean, self.precision
         return replace(self, mean=mean, precision=precision)

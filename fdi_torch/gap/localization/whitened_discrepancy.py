@@ -74,7 +74,7 @@ class WhitenedDiscrepancy:
         return _Block(columns, torch.cat(remaining, dim=1))
 
     def with_columns(self, columns: Columns) -> WhitenedDiscrepancy:
-        """The same with other columns (S, C, M), of which only new blocks are whitened."""
+        """The regression with other columns (S, C, M), of which only new blocks are whitened."""
         other, known = copy(self), {id(b.columns): b for b in self._blocks}
         other._blocks = [known.get(id(columns)) or self._block(columns) for columns in columns.blocks]
         return other

@@ -164,7 +164,7 @@ def _segment(recording: Recording, sensor: Sensor, first: int = 0, beyond: int |
 
 
 def _typical_scatter(plant: PlantDescription, recording: Recording, sensor: Sensor) -> Scatter:
-    """Scatter of the other sensors of this unit, converted to this sensor's gain; the median over them."""
+    """Median scatter of the other sensors with the same unit, rescaled to the gain of this sensor."""
     others = [s for s in plant.sensors if s is not sensor and s.unit == sensor.unit]
     scatters = [(scatter(recording.valid_readings(s.column)), abs(sensor.gain / s.gain)) for s in others]
     moving = [(each, scale) for each, scale in scatters if each.step > 0.0]

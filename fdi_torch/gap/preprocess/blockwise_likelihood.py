@@ -1,4 +1,4 @@
-"""Likelihood of a recording under a model that is wrong by an unknown amount for a known time.
+"""Likelihood of a recording under a model whose errors have an unknown size and a known correlation time.
 
     log p(y | D) = -1/2 sum_c n_c log v_c - chi^2(tolerances) / 2 + log prior
 

@@ -46,8 +46,9 @@ def recording_fault(
 ) -> RecordingFault | None:
     """The likeliest fault of a recording, or None if faults have less than 95 % together.
 
-    constant: columns of sensors that never move although noise should move them. They may also be clipped throughout.
-    thorough: try the likeliest fault beside an effect of the plant too, even if the fault alone gains nothing.
+    constant: columns of sensors that never move although noise should move them; such a sensor may be stuck, or at a
+    limit of its range all the time. thorough: try the likeliest fault beside an effect of the plant too, even if the
+    fault alone gains nothing.
     """
     noise = noise_of(plant, recording)
     as_is = blockwise_fit(blocked_recording(plant, recording, noise))

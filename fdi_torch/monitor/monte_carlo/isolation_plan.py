@@ -45,7 +45,8 @@ PERIOD, BEFORE_ONSET = 40.0, 60.0
 
 @dataclass(frozen=True)
 class IsolationPlan:
-    """The rig's space are the faults; all but stuck sensors and oscillations are simulated as incipient faults as well.
+    """Every fault in the space of the rig is simulated, sudden and (except stuck sensors and oscillations) incipient.
+
     loop: name of the plan, "open" or "closed". times: fault size as a multiple of the smallest isolable size.
     """
 

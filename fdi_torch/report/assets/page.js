@@ -33,6 +33,10 @@ const start = () => {
   for (const svg of document.querySelectorAll("figure > svg")) {
     svg.addEventListener("click", () => enlarge(svg.parentElement));
   }
+  for (const figure of document.querySelectorAll("figure.wide")) {
+    const mark = figure.querySelector('text[style*="--mark"]');
+    if (mark) figure.scrollLeft = mark.getBoundingClientRect().left - figure.getBoundingClientRect().left - figure.clientWidth / 2;
+  }
   const seen = new IntersectionObserver(entries => {
     for (const entry of entries) if (entry.isIntersecting) {
       seen.unobserve(entry.target);

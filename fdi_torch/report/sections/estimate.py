@@ -104,7 +104,7 @@ def _simulated(material: Material, unit: str, names: Sequence[str], coefficients
 
 
 def _finding(material: Material, name: str) -> Any:
-    """What the test of a fault size says; empty for other parameters."""
+    """Result of the test of a fault size, in words; empty for other parameters."""
     for finding in diagnosed_effects(material):
         if name in (prefix := f"{finding.location}.{finding.effect}", f"{prefix}.size"):
             if material.unexplained:

@@ -127,7 +127,7 @@ def posterior_bars(answer: Mapping[str, Any]) -> list[list[Picture]]:
 
 
 def _beside(shared: Sequence[Mapping[str, Any]], causes: Sequence[Mapping[str, Any]]) -> str:
-    """The causes other than those that all explanations contain, which would not fit beside a bar."""
+    """The causes that not all explanations contain, as text beside a bar; the whole list would be too long for it."""
     others = [cause for cause in apart_from_rounding(causes) if cause not in shared]
     return explanation_words(others) if others or not shared else "nothing else"
 

@@ -25,7 +25,7 @@ from fdi_torch.study.estimators import ESTIMATORS, Estimator
 TRIAL, SUMMARY = "/study/trial", "/study/summary"
 MOST_PANELS, MOST_GROUPS, MOST_ROWS = 9, 40, 30
 SHOWN: tuple[Estimator, ...] = ("free", "boxed", "correlation", "search")
-"""Of the estimators that a log has, the first of these is shown."""
+"""Estimators in the order of preference: the first one that a log has is shown."""
 MAIN = {"over_bound": "error over the Cramér-Rao bound", "coverage": "coverage of the 95 % interval"}
 _OWN = ("t", "trial", "trials", "group", "seed", "status")
 
@@ -194,6 +194,7 @@ def _shown(value: Any, scale: float = 1.0) -> str | None:
 
 
 MOST_MODES = 64
+MOST_NAMED, LONGEST_MODE = 12, 24
 
 
 def isolation_section(material: Material) -> Section | None:
@@ -205,16 +206,21 @@ def isolation_section(material: Material) -> Section | None:
     counts_ = [result.get(f"isolation.{name}", "?") for name in ("right", "trials", "missed", "false")]
     words = (
         "{} of {} modes stated correctly; {} faults missed, {} false faults. ".format(*counts_)
-        + "Row: true mode; column: stated mode; the table has their names."
+        + "Row: true mode; column: stated mode; the table has their full names."
     )
     rows = [_row(k, labels, counts) for k in range(len(labels)) if counts[k].sum()]
     listed = table(["", "mode", "trials", "right", "most often taken for"], rows)
-    return Section("Isolation", [words, [Picture("isolation", matrix_panel(counts))], folded("The modes", listed)])
+    picture = Picture("isolation", matrix_panel(counts, labels))
+    return Section("Isolation", [words, [picture], folded("The modes", listed)])
 
 
-def matrix_panel(counts: np.ndarray) -> Figure:
-    """Share of each row (M, M) as a heat map; right answers are on the diagonal."""
-    figure, axes = panel("Stated against true", "stated mode", "true mode", height=4.0)
+def matrix_panel(counts: np.ndarray, labels: Sequence[str] = ()) -> Figure:
+    """Share of each row (M, M) as a heat map; right answers are on the diagonal. labels: names of the modes, written
+    beside the rows if these are at most `MOST_NAMED`.
+    """
+    named = 0 < len(labels) <= MOST_NAMED
+    rows, height = ("", 2.9) if named else ("true mode", 4.0)  # the names leave no room for a label beside them
+    figure, axes = panel("Stated against true", "stated mode", rows, height=height)
     share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     for row, column in np.argwhere(share > 0):
         strength = 0.15 + 0.85 * float(share[row, column])
@@ -225,6 +231,9 @@ def matrix_panel(counts: np.ndarray) -> Figure:
     axes.grid(False)
     for side in (axes.xaxis, axes.yaxis):
         side.set_major_locator(MaxNLocator(8, integer=True, min_n_ticks=1))
+    if named:
+        names = [f"{short(label, LONGEST_MODE)}  {number}" for number, label in enumerate(labels, 1)]
+        axes.set_yticks(range(1, len(labels) + 1), names)
     return figure
 
 

@@ -1,0 +1,155 @@
+"""A first plant file from the columns of a recording: pumps and sensors as recorded, tanks and pipes as a guess."""
+
+from __future__ import annotations
+
+import re
+from itertools import pairwise
+from pathlib import Path
+from string import ascii_uppercase
+from typing import NamedTuple
+
+import torch
+
+from fdi_torch.plant.components import COMMAND_UNITS
+from fdi_torch.plant.description import OUTSIDE
+from fdi_torch.quantities import rounded_up, significant, unit_factor
+from fdi_torch.recordings.csv_binding import bind_clock
+from fdi_torch.recordings.csv_files import read_csv, read_header
+from fdi_torch.recordings.csv_text import HeaderlessError, header_unit
+from fdi_torch.recordings.source import ClockSource
+from fdi_torch.units import spelled
+
+HEIGHT = 0.6  # m, of a tank that is still to be measured
+AT_RIM = {"1": 1.0, "V": 10.0, "A": 0.02, "Pa": 9810.0 * HEIGHT}
+"""Reading of a sensor at the rim, by the unit of its reading: 100 %, 10 V, 20 mA, water."""
+READING = re.compile(r"[LHX]|P[DIRT]|.*(level|füllstand|niveau|pegel|pressure|druck)", re.IGNORECASE)
+"""Tags of levels and pressures (ISA-5.1: PT, PI; P-101 and PK are pumps), letters of levels by custom, and words."""
+COMMAND = re.compile(
+    r".*(pump|valve|ventil|pwm|duty|cmd|command|speed|drehzahl)|[A-Z]+C\W?\d+\W?(out|op)$", re.IGNORECASE
+)
+"""Words, and tags of a controller's output (LIC-101.OUT)."""
+PUMPS = "pumps:    # ! the tank that each fills, and its maximum flow; a flow out of a tank belongs under transfers"
+
+
+class _Column(NamedTuple):
+    """A column with a unit in its header: its header, name, unit, SI unit and highest value (SI)."""
+
+    header: str
+    name: str
+    unit: str
+    kind: str
+    highest: float
+
+    @property
+    def own(self) -> str:
+        """A name for the component: letters, digits and _."""
+        return re.sub(r"\W+", "_", self.name).strip("_") or "x"
+
+    @property
+    def may_be_reading(self) -> bool:
+        return self.kind in ("m", "Pa") or (self.kind in AT_RIM and not COMMAND.match(self.name))
+
+    @property
+    def is_reading(self) -> bool:
+        return self.kind in ("m", "Pa") or (self.may_be_reading and bool(READING.match(self.name)))
+
+
+def plant_from_recording(path: Path, name: str) -> str:
+    """The text of a plant file: a pump for each flow or command, and a row of tanks, one for each level.
+
+    A column is a reading if its unit is a length or a pressure, or if its name says so; if none is, each that may be.
+    Others are commands. Raises ValueError if no column with a unit in its header can be a reading.
+    """
+    try:
+        header = read_header(path)
+    except HeaderlessError:
+        raise ValueError(
+            f"{path}: expected a header with names and units, got numbers; describe the plant with fdi new plant, then "
+            f"let fdi new run --plant FILE --recording {path} number the columns"
+        ) from None
+    clock = bind_clock(path, header, ClockSource()).header
+    named = [column for column in header if column != clock]
+    columns = _columns(path, [column for column in named if header_unit(column)])
+    sensors = [column for column in columns if column.is_reading] or [c for c in columns if c.may_be_reading]
+    if not sensors:
+        raise ValueError(
+            f"{path}: expected a column of a level with its unit in the header, such as LT-101 (cm), got "
+            f"{', '.join(named)}; add units to the header, or describe the plant with fdi new plant, then let "
+            f"fdi check --plant FILE --recording {path} print the lines that map the columns"
+        )
+    tanks = [f"T{k + 1}" for k in range(len(sensors))] if len(sensors) > 26 else list(ascii_uppercase[: len(sensors)])
+    pipes = [(f"{a}_{b}", a, b) for a, b in pairwise(tanks)] + [("outlet", tanks[-1], OUTSIDE)]
+    commands = [column for column in columns if column not in sensors and column.kind in COMMAND_UNITS.values()]
+    pumps = [_pump(column, tanks[0]) for column in commands]
+    used = {column.header for column in (*sensors, *commands)}
+    without = [column for column in named if column not in used]
+    lines = [
+        f"# From the columns of {path.name}. Correct what follows a ! and delete the !, then check the file.",
+        *([f"# Left out, as their header has no unit of a level or command: {', '.join(without)}"] if without else []),
+        f"name: {name}",
+        "",
+        "tanks:    # ! cross-section, and height from the floor to the rim",
+        *(f"  {tank}: {{area: 200 cm^2, height: {_height(c)}}}" for tank, c in zip(tanks, sensors, strict=True)),
+        "",
+        "pipes:    # ! which there are, and the area of each orifice; target outside: an outlet",
+        *(
+            f"  {pipe}: {{source: {a}, target: {b}, area: 0.5 cm^2, discharge_coefficient: 0.6}}"
+            for pipe, a, b in pipes
+        ),
+        "",
+        *([PUMPS, *pumps, ""] if pumps else []),
+        "sensors:  # ! the tank of each, and its gain: reading at the rim divided by height; commands go to pumps",
+        *(_sensor(column, tank) for column, tank in zip(sensors, tanks, strict=True)),
+        "",
+        "tolerances:    # one standard deviation; constants without one count as exact",
+        '  "*.discharge_coefficient": 30 %',
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _columns(path: Path, headers: list[str]) -> list[_Column]:
+    """The columns with a unit, in their order."""
+    split = [(header, *pair) for header in headers if (pair := header_unit(header))]
+    if not split:
+        return []
+    recording = read_csv(path, [], [name for _, name, _ in split])
+    highest = torch.nan_to_num(recording.outputs, nan=0.0).amax(dim=0).tolist()
+    kinds = recording.output_units
+    return [
+        _Column(header, name, spelled(unit), kind, high)
+        for (header, name, unit), kind, high in zip(split, kinds, highest, strict=True)
+    ]
+
+
+def _height(column: _Column) -> str:
+    """A height a tenth above the highest level of a column, in its unit."""
+    if column.kind != "m" or column.highest <= 0.0:
+        return f"{100.0 * HEIGHT:g} cm"
+    return f"{rounded_up(1.1 * column.highest / unit_factor(column.unit, 'm')):.10g} {column.unit}"
+
+
+def _pump(column: _Column, tank: str) -> str:
+    per_unit = unit_factor(column.unit, column.kind)
+    flow = "6 l/min"
+    if column.kind == "m^3/s":
+        flow = f"{significant(max(column.highest, per_unit) / per_unit, 3)} {column.unit}"
+    fields = [f"target: {tank}", f"max_flow: {flow}"]
+    if column.kind == "1":
+        fields.append(f"gain: {significant(6.0 * per_unit, 3)} l/min" + (f"/{column.unit}" if per_unit < 1.0 else ""))
+    elif column.kind != "m^3/s":
+        largest = 5.9 * per_unit / (column.highest or 1.0)  # rounded, the highest command stays below the maximum flow
+        fields.append(f"gain: {significant(largest, 3)} l/min/{column.unit}")
+    return _line(column, fields, "command")
+
+
+def _sensor(column: _Column, tank: str) -> str:
+    fields = [f"tank: {tank}"]
+    if column.kind != "m":
+        gain = AT_RIM[column.kind] / HEIGHT / unit_factor(column.unit, column.kind)
+        fields.append(f"gain: {significant(gain, 4)} {column.unit}/m")
+    return _line(column, fields, "channel")
+
+
+def _line(column: _Column, fields: list[str], key: str) -> str:
+    named = [] if column.own == column.name else [f'{key}: "{column.name}"']
+    return f"  {column.own}: {{{', '.join([*fields, *named])}}}"
