@@ -22,6 +22,7 @@ from fdi_torch.monitor.detection import (
     cusum,
     cusum_rate,
     fixed_rate,
+    latin_hypercube,
     make_detector,
 )
 from fdi_torch.monitor.whitening import score_whitenings
@@ -33,8 +34,8 @@ def noise(*shape: int, seed: int = 0) -> torch.Tensor:
 
 def known(rate: ChartRate, run_length: float, channels: int) -> FalseAlarmDesign:
     """The design for noise that is known."""
-    zeros, median = torch.zeros(channels, dtype=torch.float64), torch.full((1, channels), 0.5, dtype=torch.float64)
-    return FalseAlarmDesign(rate, lambda threshold: 1, lambda length: zeros, median, run_length, 1.0)
+    zeros, median = torch.zeros(channels, dtype=torch.float64), torch.full((2, 1, channels), 0.5, dtype=torch.float64)
+    return FalseAlarmDesign(rate, lambda threshold: 1, lambda length: (zeros, zeros), median, run_length, 1.0)
 
 
 def cusum_run_length(threshold: float, drift: float, std: float = 1.0) -> float:
@@ -96,6 +97,16 @@ def test_predictive_threshold_of_one_sample_is_students() -> None:
     learnt = whitening_of(noise(100, 1), 0)
     detector = make_detector("fixed", 1000.0, 1.0, 1, torch.Generator(), learnt=learnt)
     assert detector.threshold == pytest.approx(stats.t.isf(0.5 / 1000.0, df=100), rel=2e-3)
+
+
+def test_uncertain_flows_give_the_mean_rate_of_a_log_normal_deviation() -> None:
+    """By Gauss-Hermite quadrature over ln of the standard deviation of one channel's sums."""
+    error = torch.full((1,), 0.3, dtype=torch.float64)
+    share = latin_hypercube(1, torch.Generator()).expand(2, -1, -1)
+    design = replace(known(fixed_rate, 1000.0, 1), errors=lambda length: (0.0 * error, error), share=share)
+    nodes, weights = (torch.from_numpy(x) for x in np.polynomial.hermite_e.hermegauss(60))
+    rates = fixed_rate(design.threshold, torch.exp(0.3 * nodes).unsqueeze(1))
+    assert float(rates @ weights / weights.sum()) * 1000.0 == pytest.approx(1.0, rel=0.05)
 
 
 @pytest.mark.parametrize("samples", [300, 3000])

@@ -191,7 +191,8 @@ def test_the_stated_error_of_sums_is_that_of_many_calibrations() -> None:
         noise, _ = learn_noise(NETWORK, samples.segment(first, first + 500))
         white = noise.whitening(Observer(NETWORK, noise.gain).run(samples).steady_residual)[100:]
         blocks = white.reshape(-1, 20, 3).sum(1)
-        deviations.append(0.5 * torch.log(blocks.square().mean(0) / 20.0) / noise.whitening.error_of_sums(20))
+        error = torch.hypot(*noise.whitening.errors_of_sums(20))
+        deviations.append(0.5 * torch.log(blocks.square().mean(0) / 20.0) / error)
     # 36 values, three of which are of one calibration.
     assert 0.7 < float(torch.stack(deviations).square().mean().sqrt()) < 1.4
 

@@ -208,7 +208,7 @@ def test_errors_of_constants_raise_no_alarm(seed: int, learn: int, calibrate: Se
 @pytest.mark.parametrize("calibrate", [CONSTANTS, []])
 def test_errors_of_constants_hide_no_fault_beyond_their_tolerance(calibrate: Sequence[str]) -> None:
     """A leak of 0.1 draws as much as an outlet whose coefficient is 10 % larger; the tolerance is 3 %."""
-    events, _ = learnt_at_rest(20261566, 300, 0.1, calibrate)
+    events, _ = learnt_at_rest(20261566, 100, 0.1, calibrate)
     assert 600.0 < next(event.time for event in events if event.kind == "alarm") <= 620.0
 
 

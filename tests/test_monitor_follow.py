@@ -315,9 +315,10 @@ def test_a_wild_time_stamp_neither_ends_the_learning_nor_the_monitor(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One stamp far ahead while learning and one afterwards, all rows at once: as if they came one by one."""
-    lines = [row(k, levels) for k, levels in enumerate(readings())]
+    levels = readings(size=0.1)
+    lines = [row(k, each) for k, each in enumerate(levels)]
     for k in (20, 180):
-        lines[k] = row(1e6 + k, readings()[k])
+        lines[k] = row(1e6 + k, levels[k])
     (tmp_path / "rig.csv").write_text(HEADER + "".join(lines))
     events = monitored(["--config", config(tmp_path), "--follow", "--idle", "0.2"], capsys)
     assert texts(events).count("the clock jumps back") == 2

@@ -4,7 +4,8 @@ its predictive distribution, is the rate asked for.
 Noise learnt from a finite recording leaves the standard deviation of the white residual uncertain. The variance of a
 channel over the learnt one has the posterior nu / chi-square(nu) of a normal variance. Its degrees of freedom
 nu = 1 / (2 s^2) follow from the standard error s of ln of the standard deviation (Satterthwaite 1946), in which
-autocorrelation and random flows are included.
+autocorrelation is included. Uncertain random flows multiply it by a log-normal factor: the posterior of the logarithms
+of their intensities is normal (Laplace's approximation).
 """
 
 from __future__ import annotations
@@ -40,14 +41,15 @@ ChartRate = Callable[[float, Tensor], Tensor]
 class FalseAlarmDesign:
     """Threshold and false-alarm rate of a chart.
 
-    chart_rate: of the chart. length: of the sums of the residual that decide about an alarm at a threshold. error:
-    standard error (C,) of ln of the standard deviation of sums of that length. share (D, C): probabilities at which
-    the posterior is drawn. run_length: expected number of samples to a false alarm. interval: between samples, s.
+    chart_rate: of the chart. length: of the sums of the residual that decide about an alarm at a threshold. errors:
+    standard errors (C,) of ln of the standard deviation of sums of that length, by the number of samples and by the
+    random flows. share (2, D, C): probabilities at which the posterior of each is drawn. run_length: expected number of
+    samples to a false alarm. interval: between samples, s.
     """
 
     chart_rate: ChartRate
     length: Callable[[float], int]
-    error: Callable[[int], Tensor]
+    errors: Callable[[int], tuple[Tensor, Tensor]]
     share: Tensor
     run_length: float
     interval: float
@@ -77,8 +79,10 @@ class FalseAlarmDesign:
 
         @cache
         def std(length: int) -> Tensor:
-            half_freedom = 0.25 / self.error(length).clamp(min=SMALLEST_ERROR).square()
-            return (half_freedom / torch.from_numpy(gammaincinv(half_freedom.numpy(), self.share.numpy()))).sqrt()
+            by_samples, by_flows = self.errors(length)
+            half_freedom = 0.25 / by_samples.clamp(min=SMALLEST_ERROR).square()
+            chi_square = torch.from_numpy(gammaincinv(half_freedom.numpy(), self.share[0].numpy()))
+            return (half_freedom / chi_square).sqrt() * torch.exp(by_flows * torch.special.ndtri(self.share[1]))
 
         return std
 
@@ -102,7 +106,12 @@ class FalseAlarmDesign:
 
     def longer(self, factor: float) -> FalseAlarmDesign:
         """The design after learning for `factor` times as long: standard errors fall with the square root of time."""
-        return replace(self, error=lambda length: self.error(length) * factor**-0.5)
+
+        def errors(length: int) -> tuple[Tensor, Tensor]:
+            by_samples, by_flows = self.errors(length)
+            return by_samples * factor**-0.5, by_flows * factor**-0.5
+
+        return replace(self, errors=errors)
 
     def learning_factor(self, accuracy: float) -> float:
         """How many times as long the noise must be learnt to know the rate within a factor of `accuracy` (95 %)."""
@@ -216,13 +225,16 @@ def make_detector(
     else:
         raise ValueError(f"expected a detector of {', '.join(CHARTS)}, got '{chart}'")
 
-    @cache
-    def error(length: int) -> Tensor:
-        return torch.zeros(channels, dtype=torch.float64) if learnt is None else learnt.error_of_sums(length)
+    none = torch.zeros(channels, dtype=torch.float64)
 
-    median = torch.full((1, channels), 0.5, dtype=torch.float64)
-    share = median if learnt is None else latin_hypercube(channels, generator)
-    return Detector(chart, FalseAlarmDesign(rate, length, error, share, run_length, sampling), update)
+    @cache
+    def errors(length: int) -> tuple[Tensor, Tensor]:
+        return (none, none) if learnt is None else learnt.errors_of_sums(length)
+
+    share = torch.full((2, 1, channels), 0.5, dtype=torch.float64)
+    if learnt is not None:
+        share = torch.stack([latin_hypercube(channels, generator) for _ in range(2)])
+    return Detector(chart, FalseAlarmDesign(rate, length, errors, share, run_length, sampling), update)
 
 
 def max_abs(white: Tensor, before: Tensor | None = None) -> tuple[Tensor, Tensor]:

@@ -32,16 +32,17 @@ class Whitening:
     slow_error: Tensor
     flows: FlowFilter | None = None
 
-    def error_of_sums(self, length: int) -> Tensor:
-        """Standard error (C,) of ln of the standard deviation of sums of `length` successive e.
+    def errors_of_sums(self, length: int) -> tuple[Tensor, Tensor]:
+        """Standard errors (C,) of ln of the standard deviation of sums of `length` successive e: by the number of
+        samples, and by the uncertain intensities of the random flows.
 
-        For length 1 the error is 1 / sqrt(2 n), with n = `samples`. A longer sum is assumed to be much longer than the
-        memory of the autoregression, so that its error is `slow_error`, to which uncertain intensities of the random
-        flows add.
+        For length 1 the first is 1 / sqrt(2 n), with n = `samples`, and the second 0. A longer sum is assumed to be
+        much longer than the memory of the autoregression, so that the first is `slow_error`.
         """
+        none = torch.zeros_like(self.slow_error)
         if length == 1:
-            return torch.full_like(self.slow_error, (2.0 * self.samples) ** -0.5)
-        return self.slow_error if self.flows is None else self.slow_error.hypot(self.flows.error_of_sums(length))
+            return none + (2.0 * self.samples) ** -0.5, none
+        return self.slow_error, none if self.flows is None else self.flows.error_of_sums(length)
 
     @property
     def order(self) -> int:
