@@ -20,6 +20,7 @@ from fdi_torch.gap.cause_hypothesis import CauseHypothesis
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.hypothesis_search import HypothesisSearch
+from fdi_torch.gap.stage_progress import StageProgress
 from fdi_torch.gap.trajectory_problem import first_lowest
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.recording import Recording
@@ -95,7 +96,7 @@ def test_a_change_in_time_is_named_where_there_was_one(plugged: bool) -> None:
 
 
 def test_a_discrepancy_is_tried_at_other_places_beside_the_same_effects(monkeypatch: pytest.MonkeyPatch) -> None:
-    search = HypothesisSearch(cast(ExplanationPool, SimpleNamespace()), (), ("T1", "OUT1"))
+    search = HypothesisSearch(cast(ExplanationPool, SimpleNamespace(progress=StageProgress())), (), ("T1", "OUT1"))
     explanation = SimpleNamespace()
     at_tank, at_outlet = (
         cast(
@@ -125,7 +126,7 @@ def test_a_discrepancy_is_tried_at_other_places_beside_the_effect_that_names_it(
     alone, lagging, slower = (
         SimpleNamespace(key=key, log_weight=weight) for key, weight in [(frozenset(), 1.0), (lag, 2.0), (lag, 0.0)]
     )
-    pool = SimpleNamespace(explanations={0: alone, 1: slower, 2: lagging})
+    pool = SimpleNamespace(explanations={0: alone, 1: slower, 2: lagging}, progress=StageProgress())
     search = HypothesisSearch(cast(ExplanationPool, pool), (), ("h1", "Q1"))
     best, moved = (
         cast(

@@ -19,6 +19,7 @@ from fdi_torch import Pipe, Plant, Sensor, Tank
 from fdi_torch.config.monitor_file import MonitorConfig
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
+from fdi_torch.config.problems import Source
 from fdi_torch.config.resolved_config import resolve
 from fdi_torch.config.run_file import load_run
 from fdi_torch.effects import all_placements, build_network, placements_for
@@ -153,8 +154,8 @@ def test_steps_of_a_lane_s_own_scale_with_the_rig(metres: float, seconds: float)
 def test_times_of_a_monitor_that_nobody_chose_follow_the_plant() -> None:
     slow = plant_mapping(rescaled(three_tank(), 1.0, 60.0))
     given = {"recording": {"file": "any.csv"}, "fault_free": ["0 s", "1 h"], "window": {"confirm": "90 s"}}
-    config, _, _ = resolve(MonitorConfig, given | {"plant": slow}, Path(), "slow.yaml")
-    usual, _, _ = resolve(MonitorConfig, given, Path(), "usual.yaml")
+    config, _, _ = resolve(MonitorConfig, given | {"plant": slow}, Path(), Source("slow.yaml"))
+    usual, _, _ = resolve(MonitorConfig, given, Path(), Source("usual.yaml"))
     assert (usual.window.lookback, usual.window.confirm, usual.false_alarms_every) == (300, 90, 20000)
     assert config.window.confirm == 90
     assert (config.window.lookback, config.false_alarms_every) == pytest.approx((18000, 1.2e6), rel=1e-9)
