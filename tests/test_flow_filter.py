@@ -201,15 +201,18 @@ def test_the_start_tells_how_many_false_alarms_are_possible_if_one_is_expected()
     """If the noise is known, 0 to 3 by the Poisson distribution; if 600 samples determine it, more."""
     noise, _ = learn_noise(NETWORK, disturbed(15.0, 600))
     known = replace(noise.whitening, samples=10**9, slow_error=torch.zeros(3, dtype=torch.float64), flows=None)
-    most = []
+    most, thresholds = [], []
     for whitening in (known, noise.whitening):
         detector = make_detector("cusum", 20_000.0, 1.0, 3, torch.Generator().manual_seed(0), learnt=whitening)
         text = false_alarm_rate_text(replace(noise, whitening=whitening), detector, 20_000.0)
         found = re.search(r"expect one false alarm in 20000 s \(0 to (\d+) with a probability of 95 %\)", text)
         assert found is not None
         most.append(int(found[1]))
+        thresholds.append(detector.threshold)
+        assert ("the fault-free part is short" in text) is (whitening is not known)
     assert most[0] == poisson.ppf(0.975, 1.0)
     assert most[1] > most[0]
+    assert f"the threshold is {100.0 * (thresholds[1] / thresholds[0] - 1.0):.2g} % higher" in text
 
 
 def test_without_a_compiler_the_start_tells_what_is_not_modelled(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -111,7 +111,7 @@ def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
     try:
         until, needed = _learning_time(plant, read, every, until)
         if needed > until:
-            remark = f"half of the recording; the noise needs some {needed:.10g} s; until then the threshold is raised"
+            remark = f"half of the recording; the noise needs some {needed:.10g} s; until then the threshold is higher"
     except ValueError as error:
         remark = f"half of the recording, which the monitor will refuse: {str(error).partition(chr(10))[0]}"
     return f"[{first:.10g} s, {first + until:.10g} s]    # {remark}"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from fdi_torch.monitor.detection import DRIFT, Detector
+from fdi_torch.monitor.detection import DRIFT, VERY_LONG, Detector
 from fdi_torch.monitor.events import Explanation, percent_text, size_of
 from fdi_torch.monitor.hypothesis import Fault
 from fdi_torch.monitor.isolation import isolate
@@ -96,8 +96,8 @@ def learning_times(noise: NoiseModel, detector: Detector) -> tuple[float, float]
 
 
 def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -> str:
-    """Text: the expected time between false alarms, the 95 % interval of their number in it, and how long a fault-free
-    part would determine their rate within a factor of RATE_FACTOR (95 %).
+    """Text: the expected time between false alarms, the 95 % interval of their number in it, how long a fault-free part
+    would determine their rate within a factor of RATE_FACTOR (95 %), and how much a shorter one raises the threshold.
 
     The text gives no interval of the rate itself, because the mean rate may lie outside of it: a small share of the
     posterior of the noise may dominate the mean.
@@ -112,7 +112,8 @@ def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -
         text += ", if no random flow is slow: to model these, install a C++ compiler or the extra fdi_torch[compiler]"
     if needed <= seconds:
         return text
-    return f"{text}; the fault-free part is short, so that the threshold is raised: lengthen fault_free"
+    higher = 100.0 * (detector.threshold / detector.design.longer(VERY_LONG).threshold - 1.0)
+    return f"{text}; the fault-free part is short, so that the threshold is {higher:.2g} % higher: lengthen fault_free"
 
 
 def noise_std_from_differences(readings: Tensor) -> Tensor:
