@@ -3,10 +3,10 @@
 Intensities and scales maximise the likelihood of the innovations (kalman.py) times a prior: disturbances of all tanks
 are of one order of magnitude, since a significant diffusion term in one state equation shows where a model is deficient
 (Kristensen, Madsen and Jorgensen, 2004, Automatica 40, 225-237). The gradient comes from the disturbance
-smoother (Durbin and Koopman, 2012, "Time series analysis by state space methods", section 7.3.3). Plant parameters, in
-which the residuals are linear, are profiled out, or averaged over their posterior: then the flows that look like errors
-of parameters are not lost, as in restricted maximum likelihood (Patterson and Thompson, 1971, Biometrika 58, 545-554).
-The correlation time is selected from a grid of candidates.
+smoother (Durbin and Koopman, 2012, "Time series analysis by state space methods", section 7.3.3). The likelihood is
+averaged over the plant parameters, in which the residuals are linear: with the most likely parameters instead, flows that
+look like errors of parameters would be lost (restricted maximum likelihood, Patterson and Thompson, 1971, Biometrika 58,
+545-554). The correlation time is selected from a grid of candidates.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from fdi_torch.estimate.kalman import SCATTER, KalmanFilter, Propagation, Score,
 
 CORRELATION_TIMES = (0.0, 5.0, 20.0, 80.0, 320.0)  # grid of candidates, in sampling intervals; 0: white
 LIKELIHOOD_TOLERANCE = 0.1  # nats; the optimisation ends when an iteration gains less
-RIDGE = 1e-12  # relative to a unit curvature: keeps parameters without information in the data in place
+RIDGE = 1e-12  # relative to a unit curvature: keeps parameters without information in their place
 MIN_DETERMINED = 1e-2  # lower limit on the effective number of readings per parameter, for its scaling
 LOG_BOUND = 10.0  # bound on |log(intensity / unit)| and |log(scale)| in the optimisation
 
@@ -34,9 +34,9 @@ LOG_BOUND = 10.0  # bound on |log(intensity / unit)| and |log(scale)| in the opt
 class Likelihood:
     """Maximum of the likelihood.
 
-    noise: the maximising noise model. log_likelihood: of the residuals, maximised over the noise model and maximised or
-    integrated over the linear parameters, the log density of the priors of both included; constants of the normal
-    distribution are omitted.
+    noise: the maximising noise model. log_likelihood: of the residuals, maximised over the noise model and integrated
+    over the linear parameters, the log density of the priors of both included; constants of the normal distribution and
+    of the priors are omitted.
     converged: whether the optimisation of the noise model converged. determined: effective number of readings that
     determine each of its parameters, in the order of `Score.slope`.
     """
@@ -58,10 +58,8 @@ def estimate_state_noise(
     unit: Tensor,
     start: StateNoise | None = None,
     climb: bool = True,
-    marginal: bool = False,
 ) -> Likelihood:
-    """Estimate the noise model from residuals (S, C), with plant parameters profiled out or, if `marginal`, integrated
-    over.
+    """Estimate the noise model from residuals (S, C), averaged over the plant parameters.
 
     jacobian (S, C, P): derivatives of the readings by the P parameters.
     pull, off (P,): normal priors of the parameters. A parameter change delta has the prior residual off + pull * delta
@@ -71,7 +69,7 @@ def estimate_state_noise(
     search is over the wander's correlation time and smoothness if a sensor wanders, else over the correlation time of
     the flow disturbances.
     """
-    problem = _Problem(propagation, sensors, residual, jacobian, pull, off, unit, marginal)
+    problem = _Problem(propagation, sensors, residual, jacobian, pull, off, unit)
     interval = propagation.interval
     if start is None:
         start = StateNoise(unit, interval * CORRELATION_TIMES[2], torch.ones_like(sensors.std))
@@ -116,7 +114,6 @@ class _Problem:
     pull: Tensor
     off: Tensor
     unit: Tensor
-    marginal: bool = False
 
     @cached_property
     def filter(self) -> KalmanFilter:
@@ -198,13 +195,8 @@ class _Problem:
     def likelihood(self, noise: StateNoise) -> tuple[float, Score]:
         """Log-likelihood of a noise model with the log prior of its intensities, and its score."""
         model = self.filter.under(noise)
-        white = model.innovations(self.columns)
-        innovations, prior_residual = _profiled(white, self.pull, self.off)
-        cost = float(innovations.square().sum()) + float(prior_residual.square().sum()) + model.log_det
-        innovations = innovations.unsqueeze(-1)
-        if self.marginal:
-            errors, log_det = _by_errors(white[..., 1:], self.pull)
-            innovations, cost = torch.cat([innovations, errors], dim=-1), cost + log_det
+        innovations, cost = _averaged(model.innovations(self.columns), self.pull, self.off)
+        cost += model.log_det
         score, deviation = model.score(innovations), noise.scatter() / SCATTER
         slope, determined = score.slope.clone(), score.determined.clone()
         slope[: len(deviation)] -= deviation
@@ -212,28 +204,25 @@ class _Problem:
         return -0.5 * cost + noise.log_prior(), replace(score, slope=slope, determined=determined)
 
 
-def _by_errors(white: Tensor, pull: Tensor) -> tuple[Tensor, float]:
-    """What the errors of the most likely parameters add to the innovations, as P independent columns (S, C, P), and the
-    log determinant of the information about the parameters over that of their priors.
+def _averaged(white: Tensor, pull: Tensor, off: Tensor) -> tuple[Tensor, float]:
+    """Average a Gaussian likelihood over the linear parameters, with their normal priors.
 
-    white (S, C, P): whitened Jacobian. pull (P,): positive.
-    """
-    by_priors = white.flatten(0, 1) / pull
-    root = torch.linalg.cholesky(by_priors.mT @ by_priors + torch.eye(len(pull), dtype=white.dtype))
-    errors = torch.linalg.solve_triangular(root.mT, by_priors, upper=True, left=False)
-    return errors.reshape(white.shape), 2.0 * float(torch.diagonal(root).log().sum())
-
-
-def _profiled(white: Tensor, pull: Tensor, off: Tensor) -> tuple[Tensor, Tensor]:
-    """Regress the whitened residual on the whitened Jacobian and the priors, by linear least squares.
-
-    white (S, C, 1 + P): whitened residual and Jacobian. Returns the regression residuals of the readings, (S, C), and
-    of the priors, (P,).
+    white (S, C, 1 + P): whitened residual and Jacobian. Returns the innovations under the most likely parameters, beside
+    what the errors of these add to them as P independent columns, (S, C, 1 + P); and -2 ln of the average, without the
+    log determinants of the innovations and of the priors, which may be improper (`pull` 0).
     """
     columns = white.permute(1, 2, 0)
     gram = (columns @ columns.mT).sum(dim=0)
     curvature, right = gram[1:, 1:] + torch.diag(pull**2), gram[1:, 0] - pull * off
     scale = torch.diagonal(curvature).sqrt().clamp(min=1e-150)
     unit = curvature / scale / scale.unsqueeze(1) + RIDGE * torch.eye(len(pull), dtype=white.dtype)
-    step = torch.linalg.solve(unit, (right / scale).unsqueeze(1)).squeeze(1) / scale
-    return (torch.cat([step.new_ones(1), -step]) @ columns).T, -off - pull * step
+    root = torch.linalg.cholesky(unit)
+    step = torch.cholesky_solve((right / scale).unsqueeze(1), root).squeeze(1) / scale
+    mixing = torch.zeros(1 + len(pull), 1 + len(pull), dtype=white.dtype)
+    mixing[0, 0], mixing[1:, 0] = 1.0, -step
+    identity = torch.eye(len(pull), dtype=white.dtype)
+    mixing[1:, 1:] = torch.linalg.solve_triangular(root.mT, identity, upper=True) / scale.unsqueeze(1)
+    innovations = (mixing.T @ columns).permute(2, 0, 1)
+    log_det = 2.0 * float((torch.diagonal(root).log() + scale.log()).sum())
+    misfit = float(innovations[..., 0].square().sum()) + float((off + pull * step).square().sum())
+    return innovations, misfit + log_det

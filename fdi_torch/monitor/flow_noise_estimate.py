@@ -100,7 +100,7 @@ def _likeliest(
     def solved(noise: StateNoise) -> Likelihood:
         priors = ones, 0.0 * ones
         given = propagation, sensors, residual, columns, *priors, unit, noise
-        return estimate_state_noise(*given, climb=False, marginal=True)
+        return estimate_state_noise(*given, climb=False)
 
     noise = replace(start.noise, scale=torch.ones_like(start.reading_std))
     likely = _with_likeliest_time(solved, noise, start.interval, times)
