@@ -11,6 +11,7 @@
 #include <cmath>
 #include <cstdint>
 #include <initializer_list>
+#include <type_traits>
 #include <vector>
 
 namespace {
@@ -210,48 +211,61 @@ void whiten(const Model& m, int64_t samples, int64_t columns, int64_t first, con
     }
 }
 
-// Adjoint of `whiten`, by recursion backwards in time: out = G' v for W columns of v, if `whiten` is out = G y.
+// Sums over columns: derivatives of the log-likelihood by the variances q (decaying), r (C) and p0 (d), less the parts that
+// do not depend on the innovations. `shocks` (S, d), of the first column, see kalman_score.
+struct Sums {
+    double *by_q, *by_r, *by_p0, *shocks;
+};
+
+// Adjoint of `whiten`, by recursion backwards in time: out = G' v for W columns of v, if `whiten` is out = G y. Where v are
+// innovations, the recursion is that of the disturbance smoother: adds to the sums, if there are any.
 template <int W>
 void whiten_back(const Model& m, int64_t samples, int64_t columns, int64_t first, const double* gain,
-                 const double* white, const double* v, double* out) {
+                 const double* white, const double* v, double* out, const Sums* sums) {
     double z[d * W], moved[d * W], nu[C * W];
-    std::vector<double> block(BLOCK * C * W);
+    std::vector<double> block(BLOCK * C * W, 0.0);
+    const auto add_squares = [](const double* x, int count, double* to) {
+        for (int i = 0; i < count; ++i)
+            for (int k = 0; k < W; ++k) to[i] += 0.5 * x[i * W + k] * x[i * W + k];
+    };
     for (int64_t t = samples - 1; t >= 0; --t) {
         double* own = &block[t % BLOCK * C * W];
         const int64_t start = t - t % BLOCK, length = std::min(BLOCK, samples - start);
         if (t + 1 == start + length) gather<W>(v, samples, columns, first, start, length, block.data());
-        if (t + 1 == samples || m.fresh[t + 1])
+        if (t + 1 == samples || m.fresh[t + 1]) {
             std::fill(moved, moved + d * W, 0.0);
-        else
+        } else {
+            if (sums) add_squares(z + n * W, decaying, sums->by_q);
             backward<W>(m, t, z, moved);
+        }
         std::fill(nu, nu + C * W, 0.0);
         add_product_of_transposed<C, C, W>(white + t * C * C, own, nu);
         add_product_of_transposed<d, C, W>(gain + t * d * C, moved, nu);
         for (int c = 0; c < C; ++c)
             if (!m.seen[t * C + c]) std::fill(nu + c * W, nu + (c + 1) * W, 0.0);
+        if (sums) add_squares(nu, C, sums->by_r);
         std::copy(nu, nu + C * W, own);
-        if (t == start) scatter<W>(block.data(), samples, columns, first, start, length, out);
+        if (out && t == start) scatter<W>(block.data(), samples, columns, first, start, length, out);
         look_back<W>(m, t, nu, z);
         for (int i = 0; i < d * W; ++i) z[i] = moved[i] - z[i];
+        if (sums && m.fresh[t]) add_squares(z, d, sums->by_p0);
+        for (int i = 0; i < d && sums && first == 0; ++i)
+            sums->shocks[t * d + i] = -z[i * W] * (m.fresh[t] ? m.p0[i] : i < n ? 0.0 : m.q[i - n]);
     }
 }
 
-using Walk = void (*)(const Model&, int64_t, int64_t, int64_t, const double*, const double*, const double*, double*);
+template <int W>
+using Width = std::integral_constant<int, W>;
 
-struct Tile {
-    int64_t width;
-    Walk walk;
-};
-
-// Process all columns in tiles, given from wide to narrow, the last of width 1. The widest tile is taken of which more than
-// half is filled.
-void in_tiles(std::initializer_list<Tile> tiles, const Model& m, int64_t samples, int64_t columns, const double* gain,
-              const double* white, const double* x, double* out) {
+// walk(Width<W>, first) for tiles of W columns from `first` on. The widest tile is taken of which more than half is filled.
+template <class Walk>
+void in_tiles(int64_t columns, const Walk& walk) {
     for (int64_t first = 0; first < columns;) {
-        const Tile* tile = tiles.begin();
-        while (tile->width > 1 && columns - first <= tile->width / 2) ++tile;
-        tile->walk(m, samples, columns, first, gain, white, x, out);
-        first += tile->width;
+        const int64_t left = columns - first;
+        if (left > 16) walk(Width<32>{}, first), first += 32;
+        else if (left > 8) walk(Width<16>{}, first), first += 16;
+        else if (left > 4) walk(Width<8>{}, first), first += 8;
+        else walk(Width<1>{}, first), first += 1;
     }
 }
 }  // namespace
@@ -309,18 +323,20 @@ double kalman_gains(int64_t samples, const Model* model, double* gain, double* w
 // y (C, M, S) -> innovations of unit variance (C, M, S), column by column.
 void kalman_innovations(int64_t samples, const Model* model, int64_t columns, const double* gain, const double* white,
                         const double* y, double* out) {
-    in_tiles({{32, whiten<32>}, {16, whiten<16>}, {8, whiten<8>}, {1, whiten<1>}}, *model, samples, columns, gain,
-             white, y, out);
+    in_tiles(columns, [=](auto width, int64_t first) {
+        whiten<width>(*model, samples, columns, first, gain, white, y, out);
+    });
 }
 
 // Adjoint of kalman_innovations: v (C, M, S) -> out (C, M, S).
 void kalman_transposed(int64_t samples, const Model* model, int64_t columns, const double* gain, const double* white,
                        const double* v, double* out) {
-    in_tiles({{32, whiten_back<32>}, {16, whiten_back<16>}, {8, whiten_back<8>}, {1, whiten_back<1>}}, *model, samples,
-             columns, gain, white, v, out);
+    in_tiles(columns, [=](auto width, int64_t first) {
+        whiten_back<width>(*model, samples, columns, first, gain, white, v, out, nullptr);
+    });
 }
 
-// Disturbance smoother (Durbin and Koopman, 2012, sections 4.5 and 7.3.3). Input: columns nu (M, S, C) of innovations of
+// Disturbance smoother (Durbin and Koopman, 2012, sections 4.5 and 7.3.3). Input: columns nu (C, M, S) of innovations of
 // unit variance, the squares of which add up. Output:
 //   by_q (decaying), by_r (C), by_p0 (d): derivatives of the log-likelihood by the variances q, R and P0;
 //   n_q, n_r, n_p0: minus the parts of these that do not depend on nu; a variance times twice its n is the effective
@@ -334,23 +350,20 @@ void kalman_score(int64_t samples, const Model* model, int64_t columns, const do
     std::vector<double> space(3 * d * d + 4 * d * C);
     double *big = space.data(), *half = big + d * d, *turned = half + d * d, *inner = turned + d * d;
     double *inner_t = inner + d * C, *wide = inner_t + d * C, *cross = wide + d * C;
-    std::vector<double> of_columns(columns * d);
-    double back[d], u[C], spread[C * C], by_level[n * n], by_flow[2 * n * n];
+    double spread[C * C], by_level[n * n], by_flow[2 * n * n];
     for (double* sum : {by_q, n_q}) std::fill(sum, sum + decaying, 0.0);
     for (double* sum : {by_r, n_r}) std::fill(sum, sum + C, 0.0);
     for (double* sum : {by_p0, n_p0}) std::fill(sum, sum + d, 0.0);
+    const Sums sums{by_q, by_r, by_p0, shocks};
+    in_tiles(columns, [&](auto width, int64_t first) {
+        whiten_back<width>(m, samples, columns, first, gain, white, nu, nullptr, &sums);
+    });
     for (int64_t t = samples - 1; t >= 0; --t) {
         const double *k = gain + t * d * C, *w = white + t * C * C;
         if (t + 1 == samples || m.fresh[t + 1]) {
-            std::fill(of_columns.begin(), of_columns.end(), 0.0);
             std::fill(big, big + d * d, 0.0);
         } else {
             for (int i = 0; i < decaying; ++i) n_q[i] += 0.5 * big[(n + i) * (d + 1)];
-            for (double* r = of_columns.data(); r < of_columns.data() + columns * d; r += d) {
-                for (int i = 0; i < decaying; ++i) by_q[i] += 0.5 * r[n + i] * r[n + i];
-                backward<1>(m, t, r, back);
-                std::copy(back, back + d, r);
-            }
             // F' N F: only the rows and columns of the levels and flows need a product, and N is symmetric.
             backward<d>(m, t, big, half);
             for (int i = 0; i < d; ++i)
@@ -367,26 +380,13 @@ void kalman_score(int64_t samples, const Model* model, int64_t columns, const do
             for (int i = 0; i < d; ++i)
                 for (int j = 0; j < i; ++j) big[i * d + j] = big[j * d + i];
         }
-        // u = S^-1 nu - K' F' r, and S^-1 + K' F' N F K.
+        // S^-1 + K' F' N F K
         std::fill(inner, inner + d * C, 0.0);
         add_product<d, d, C>(big, k, inner);
         std::fill(spread, spread + C * C, 0.0);
         add_product_of_transposed<d, C, C>(k, inner, spread);
         add_product_of_transposed<C, C, C>(w, w, spread);
         for (int c = 0; c < C; ++c) n_r[c] += m.seen[t * C + c] ? 0.5 * spread[c * C + c] : 0.0;
-        for (int64_t column = 0; column < columns; ++column) {
-            double* r = &of_columns[column * d];
-            std::fill(u, u + C, 0.0);
-            add_product_of_transposed<C, C, 1>(w, nu + (column * samples + t) * C, u);
-            for (int c = 0; c < C; ++c) {
-                for (int i = 0; i < d; ++i) u[c] -= k[i * C + c] * r[i];
-                if (!m.seen[t * C + c]) u[c] = 0.0;
-                by_r[c] += 0.5 * u[c] * u[c];
-            }
-            look_back<1>(m, t, u, back);
-            for (int i = 0; i < d; ++i) r[i] += back[i];
-            for (int i = 0; i < d && m.fresh[t]; ++i) by_p0[i] += 0.5 * r[i] * r[i];
-        }
         // big = F'NF + Z + Z' with Z = H' (T H / 2 - (F'NF K)') and T = spread, which equals
         // (I - K H)' F'NF (I - K H) + H' S^-1 H.
         for (int c = 0; c < C; ++c)
@@ -401,11 +401,7 @@ void kalman_score(int64_t samples, const Model* model, int64_t columns, const do
         look_back<d>(m, t, wide, half);
         for (int i = 0; i < d; ++i)
             for (int j = 0; j < d; ++j) big[i * d + j] += half[i * d + j] + half[j * d + i];
-        for (int i = 0; i < d; ++i) {
-            const double shock = m.fresh[t] ? m.p0[i] : i < n ? 0.0 : m.q[i - n];
-            shocks[t * d + i] = shock * of_columns[i];
-            n_p0[i] += m.fresh[t] ? 0.5 * big[i * (d + 1)] : 0.0;
-        }
+        for (int i = 0; i < d && m.fresh[t]; ++i) n_p0[i] += 0.5 * big[i * (d + 1)];
     }
     for (int i = 0; i < decaying; ++i) by_q[i] -= n_q[i];
     for (int c = 0; c < C; ++c) by_r[c] -= n_r[c];

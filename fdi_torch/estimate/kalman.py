@@ -201,8 +201,8 @@ class KalmanWhitening:
         which is the sum over the M columns. Its shocks are those of the first column."""
         slopes, information = ([torch.empty_like(x) for x in (self.q, self.r, self.p0)] for _ in range(2))
         shocks = nu.new_empty(self.gain.shape[:2])
-        columns = nu.permute(2, 0, 1).contiguous()
-        self._run("kalman_score", len(columns), self.gain, self.white, columns, *slopes, *information, shocks)
+        columns = nu.permute(1, 2, 0).contiguous()
+        self._run("kalman_score", nu.shape[-1], self.gain, self.white, columns, *slopes, *information, shocks)
         return Score(self._by_deviation(*slopes), self._by_deviation(*information), shocks)
 
     def _by_deviation(self, by_q: Tensor, by_r: Tensor, by_p0: Tensor) -> Tensor:
