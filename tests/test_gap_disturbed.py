@@ -27,8 +27,10 @@ from fdi_torch.gap.marginal_likelihood import evidence_under, with_disturbances,
 from fdi_torch.gap.onsets import fine_onsets
 from fdi_torch.gap.problem import problem_of
 from fdi_torch.gap.ranked_explanation import RankedExplanation
+from fdi_torch.gap.remarks import implausible_flows
 from fdi_torch.gap.screening import Option, options_of, screen
 from fdi_torch.gap.structure_search import search
+from fdi_torch.plant.constants import flow_scale
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of_all
 from fdi_torch.recording import Recording
@@ -236,3 +238,19 @@ def test_the_evidence_beside_strong_flows_is_that_about_the_own_trajectory() -> 
     found = ExplanationPool(fitter, null, 20).evaluate(null)
     about = with_disturbances(fitter, found.fit, found.noise)
     assert evidence_under(about, found.fit, 20) == pytest.approx(found.log_evidence, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("share", "correlation_time", "doubted"), [(2.0, 500.0, True), (0.5, 500.0, False), (2.0, 0.0, False)]
+)
+def test_random_flows_above_what_a_full_tank_discharges_are_doubted(
+    share: float, correlation_time: float, doubted: bool
+) -> None:
+    """A white flow of the same standard deviation moves the level by less, since its mean over any time is small."""
+    flows = torch.tensor(
+        [share * flow_scale(nominal_plant(), t.name) for t in nominal_plant().tanks], dtype=torch.float64
+    )
+    remarks = implausible_flows(
+        nominal_plant(), StateNoise(flows, correlation_time, torch.ones(3, dtype=torch.float64)), 1.0
+    )
+    assert [r.partition(" ")[0] for r in remarks] == (["T1", "T2", "T3"] if doubted else [])

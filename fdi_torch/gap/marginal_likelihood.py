@@ -68,9 +68,9 @@ def estimate_disturbances(
     start: StateNoise | None = None,
     climb: bool = True,
 ) -> Likelihood:
-    """The most likely disturbance noise about a linearised trajectory, with the parameters of a fit profiled out.
+    """The most likely disturbance noise about a linearised trajectory, with the parameters of a fit integrated out.
 
-    further: coefficients that are profiled out as well.
+    further: coefficients that are integrated out as well.
     """
     data = fitter.data
     scale, weight, deviation = fitter.priors(fit.space, fit.theta)

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from fdi_torch.effects import EFFECTS, all_placements, effect
+from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.gap.answer import CERTAIN
 from fdi_torch.gap.candidate import Candidate, Fit
@@ -23,6 +24,7 @@ from fdi_torch.gap.library import equivalence_class
 from fdi_torch.gap.preprocess.outliers import SensorOutliers
 from fdi_torch.gap.screening import options_of
 from fdi_torch.parameters import ParameterName
+from fdi_torch.plant.constants import flow_scale
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recordings.check import data_warnings
@@ -54,11 +56,27 @@ def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
             "the fit of the likeliest explanation has not converged: its sizes may be off by more than half of their "
             "standard errors; use a longer recording, or fewer effects by --library"
         )
+    remarks += implausible_flows(data.plant, result.posterior.best.noise, data.row_spacing)
     remarks += [_masked_outliers(s) for group in result.outliers for s in group]
     remarks += [*_nominal_values_out_of_range(data.plant), *_values_at_bounds(result), *_periods(result)]
     remarks += _twins_outside_library(result)
     on_holdouts = [remark(result, h) for remark in (_free_form_fails, rig_difference) for h in held]
     return remarks + [sentence for sentence in on_holdouts if sentence]
+
+
+def implausible_flows(plant: PlantDescription, noise: StateNoise, interval: float) -> list[str]:
+    """The remark on a random flow which, averaged over the time in which the full tank runs dry, exceeds what the full
+    tank discharges: it stands for a wrong equation. interval: between readings, s."""
+    memory, remarks = max(2.0 * noise.correlation_time, interval), []
+    for tank, std in zip(plant.tanks, noise.intensity.tolist(), strict=True):
+        most = flow_scale(plant, tank.name)
+        if std * math.sqrt(min(memory * most / (tank.area * tank.height), 1.0)) > most:
+            shown, limit = (quantity_text(x, "m^3/s", 3, tank.name) for x in (std, most))
+            remarks.append(
+                f"{tank.name} would need random flows of {shown}, although the full tank discharges {limit}: the plant "
+                "file is far from the rig; check its areas, units and connections by fdi check and fdi predict"
+            )
+    return remarks
 
 
 def _masked_outliers(outliers: SensorOutliers) -> str:
