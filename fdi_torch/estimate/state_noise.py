@@ -4,9 +4,9 @@ Intensities and scales maximise the likelihood of the innovations (kalman.py) ti
 are of one order of magnitude, since a significant diffusion term in one state equation shows where a model is deficient
 (Kristensen, Madsen and Jorgensen, 2004, Automatica 40, 225-237). The gradient comes from the disturbance
 smoother (Durbin and Koopman, 2012, "Time series analysis by state space methods", section 7.3.3). The likelihood is
-averaged over the plant parameters, in which the residuals are linear: with the most likely parameters instead, flows that
-look like errors of parameters would be lost (restricted maximum likelihood, Patterson and Thompson, 1971, Biometrika 58,
-545-554). The correlation time is selected from a grid of candidates.
+averaged over the plant parameters, in which the residuals are linear: with the most likely parameters instead, flows
+that look like errors of parameters would be lost (restricted maximum likelihood, Patterson and Thompson, 1971,
+Biometrika 58, 545-554). The correlation time is selected from a grid of candidates.
 """
 
 from __future__ import annotations
@@ -207,9 +207,9 @@ class _Problem:
 def _averaged(white: Tensor, pull: Tensor, off: Tensor) -> tuple[Tensor, float]:
     """Average a Gaussian likelihood over the linear parameters, with their normal priors.
 
-    white (S, C, 1 + P): whitened residual and Jacobian. Returns the innovations under the most likely parameters, beside
-    what the errors of these add to them as P independent columns, (S, C, 1 + P); and -2 ln of the average, without the
-    log determinants of the innovations and of the priors, which may be improper (`pull` 0).
+    white (S, C, 1 + P): whitened residual and Jacobian. Returns the innovations under the most likely parameters,
+    beside what the errors of these add to them as P independent columns, (S, C, 1 + P); and -2 ln of the average,
+    without the log determinants of the innovations and of the priors, which may be improper (`pull` 0).
     """
     columns = white.permute(1, 2, 0)
     gram = (columns @ columns.mT).sum(dim=0)
