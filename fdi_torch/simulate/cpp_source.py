@@ -59,8 +59,6 @@ def emit(program: Program, inner_samples: bool, real: str, lanes: int | str) -> 
         "LANE_CONSTANTS": len(writer.lane_constants),
         "UNIFORM_CONSTANTS": len(writer.uniform_constants),
         "ROWS": len(writer.rows),
-        "STEADY": len(writer.steady),
-        "SPANS": len(writer.spans),
     }
     head = [f"#define {name} {value}" for name, value in defines.items()]
     head += [

@@ -70,7 +70,7 @@ using Lane = real[LANES];
 
 struct Block {
     alignas(64) Lane theta[SOME(COLUMNS)];
-    Lane lane[SOME(LANE_CONSTANTS)], steady[SOME(STEADY)];
+    Lane lane[SOME(LANE_CONSTANTS)];
     Lane level[ORDER], before[ORDER], sample[ORDER], slope_left[ORDER], slope_right[ORDER];
     Lane action[SOME(ACTUATORS)], command_memory[SOME(COMMAND_MEMORY)], late_channel[SOME(LATE_ACTUATORS)];
     Lane integral[SOME(LATE_ACTUATORS)], late_slope[SOME(LATE_ACTUATORS)];   // of delayed channels, up to the present
@@ -101,7 +101,7 @@ struct Block {
     Lane d_seen[COLUMNS][SENSORS], d_reading[COLUMNS][SENSORS], d_reading_memory[COLUMNS][SOME(READING_MEMORY)];
     Lane gram[SENSORS][PAIRS], column[WIDTH];
 #endif
-    real uniform[SOME(UNIFORM_CONSTANTS)], span[SOME(SPANS)];    // span: step lengths for which `steady` was computed
+    real uniform[SOME(UNIFORM_CONSTANTS)];
     int64_t end[SOME(LATE_ACTUATORS)][LANES], past[SOME(LATE_SENSORS)][LANES];
     int64_t problem[LANES];
     bool one_problem, looks;
@@ -346,7 +346,6 @@ static void load(const Job &job, Block &b, const Rows &rows) {
         for (int i = 0; i < COLUMNS; ++i) b.theta[i][l] = job.theta[lane * COLUMNS + i];
         b.problem[l] = lane / job.lanes_per_problem;
     }
-    for (real &span : b.span) span = NAN;
     b.one_problem = b.problem[0] == b.problem[LANES - 1];
     std::memset(b.end, 0, sizeof b.end);
     std::memset(b.past, 0, sizeof b.past);
