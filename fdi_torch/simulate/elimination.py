@@ -9,12 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
-
-import torch
-from torch import Tensor
-
-X = TypeVar("X")
 
 
 @dataclass(frozen=True)
@@ -35,30 +29,6 @@ class Elimination:
     rows: tuple[tuple[int, int], ...]
     updates: tuple[tuple[tuple[int, int], ...], ...]
     above: tuple[tuple[tuple[int, int], ...], ...]
-
-    def factored(self, matrix: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """LU factors in place of the matrix (one tensor per entry), and the inverse pivots."""
-        lu, inverse = list(matrix), [torch.empty(0)] * self.size
-        work = list(zip(self.rows, self.updates, strict=True))
-        for pivot in self.order:
-            inverse[pivot] = 1.0 / lu[pivot]
-            for (entry, _), updates in (w for w in work if w[0][1] == pivot):
-                lu[entry] = lu[entry] * inverse[pivot]
-                for changed, beyond in updates:
-                    lu[changed] = lu[changed] - lu[entry] * lu[beyond]
-        return lu, inverse
-
-    def solved(self, factors: tuple[list[Tensor], list[Tensor]], right: Sequence[Tensor]) -> list[Tensor]:
-        """The solution for a right-hand side, one tensor per row."""
-        (lu, inverse), x = factors, list(right)
-        for entry, pivot in self.rows:
-            row = self.entries[entry][0]
-            x[row] = x[row] - lu[entry] * x[pivot]
-        for pivot, beyond in zip(reversed(self.order), reversed(self.above), strict=True):
-            for entry, column in beyond:
-                x[pivot] = x[pivot] - lu[entry] * x[column]
-            x[pivot] = x[pivot] * inverse[pivot]
-        return x
 
 
 def eliminate(size: int, pattern: Sequence[tuple[int, int]]) -> Elimination:

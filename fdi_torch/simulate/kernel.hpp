@@ -448,7 +448,8 @@ static void end(Block &b, const real *clock, const real *channel) {
 #endif
 
 #if WITHIN
-// As `next_step` in step_control.py. Returns whether any lane is unfinished.
+// Begins the next step of each lane: its planned length, or less, so that no short step remains before the end of the
+// span; a finished lane takes one that is not used. Returns whether any lane is unfinished.
 static bool set_out(Block &b, real start, real span) {
     int open = 0;
     EACH_LANE {
@@ -542,7 +543,7 @@ static void solve_stage(const Job &job, Block &b, const real *clock, const real 
     EACH_LANE b.failed[l] = active[l] != 0 ? 1 : b.failed[l];
 }
 
-// As `ImplicitStep` in implicit.py.
+// One step of each lane, see step_control.py.
 static void step(const Job &job, Block &b, const real *clock, const real *channel) {
     EACH_LANE b.failed[l] = 0;
     take_rates(b, clock, channel, 0);
@@ -580,7 +581,9 @@ static void step(const Job &job, Block &b, const real *clock, const real *channe
     }
 }
 
-// As `accept_steps` in step_control.py. NaN levels are accepted unchanged.
+// Keeps a step of a lane if its error is at most the tolerance, or if it is the shortest allowed. The next length follows
+// from the error, which grows with step^4; that of slopes counts relative to the largest slope by the parameter so far.
+// NaN levels are accepted unchanged.
 static void keep_or_undo(const Job &job, Block &b, real span) {
     const real tolerance = job.tolerance, shortest = job.shortest;
     Lane kept, error;

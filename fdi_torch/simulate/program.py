@@ -34,7 +34,7 @@ class Program:
     levels and then its rates ('slope'), four of each in turn. advance: level. end: slope at the end of the step. read:
     reading, next_reading_memory.
 
-    adaptive: each lane divides the steps of the grid, see `implicit.py`. unrolled: there are stages, advance and end,
+    adaptive: each lane divides the steps of the grid (`step_control.py`). unrolled: there are stages, advance and end,
     which share common subexpressions. If not, there is `law`, evaluated at every stage: the rates ('slope') with their
     direct changes by theta and the actions, and their slopes by the levels ('by_level'), one output per (row, column)
     of `pattern`. late_actuators, late_sensors: indices of those with dead time, in the order of the delays.

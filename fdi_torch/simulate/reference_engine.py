@@ -15,7 +15,7 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.signals import Clock
-from fdi_torch.simulate.engine import Engine, expect_columns
+from fdi_torch.simulate.engine import Engine, expect_columns, expect_no_gradient
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.forward_mode import (
     ZeroSlopes,
@@ -25,7 +25,6 @@ from fdi_torch.simulate.forward_mode import (
     value_and_slope,
     with_slope,
 )
-from fdi_torch.simulate.gradient import expect_no_gradient
 
 
 class ReferenceEngine(Engine):
@@ -51,9 +50,7 @@ class ReferenceEngine(Engine):
         why: str = "",
         every_node: bool = True,
     ) -> None:
-        if experiment.step_control is not None:
-            raise ValueError("expected the same steps for all lanes in the reference engine, got adaptive steps")
-        self.network, self.space, self.experiment, self.why = network, space, experiment, why
+        super().__init__(network, space, experiment, why)
         self.method, self.rtol, self.atol, self.every_node = method, rtol, atol, every_node
 
     def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
