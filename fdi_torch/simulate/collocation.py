@@ -25,7 +25,6 @@ from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.scales import length_scale
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.actuation import Actuation, with_parameters
-from fdi_torch.simulate.array_program import NewtonControl
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.midpoint import newton_correction, newton_step
@@ -119,8 +118,8 @@ class Collocation:
         path = self._path(theta, constant if guess is None else guess).clone()
         path[..., 0] = start
         rates, commands = traced_rates(self.network, self.space.names), self._commands(values, [], len(theta))[0]
-        control = NewtonControl(tolerance, ROUNDS, guess is not None)
-        if rates.solve(path, commands, theta, self.network.nominal, self._actuation.clock, control):
+        guessed, clock = guess is not None, self._actuation.clock
+        if rates.solve(path, commands, theta, self.network.nominal, clock, guessed, tolerance, ROUNDS):
             return path.movedim(1, 2)
         return torch.cat([self._by_torch(*lane, tolerance) for lane in zip(theta.split(1), path.split(1), strict=True)])
 

@@ -1,4 +1,4 @@
-"""A linear recurrence in time: a compiled loop, or a few dozen vector operations on blocks of blocks for all K steps.
+"""A linear recurrence in time: a compiled loop, or some vector operations on all K steps.
 
 The loops are compiled at the first use for each number of tanks, up to `MOST`, because they keep matrices of a block of
 steps on the stack. Without a compiler, and for tensors that they cannot take (gradients, float32, GPU), torch does the
@@ -18,7 +18,6 @@ from torch import Tensor
 
 from fdi_torch.simulate.build import BuildError, load_library
 
-LENGTH = 8  # sequential steps in each block, and in blocks of blocks
 MOST = 32
 _SOURCE = Path(__file__).with_name("recurrence.hpp")
 
@@ -31,59 +30,22 @@ def scan_in_time(
 ) -> Float[Tensor, "L n m K+1"]:
     """x_{k+1} = A_k x_k + b_k for k = 0..K-1: a (L, n, n, K), b (L, n, m, K), first (L, n, m) -> x (L, n, m, K+1).
 
-    gain: G (L, n, n, K), if the forcing is G_k b_k. Without a compiled loop, all blocks run in parallel from zero
-    together with the products of their A; the starts of the blocks obey such a recurrence again, and then every x
-    follows.
+    gain: G (L, n, n, K), if the forcing is G_k b_k. Without a compiled loop, each state follows from that 1, 2, 4 ...
+    steps before it, with the products of the A between them (Hillis and Steele, 1986).
     """
-    m, count = b.shape[2], b.shape[-1]
+    count = b.shape[-1]
     a, x = a.expand(b.shape[0], *a.shape[1:]), b.new_empty(*b.shape[:-1], count + 1)
     if run_loop("scan_in_time", b.shape, [a, gain, b, first], [x]):
         return x
     if gain is not None:
         b = product(gain, b)
-    if count <= LENGTH:
-        return torch.stack(_one_by_one(a, b, first), dim=-1)
-    blocks = -(-count // LENGTH)
-    inner = _side_by_side(_in_blocks(a, blocks, one=True), _in_blocks(b, blocks, one=False))
-    ends = inner[-1][..., :-1]
-    start = scan_in_time(ends[:, :, m:], ends[:, :, :m], first)
-    x = b.new_empty(*b.shape[:-1], blocks * LENGTH + 1)
-    x[..., 0] = first
-    steps = x[..., 1:].unflatten(-1, (blocks, LENGTH))
-    for k, y in enumerate(inner):
-        steps[..., k] = product(y[:, :, m:], start).add_(y[:, :, :m])
-    return x[..., : count + 1]
-
-
-def _in_blocks(x: Tensor, blocks: int, one: bool) -> Tensor:
-    """(L, n, m, K) -> (LENGTH, L, n, m, blocks), the last block padded with identity matrices (`one`) or zeros."""
-    lanes, n, m, count = x.shape
-    whole, remainder = divmod(count, LENGTH)
-    blocked = x.new_empty(LENGTH, lanes, n, m, blocks)
-    blocked[..., :whole] = x[..., : whole * LENGTH].unflatten(-1, (whole, LENGTH)).permute(4, 0, 1, 2, 3)
-    if remainder:
-        blocked[:remainder, ..., whole] = x[..., whole * LENGTH :].permute(3, 0, 1, 2)
-        blocked[remainder:, ..., whole] = torch.eye(n, m, dtype=x.dtype, device=x.device) if one else 0.0
-    return blocked
-
-
-def _side_by_side(a: Tensor, b: Tensor) -> list[Tensor]:
-    """[x from zero | product of A] after each step within each block, (L, n, m + n, blocks)."""
-    m = b.shape[3]
-    state = torch.cat([b[0], a[0]], dim=2)
-    states = [state]
-    for k in range(1, len(a)):
-        state = product(a[k], state)
-        state[:, :, :m] += b[k]
-        states.append(state)
-    return states
-
-
-def _one_by_one(a: Tensor, b: Tensor, first: Tensor) -> list[Tensor]:
-    states = [first]
-    for k in range(b.shape[-1]):
-        states.append(product(a[..., k : k + 1], states[-1].unsqueeze(-1))[..., 0] + b[..., k])
-    return states
+    x = torch.cat([product(a[..., :1], first.unsqueeze(-1)) + b[..., :1], b[..., 1:]], dim=-1)
+    reach = 1
+    while reach < count:
+        later, between = x[..., reach:] + product(a[..., reach:], x[..., :-reach]), a[..., reach:]
+        a = torch.cat([a[..., :reach], product(between, a[..., :-reach])], dim=-1)
+        x, reach = torch.cat([x[..., :reach], later], dim=-1), 2 * reach
+    return torch.cat([first.unsqueeze(-1), x], dim=-1)
 
 
 def product(a: Float[Tensor, "L n n K"], x: Float[Tensor, "L n m K"]) -> Float[Tensor, "L n m K"]:
