@@ -10,10 +10,10 @@ from torch import Tensor
 
 from fdi_torch.simulate import traced_engine
 from fdi_torch.simulate.elimination import Elimination
+from fdi_torch.simulate.expression import Section
 from fdi_torch.simulate.injection import Injection
 from fdi_torch.simulate.interpreter import Change, State
 from fdi_torch.simulate.program import Program, build_program
-from fdi_torch.simulate.section import Section
 from fdi_torch.simulate.step_control import (
     DIAGONAL,
     ERROR,

@@ -27,10 +27,9 @@ from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.actuation import Actuation, with_parameters
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.linearised import Linearised
-from fdi_torch.simulate.midpoint import newton_correction, newton_step
+from fdi_torch.simulate.linearised_stage import partials
 from fdi_torch.simulate.output_map import LinearisedOutputs, OutputMap
-from fdi_torch.simulate.pointwise import partials
-from fdi_torch.simulate.scan import scan_in_time
+from fdi_torch.simulate.scan import newton_correction, newton_step, scan_in_time
 from fdi_torch.simulate.traced_rates import traced_rates
 
 # Newton's method has converged at corrections below these, in units of the plant's length scale: of the whole plant,

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 from fdi_torch.simulate.cpp_statements import Statements, stored
-from fdi_torch.simulate.expression import Varies
+from fdi_torch.simulate.expression import Output, Place, Row, Section, Varies
 from fdi_torch.simulate.program import Program
-from fdi_torch.simulate.section import Output, Place, Row, Section
 
 
 class SectionWriter:

@@ -17,11 +17,9 @@ from fdi_torch.parameters import by_prefix
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.elimination import Elimination, eliminate
-from fdi_torch.simulate.expression import Graph, Varies
+from fdi_torch.simulate.expression import Graph, Output, Place, Row, Section, Varies
 from fdi_torch.simulate.runge_kutta import Stages, substituted
-from fdi_torch.simulate.section import Output, Place, Row, Section
-from fdi_torch.simulate.structure import Structure, structure_of
-from fdi_torch.simulate.tracer import Tracer
+from fdi_torch.simulate.tracer import Structure, Tracer, structure_of
 
 
 @dataclass(frozen=True, eq=False)

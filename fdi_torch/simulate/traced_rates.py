@@ -13,10 +13,8 @@ from fdi_torch.parameters import by_prefix
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.array_program import ArrayProgram
-from fdi_torch.simulate.expression import Graph, Varies
-from fdi_torch.simulate.section import Place
-from fdi_torch.simulate.structure import Structure, structure_of_rates
-from fdi_torch.simulate.tracer import Tracer
+from fdi_torch.simulate.expression import Graph, Place, Varies
+from fdi_torch.simulate.tracer import Structure, Tracer, structure_of_rates
 
 Entry = tuple[int, int]
 
