@@ -17,14 +17,7 @@ from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.engine import Engine, expect_columns, expect_no_gradient
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.forward_mode import (
-    ZeroSlopes,
-    constants_with_slopes,
-    directions,
-    stack_with_slope,
-    value_and_slope,
-    with_slope,
-)
+from fdi_torch.simulate.forward_mode import ZeroSlopes, constants_with_slopes, directions, with_slope
 
 
 class ReferenceEngine(Engine):
@@ -94,14 +87,13 @@ class ReferenceEngine(Engine):
         with forward_ad.dual_level():
             engine = copy(self)
             engine.experiment, engine.arithmetic = self.experiment.mapped(with_slope), ZeroSlopes()
-            readings, slopes = value_and_slope(engine._run(directions(lanes)))
-        assert slopes is not None
+            readings, slopes = forward_ad.unpack_dual(engine._run(directions(lanes)))
         return readings[:, : len(lanes)], slopes.unflatten(1, (lanes.shape[-1], len(lanes))).movedim(1, -1)
 
     def _run(self, lanes: Tensor) -> Tensor:
         """lanes (L, P) -> readings (S, L, sensors), with slopes if the lanes have them."""
         values = self.network.bind(self.space, lanes)
-        if value_and_slope(lanes)[1] is not None:
+        if forward_ad.unpack_dual(lanes)[1] is not None:
             values = constants_with_slopes(values)
         levels, commands, values = self._integrate(values, len(lanes))
         with self.arithmetic:
@@ -119,7 +111,7 @@ class ReferenceEngine(Engine):
             commands = self._commands(values, lanes)
             levels, first = self.network.start_levels(values), self._clock(e.nodes[0], e.steps[0])
             state = self.network.with_steady_states(levels, commands[0].unbind(-1), first, values)
-            start, slopes = value_and_slope(torch.stack([x.expand(lanes) for x in state], dim=-1))
+            start, slopes = forward_ad.unpack_dual(torch.stack([x.expand(lanes) for x in state], dim=-1))
         instants = e.nodes.detach()
         edges, held = instants.tolist(), commands.unbind()
         clocks = [self._clock(begin, step) for begin, step in zip(e.nodes[:-1].unbind(), e.steps.unbind(), strict=True)]
@@ -129,7 +121,8 @@ class ReferenceEngine(Engine):
             if slopes is None:
                 return self.network(state, held[k], clocks[k], values)
             with self.arithmetic:
-                return stack_with_slope(self.network(with_slope(*state.unbind()), held[k], clocks[k], values))
+                rate = self.network(with_slope(*state.unbind()), held[k], clocks[k], values)
+                return torch.stack([*forward_ad.unpack_dual(rate)])
 
         # `perturb` evaluates slopes just inside each step, so that a switch at its end does not act early.
         restarts = instants[1:-1]
