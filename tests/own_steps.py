@@ -196,7 +196,7 @@ def _along(start: Sequence[Tensor], step: Tensor, weights: Sequence[float], slop
 
 def factored(work: Elimination, matrix: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
     """LU factors in place of the matrix (one tensor per entry), and the inverse pivots."""
-    lu, inverse = list(matrix), [torch.empty(0)] * work.size
+    lu, inverse = list(matrix), [torch.empty(0)] * len(work.order)
     rows = list(zip(work.rows, work.updates, strict=True))
     for pivot in work.order:
         inverse[pivot] = 1.0 / lu[pivot]

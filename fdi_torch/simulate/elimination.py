@@ -22,7 +22,6 @@ class Elimination:
     the diagonal.
     """
 
-    size: int
     entries: tuple[tuple[int, int], ...]
     given: tuple[int, ...]
     order: tuple[int, ...]
@@ -63,4 +62,4 @@ def eliminate(size: int, pattern: Sequence[tuple[int, int]]) -> Elimination:
             columns[k].discard(pivot)
             rows_of_column[k].discard(pivot)
     given = tuple(index.get(at, -1) for at in entries)
-    return Elimination(size, tuple(entries), given, tuple(order), tuple(rows), tuple(updates), tuple(above))
+    return Elimination(tuple(entries), given, tuple(order), tuple(rows), tuple(updates), tuple(above))

@@ -72,8 +72,7 @@ class _Run:
         injection: Injection | None = None,
     ) -> None:
         self.program, self.experiment, self.lanes, self.injection = program, experiment, lanes, injection
-        self.resolution = experiment.resolution.to(lanes)
-        interpreter = Interpreter(program, lanes, network.nominal, self.resolution)
+        interpreter = Interpreter(program, lanes, network.nominal, experiment.resolution.to(lanes))
         self.state, self.compute, self.full = interpreter.state, interpreter.run, interpreter.full
         self.history: list[list[tuple[Tensor, Change]]] = []
 
