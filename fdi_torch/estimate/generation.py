@@ -63,7 +63,6 @@ def init(
 ) -> State:
     """Draw the first population uniformly in the box, low + rand(0, 1) (high - low), not yet evaluated. (20)
 
-    low, high (*problems, P); seed (*problems) int64; first_guess (*problems, K, P), K <= N: replaces the first K.
     Raises ValueError for an empty or infinite box, mismatched shapes and a budget below the population size.
     """
     problems, parameters = low.shape[:-1], low.shape[-1]

@@ -47,7 +47,6 @@ class ReferenceEngine(Engine):
         self.method, self.rtol, self.atol, self.every_node = method, rtol, atol, every_node
 
     def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
-        """theta (*batch, P) -> readings (*batch, S, sensors) in SI."""
         expect_columns(self, theta)
         batch = theta.shape[:-1]
         lanes = theta.reshape(batch.numel(), theta.shape[-1])
@@ -58,7 +57,6 @@ class ReferenceEngine(Engine):
         return result.movedim(1, 0).reshape(*batch, *result.shape[::2])
 
     def levels(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S tanks"]:
-        """theta (*batch, P) -> tank levels at the samples (*batch, S, tanks), m."""
         expect_columns(self, theta)
         lanes = theta.reshape(theta.shape[:-1].numel(), theta.shape[-1])
         states = self._sample(*self._integrate(self.network.bind(self.space, lanes), len(lanes)))
@@ -68,10 +66,7 @@ class ReferenceEngine(Engine):
     def linearise(
         self, theta: Float[Tensor, "*batch P"]
     ) -> tuple[Float[Tensor, "*batch S C"], Float[Tensor, "*batch S C P"]]:
-        """theta (*batch, P) -> readings (*batch, S, sensors), their Jacobian (*batch, S, sensors, P), forward mode.
-
-        Levels and their slopes are integrated together; torch differentiates each operation of the right-hand side.
-        """
+        """Levels and slopes are integrated together; torch differentiates each operation of the right-hand side."""
         expect_no_gradient(self, theta, "linearise")
         lanes = theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
         parts = [self._run_with_slopes(p) for p in ([lanes] if self.method == "rk4" else lanes.split(1))]
