@@ -11,7 +11,7 @@ from fdi_torch.effects import build_network, placements_for
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.actuation import with_parameters
-from fdi_torch.simulate.pointwise import partials
+from fdi_torch.simulate.linearised_stage import partials
 from fdi_torch.simulate.traced_rates import TracedRates
 
 SIZES = (3, 10, 30)

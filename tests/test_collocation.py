@@ -18,10 +18,9 @@ from fdi_torch.recording import Recording
 from fdi_torch.simulate import array_program
 from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.experiment import lay_out
-from fdi_torch.simulate.midpoint import newton_step
 from fdi_torch.simulate.output_map import SampleGrid
 from fdi_torch.simulate.reference_engine import ReferenceEngine
-from fdi_torch.simulate.scan import scan_in_time
+from fdi_torch.simulate.scan import newton_step, scan_in_time
 from tests.rigs import blank_recording, constant_inputs, three_tank
 
 

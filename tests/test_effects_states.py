@@ -27,10 +27,12 @@ from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
+from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.ode import PlantOde
 from fdi_torch.simulate.step_control import StepControl
+from tests.own_steps import OwnStepsEngine
 from tests.rigs import blank_recording
 
 NOISE, STEP = 1e-3, 0.25  # m, s
@@ -99,8 +101,8 @@ def test_adaptive_steps_agree_with_short_fixed_steps(placement: Placement) -> No
     theta = space.nominal()
     experiment = replace(adaptive, resolution=theta.new_tensor(STEP))
     exact = make_engine(network, space, lay_out(recording, plant.channels(), STEP), "compiled").linearise(theta)[1]
-    for kind in ("traced", "compiled"):
-        readings, slopes = make_engine(network, space, experiment, kind).linearise(theta)
+    for engine in (OwnStepsEngine, CompiledEngine):
+        readings, slopes = engine(network, space, experiment).linearise(theta)
         assert torch.allclose(readings, recording.outputs, rtol=0.0, atol=2e-4)
         assert torch.allclose(slopes, exact, rtol=0.0, atol=2e-2 * float(exact.abs().max()))
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from own_steps import OwnStepsEngine
 from rigs import blank_recording, factor, rescaled
 from torch import Tensor
 
@@ -28,6 +29,8 @@ from fdi_torch.plant.signals import Clock
 from fdi_torch.recording import Recording
 from fdi_torch.report.schematic import schematic
 from fdi_torch.simulate.build import BuildError
+from fdi_torch.simulate.compiled_engine import CompiledEngine
+from fdi_torch.simulate.engine import Engine
 from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.reference_engine import ReferenceEngine
@@ -297,15 +300,15 @@ def test_every_engine_gives_the_same_readings_and_slopes(kind: type[FlowComponen
 
 
 @kinds
-@engines
-def test_adaptive_steps_keep_their_tolerance(kind: type[FlowComponent], engine: str) -> None:
+@pytest.mark.parametrize("engine", [CompiledEngine, OwnStepsEngine])
+def test_adaptive_steps_keep_their_tolerance(kind: type[FlowComponent], engine: type[Engine]) -> None:
     """A tenth of a millimetre, against steps of a quarter of a second."""
     plant = plant_with(kind)
     control = StepControl.for_tolerance(1e-4, plant)
     experiment = lay_out(inputs_of(plant), plant.channels(), SAMPLE, control)
     network = build_network(plant)
     try:
-        levels = make_engine(network, ParameterSpace(), experiment, engine).levels(network.nominal.new_zeros(0))
+        levels = engine(network, ParameterSpace(), experiment).levels(network.nominal.new_zeros(0))
     except BuildError as error:
         pytest.skip(str(error))
     assert (levels - levels_of(kind, 0.25)).abs().max() < 1e-4

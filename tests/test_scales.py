@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from own_steps import OwnStepsEngine
 from rigs import blank_recording, factor, rescaled, three_tank
 from torch import Tensor
 
@@ -40,7 +41,6 @@ from fdi_torch.simulate.experiment import lay_out
 from fdi_torch.simulate.simulated_recording import clean_readings, with_noise
 from fdi_torch.simulate.step_control import StepControl
 from fdi_torch.simulate.step_length import commensurate_step, step_ladder
-from fdi_torch.simulate.traced_engine import TracedEngine
 from tests.test_monitor import NAMES, SPACE, followed, recorded, step_to
 
 FAULTS = {"T1.leak.size": 0.2, "P13.plugging.size": 0.3}
@@ -146,7 +146,7 @@ def test_steps_of_a_lane_s_own_scale_with_the_rig(metres: float, seconds: float)
         assert own.resolution == pytest.approx(0.5 * s)
         network = build_network(plant, placements_for(FAULTS))
         space = ParameterSpace(network.constants[name] for name in FAULTS)
-        engine = TracedEngine(network, space, lay_out(blank.stretch(0, 12), plant.channels(), s, own))
+        engine = OwnStepsEngine(network, space, lay_out(blank.stretch(0, 12), plant.channels(), s, own))
         found.append(engine.readings(space.vector(FAULTS)[None]) / m)
     torch.testing.assert_close(found[1], found[0], rtol=1e-12, atol=1e-13)
 

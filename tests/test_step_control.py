@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from own_steps import OwnStepsEngine, accept_steps, next_step
 from rigs import assert_lanes_stand_alone, constant_inputs, three_tank
 from rigs import paper_network as rig
 from torch import Tensor
@@ -16,12 +17,12 @@ from fdi_torch.estimate.fitting import set_up
 from fdi_torch.estimate.refinement import HybridSettings, information_std, refine_to_convergence
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
+from fdi_torch.simulate import build
 from fdi_torch.simulate.compiled_engine import CompiledEngine
 from fdi_torch.simulate.engine import Readings, gram_of
 from fdi_torch.simulate.experiment import Experiment, lay_out
-from fdi_torch.simulate.implicit import DIAGONAL, EMBEDDED, STAGES
 from fdi_torch.simulate.reference_engine import ReferenceEngine
-from fdi_torch.simulate.step_control import StepControl, accept_steps, next_step
+from fdi_torch.simulate.step_control import DIAGONAL, EMBEDDED, STAGES, StepControl
 from fdi_torch.simulate.traced_engine import TracedEngine
 
 
@@ -70,7 +71,7 @@ def test_a_fixed_step_whose_roots_are_as_sharp_is_no_better(truth: Tensor) -> No
 def test_both_engines_take_the_same_steps() -> None:
     network, space = rig()
     e, theta = experiment(1e-5, samples=7), faults(space, 8)  # the pumps switch once
-    compiled, traced = CompiledEngine(network, space, e), TracedEngine(network, space, e)
+    compiled, traced = CompiledEngine(network, space, e), OwnStepsEngine(network, space, e)
     levels = traced.levels(theta)
     assert float((compiled.levels(theta) - levels).abs().max()) < 1e-10 * float(levels.max())
     readings, jacobian = compiled.linearise(theta)
@@ -120,7 +121,7 @@ def test_every_effect_keeps_its_meaning() -> None:
     levels = CompiledEngine(network, space, fine).levels(theta)
     assert float((CompiledEngine(network, space, own).levels(theta) - levels).abs().max()) < 1e-5
     short = experiment(1e-7, samples=7)
-    traced = TracedEngine(network, space, short).levels(theta)
+    traced = OwnStepsEngine(network, space, short).levels(theta)
     torch.testing.assert_close(CompiledEngine(network, space, short).levels(theta), traced, rtol=0, atol=1e-10)
 
 
@@ -167,9 +168,10 @@ def test_misuse_is_named() -> None:
     network, space = rig()
     with pytest.raises(ValueError, match=r"expected a tolerance above the rounding of levels .*, got 0 m"):
         experiment(0.0)
-    message = "expected the same steps for all lanes in the reference engine, got adaptive steps"
-    with pytest.raises(ValueError, match=message):
-        ReferenceEngine(network, space, experiment(1e-6))
+    for engine in (ReferenceEngine, TracedEngine):
+        message = f"expected the same steps for all lanes in the {engine.name} engine, got adaptive steps"
+        with pytest.raises(ValueError, match=message):
+            engine(network, space, experiment(1e-6))
 
 
 def test_a_long_recording_is_fitted_in_own_steps_alike(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -192,6 +194,10 @@ def test_a_long_recording_is_fitted_in_own_steps_alike(monkeypatch: pytest.Monke
         assert not fitting.takes_own_steps(0.1)
         expected, std = fitted()
     assert fitting.takes_own_steps(0.1) and not fitting.takes_own_steps(1.0)
+    assert not replace(fitting, engine="traced").takes_own_steps(0.1), "only the compiled engine takes them"
+    with monkeypatch.context() as without:
+        without.setattr(build, "find_compiler", lambda: None)
+        assert not fitting.takes_own_steps(0.1)
     found, own_std = fitted()
     assert float(((found - expected).abs() / std).max()) < 0.1
     torch.testing.assert_close(own_std, std, rtol=1e-2, atol=0)

@@ -16,7 +16,7 @@ from fdi_torch.plant.effect import Effect, Placement, Stage, fits
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.array_program import BLOCK
-from fdi_torch.simulate.pointwise import partials
+from fdi_torch.simulate.linearised_stage import partials
 from fdi_torch.simulate.program import build_program
 from fdi_torch.simulate.traced_rates import RateSlopes, TracedRates, traced_rates
 from tests.rigs import three_tank

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import ClassVar
 
 import torch
 
@@ -19,9 +20,9 @@ class NetOutlet(Effect):
 
     name = "net_outlet"
     stage = Stage.FLOW
-    places = ("outlet",)
+    places: ClassVar[tuple[str, ...]] = ("outlet",)
     searched = False
-    mistaken_for = ("plugging", "leak")
+    mistaken_for: ClassVar[tuple[str, ...]] = ("plugging", "leak")
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("size", "1", 1.0, -1.0, 2.0, meaning="net outflow relative to the outlet's law"),)

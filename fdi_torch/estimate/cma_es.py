@@ -22,6 +22,7 @@ from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.strategy import (
     Proposal,
     SearchState,
+    Strategy,
     before_first_generation,
     pick,
     reflected,
@@ -83,68 +84,65 @@ class _Constants:
         )
 
 
-class CmaEs:
-    """The strategy `cma_es`; methods as in `Strategy`."""
-
-    state = CmaState
-
-    def init(
-        self, low: Tensor, high: Tensor, settings: EvolutionSettings, seed: Tensor, first_guess: Tensor | None = None
-    ) -> CmaState:
-        problems, parameters = low.shape[:-1], low.shape[-1]
-        size = settings.first_population(parameters)
-        common = before_first_generation(low, high, settings, seed, size)
-        guess = low.new_zeros((*problems, 0, parameters)) if first_guess is None else first_guess.to(low)
-        guess = guess.clamp(low[..., None, :], high[..., None, :])
-        population = with_first_guess(((low + high) / 2)[..., None, :].repeat_interleave(size, -2), guess)
-        zeros = torch.zeros_like(low)
-        mean = torch.full_like(low, 0.5) if first_guess is None else (guess[..., 0, :] - low) / _width(low, high)
-        return CmaState(
-            **common,
-            population=population,
-            guess=guess,
-            mean=mean,
-            step=low.new_full(problems, FIRST_STEP),
-            covariance=torch.diag_embed(torch.ones_like(low)),
-            step_path=zeros,
-            path=zeros,
-        )
-
-    def ask(self, state: CmaState, settings: EvolutionSettings) -> CmaTrial:
-        size, parameters = state.population.shape[-2:]
-        u = uniform(stream(state.seed, state.generation), size * parameters).unflatten(-1, (size, parameters))
-        normal = (math.sqrt(2.0) * torch.erfinv(2.0 * u - 1.0)).to(state.low.dtype)
-        moved = apply(cholesky(state.covariance)[..., None, :, :], normal)
-        low, width = state.low[..., None, :], _width(state.low, state.high)[..., None, :]
-        candidates = low + width * (state.mean[..., None, :] + state.step[..., None, None] * moved)
-        candidates = reflected(candidates, low, state.high[..., None, :])
-        if state.generation == 0 and state.guess.shape[-2]:
-            given = ((state.guess - low) / width - state.mean[..., None, :]) / state.step[..., None, None]
-            normal, moved = with_first_guess(normal, given), with_first_guess(moved, given)
-            candidates = with_first_guess(candidates, state.guess)
-        return CmaTrial(candidates, normal, moved)
-
-    def tell(self, state: CmaState, trial: CmaTrial, cost: Tensor, settings: EvolutionSettings) -> CmaState:
-        cost, order = torch.sort(state.checked(cost), stable=True)
-        updated = _adapted(state, pick(trial.normal, order), pick(trial.moved, order), cost)
-        population = pick(trial.candidates, order)
-        # The best candidate of all is kept in the population, but takes no part in the update.
-        earlier = state.cost[..., 0] < cost[..., 0]
-        population = torch.where(
-            earlier[..., None, None], torch.cat((state.population[..., :1, :], population[..., :-1, :]), -2), population
-        )
-        cost = torch.where(earlier[..., None], torch.cat((state.cost[..., :1], cost[..., :-1]), -1), cost)
-        after = replace(
-            updated,
-            population=population,
-            cost=cost,
-            generation=state.generation + 1,
-            evaluations=state.evaluations + cost.shape[-1],
-        )
-        return after.with_progress_counters(settings)
+def init(
+    low: Tensor, high: Tensor, settings: EvolutionSettings, seed: Tensor, first_guess: Tensor | None = None
+) -> CmaState:
+    problems, parameters = low.shape[:-1], low.shape[-1]
+    size = settings.first_population(parameters)
+    common = before_first_generation(low, high, settings, seed, size)
+    guess = low.new_zeros((*problems, 0, parameters)) if first_guess is None else first_guess.to(low)
+    guess = guess.clamp(low[..., None, :], high[..., None, :])
+    population = with_first_guess(((low + high) / 2)[..., None, :].repeat_interleave(size, -2), guess)
+    zeros = torch.zeros_like(low)
+    mean = torch.full_like(low, 0.5) if first_guess is None else (guess[..., 0, :] - low) / _width(low, high)
+    return CmaState(
+        **common,
+        population=population,
+        guess=guess,
+        mean=mean,
+        step=low.new_full(problems, FIRST_STEP),
+        covariance=torch.diag_embed(torch.ones_like(low)),
+        step_path=zeros,
+        path=zeros,
+    )
 
 
-STRATEGY = CmaEs()
+def ask(state: CmaState, settings: EvolutionSettings) -> CmaTrial:
+    size, parameters = state.population.shape[-2:]
+    u = uniform(stream(state.seed, state.generation), size * parameters).unflatten(-1, (size, parameters))
+    normal = (math.sqrt(2.0) * torch.erfinv(2.0 * u - 1.0)).to(state.low.dtype)
+    moved = apply(cholesky(state.covariance)[..., None, :, :], normal)
+    low, width = state.low[..., None, :], _width(state.low, state.high)[..., None, :]
+    candidates = low + width * (state.mean[..., None, :] + state.step[..., None, None] * moved)
+    candidates = reflected(candidates, low, state.high[..., None, :])
+    if state.generation == 0 and state.guess.shape[-2]:
+        given = ((state.guess - low) / width - state.mean[..., None, :]) / state.step[..., None, None]
+        normal, moved = with_first_guess(normal, given), with_first_guess(moved, given)
+        candidates = with_first_guess(candidates, state.guess)
+    return CmaTrial(candidates, normal, moved)
+
+
+def tell(state: CmaState, trial: CmaTrial, cost: Tensor, settings: EvolutionSettings) -> CmaState:
+    cost, order = torch.sort(state.checked(cost), stable=True)
+    updated = _adapted(state, pick(trial.normal, order), pick(trial.moved, order), cost)
+    population = pick(trial.candidates, order)
+    # The best candidate of all is kept in the population, but takes no part in the update.
+    earlier = state.cost[..., 0] < cost[..., 0]
+    population = torch.where(
+        earlier[..., None, None], torch.cat((state.population[..., :1, :], population[..., :-1, :]), -2), population
+    )
+    cost = torch.where(earlier[..., None], torch.cat((state.cost[..., :1], cost[..., :-1]), -1), cost)
+    after = replace(
+        updated,
+        population=population,
+        cost=cost,
+        generation=state.generation + 1,
+        evaluations=state.evaluations + cost.shape[-1],
+    )
+    return after.with_progress_counters(settings)
+
+
+STRATEGY = Strategy(CmaState, init, ask, tell)
 
 
 def _adapted(state: CmaState, normal: Tensor, moved: Tensor, cost: Tensor) -> CmaState:

@@ -21,6 +21,7 @@ from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
+from fdi_torch.simulate.build import can_compile
 from fdi_torch.simulate.engine import Engine, Readings
 from fdi_torch.simulate.engine_choice import adaptive_engine, make_engine
 from fdi_torch.simulate.equilibrium import equilibrium
@@ -118,12 +119,14 @@ class Fitting:
         return any(self._takes_own_steps(k, step) for k in range(len(self.recordings)))
 
     def _takes_own_steps(self, k: int, step: float) -> bool:
-        """True if step control per lane is cheaper than fixed steps, and the inputs are constant between samples."""
+        """True if the inputs are constant between samples, and the compiled engine's control of each lane's steps is
+        cheaper than fixed steps."""
         recording = self.recordings[k]
         steps = float(recording.time[-1] - recording.time[0]) / step
         acts_on_commands = any(p.effect.stage is Stage.COMMAND for p in self.networks[k].placements)
         inputs_constant = recording.hold == "zero_order" and not acts_on_commands
-        return inputs_constant and not self.is_slow and steps > OWN_STEP_COST * len(recording)
+        is_cheaper = inputs_constant and steps > OWN_STEP_COST * len(recording)
+        return is_cheaper and self.engine in ("auto", "compiled") and self.device.type == "cpu" and can_compile()
 
     @on_its_device
     def problem(

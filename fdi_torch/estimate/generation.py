@@ -18,7 +18,15 @@ from torch import Tensor
 from fdi_torch.estimate.draws import stream, uniform
 from fdi_torch.estimate.evolution_settings import EvolutionSettings
 from fdi_torch.estimate.shade import draw_factor, draw_rate, update_archive, update_memory
-from fdi_torch.estimate.strategy import Proposal, SearchState, before_first_generation, halfway, pick, with_first_guess
+from fdi_torch.estimate.strategy import (
+    Proposal,
+    SearchState,
+    Strategy,
+    before_first_generation,
+    halfway,
+    pick,
+    with_first_guess,
+)
 
 _VARIATION, _ARCHIVE = 0, 2  # indices of the random streams of one generation
 
@@ -55,7 +63,6 @@ def init(
 ) -> State:
     """Draw the first population uniformly in the box, low + rand(0, 1) (high - low), not yet evaluated. (20)
 
-    low, high (*problems, P); seed (*problems) int64; first_guess (*problems, K, P), K <= N: replaces the first K.
     Raises ValueError for an empty or infinite box, mismatched shapes and a budget below the population size.
     """
     problems, parameters = low.shape[:-1], low.shape[-1]
@@ -200,14 +207,5 @@ def _sorted_and_reduced(state: State, settings: EvolutionSettings) -> State:
     )
 
 
-@dataclass(frozen=True)
-class DifferentialEvolution:
-    """The strategies `rand/1/bin` and `l-shade`, which the settings distinguish."""
-
-    state = State
-    init = staticmethod(init)
-    ask = staticmethod(ask)
-    tell = staticmethod(tell)
-
-
-STRATEGY = DifferentialEvolution()
+STRATEGY = Strategy(State, init, ask, tell)
+"""The strategies `rand/1/bin` and `l-shade`, which the settings distinguish."""

@@ -14,9 +14,10 @@ those of running it alone: random numbers therefore come from `draws`, and sums 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from importlib import import_module
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import torch
 from jaxtyping import Float, Int
@@ -97,26 +98,20 @@ class Proposal:
     candidates: Tensor  # (*problems, N, P)
 
 
-class Strategy(Protocol):
-    """A search strategy. `state` is its type of state."""
+@dataclass(frozen=True)
+class Strategy:
+    """A search strategy: the type of its state, and three functions of it.
 
-    @property
-    def state(self) -> type[SearchState]:
-        """Type of the state."""
+    init(low, high, settings, seed, first_guess): the state before the first generation, in the box low, high
+    (*problems, P), with seeds (*problems) int64; first_guess (*problems, K, P), K <= N, or None: candidates of that
+    generation. ask(state, settings): the next candidates (*problems, N, P), a `Proposal`. tell(state, trial, cost,
+    settings): the next state from the costs (*problems, N) of the candidates; a cost that is not finite never wins.
+    """
 
-    def init(
-        self, low: Tensor, high: Tensor, settings: EvolutionSettings, seed: Tensor, first_guess: Tensor | None = None
-    ) -> Any:
-        """The state before the first generation, in the box low, high (*problems, P), with seeds (*problems) int64.
-
-        first_guess (*problems, K, P), K <= N: candidates of the first generation.
-        """
-
-    def ask(self, state: Any, settings: EvolutionSettings) -> Any:
-        """Propose the next candidates (*problems, N, P)."""
-
-    def tell(self, state: Any, trial: Any, cost: Tensor, settings: EvolutionSettings) -> Any:
-        """The next state from the costs (*problems, N) of the candidates; a cost that is not finite never wins."""
+    state: type[SearchState]
+    init: Callable[..., Any]
+    ask: Callable[..., Any]
+    tell: Callable[..., Any]
 
 
 def strategy_named(name: str) -> Strategy:

@@ -20,9 +20,9 @@ from fdi_torch.plant.scales import length_scale
 from fdi_torch.simulate.actuation import Actuation
 from fdi_torch.simulate.collocation import CONVERGED
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.midpoint import newton_correction
+from fdi_torch.simulate.linearised_stage import Row, partials
 from fdi_torch.simulate.output_map import OutputMap
-from fdi_torch.simulate.pointwise import Row, partials
+from fdi_torch.simulate.scan import newton_correction
 
 Starts = Mapping[str, Tensor]
 NEWTON_ROUNDS = 12

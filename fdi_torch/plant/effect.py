@@ -7,7 +7,7 @@ nominal value. An effect overrides the hook of its stage; every other hook passe
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import ClassVar
 
@@ -15,13 +15,14 @@ import torch
 
 from fdi_torch.parameters import Parameter, ParameterName
 from fdi_torch.plant.description import FLOW_KINDS, PlantDescription
-from fdi_torch.plant.flow_component import FlowComponent
+from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
 from fdi_torch.plant.local_conditions import Local, Values
 from fdi_torch.plant.operating_range import OperatingRange
 from fdi_torch.plant.signals import Clock
 
 __all__ = [
-    *("Effect", "Memory", "Placement", "Stage", "fits", "place_kind", "place_kinds_of"),
+    *("Effect", "Memory", "Placement", "Stage"),
+    *("expect_fit", "fits", "place_kind", "place_kinds_of", "placed_parameters"),
     *("Clock", "Local", "OperatingRange", "Parameter", "PlantDescription", "Values"),  # for the files of effects
 ]
 
@@ -190,3 +191,36 @@ def place_kinds_of(effect: Effect) -> tuple[str, ...]:
     """The kinds of place at which the effect can be placed, with those of the flow components that accept it."""
     accepting = (name for kind in FLOW_KINDS if effect.name in kind.accepts for name in kind.place_kinds)
     return tuple(dict.fromkeys((*effect.places, *accepting)))
+
+
+def placed_parameters(placement: Placement, plant: PlantDescription) -> list[Parameter]:
+    """The effect's parameters under their full names ('T1.leak.size'), nominal at the placement's known values."""
+    known = dict(placement.values or {})
+    parameters = []
+    for p in placement.effect.parameters(placement.location, plant):
+        nominal = known.pop(p.name, p.nominal)
+        low, high = min(p.low, nominal), max(p.high, nominal)
+        name = placement.full_name(p.name)
+        std = plant.tolerances.get(name, p.std)
+        parameters.append(replace(p, name=name, nominal=nominal, low=low, high=high, std=std))
+    if known:
+        expected = ", ".join(p.name for p in placement.effect.parameters(placement.location, plant))
+        raise ValueError(f"{placement.prefix}: expected parameters of {expected}, got {', '.join(known)}")
+    return parameters
+
+
+def expect_fit(plant: PlantDescription, placement: Placement) -> None:
+    """Raises ValueError for a placement where its effect cannot be."""
+    if not fits(placement.effect, plant, placement.location):
+        kinds = " or ".join(place_kinds_of(placement.effect))
+        raise ValueError(f"{placement.prefix}: expected a place of kind {kinds}, got {placement.location}")
+    stage = placement.effect.stage
+    if not placement.effect.states or stage is Stage.BALANCE:
+        return
+    component = plant.component(placement.location)
+    by_levels = isinstance(component, FlowComponent) and component.order <= FlowOrder.BY_LEVELS
+    if stage is not Stage.FLOW or not by_levels:
+        raise ValueError(
+            f"{placement.prefix}: expected states only in a BALANCE effect, or in a FLOW effect of a component whose "
+            f"flow depends on levels and commands alone, got {stage.name} at {placement.location}"
+        )

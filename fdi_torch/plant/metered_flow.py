@@ -20,11 +20,7 @@ def gain_field() -> Any:
 
 
 class MeteredFlow(FlowComponent):
-    """A flow of gain x command, limited to 0..max_flow (m^3/s).
-
-    command: the input channel, if its name differs from the component's. gain: m^3/s per SI unit of the command
-    (1 if the command is a flow); a gain given as text ('2 l/min/V') sets gain_unit, one of `COMMAND_UNITS`.
-    """
+    """A flow of gain x command, limited to 0..max_flow (m^3/s); its fields are those of `Pump`."""
 
     commanded = True
 

@@ -17,12 +17,11 @@ from torch import Tensor, nn
 from fdi_torch.parameters import ParameterSpace, by_prefix
 from fdi_torch.plant.constants import constant_parameters
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
-from fdi_torch.plant.effect import Memory, Placement, Stage, Values
+from fdi_torch.plant.effect import Memory, Placement, Stage, Values, expect_fit, placed_parameters
 from fdi_torch.plant.flow_component import FlowComponent, FlowOrder
 from fdi_torch.plant.local_conditions import Local
 from fdi_torch.plant.operating_point import Constants, OperatingPoint, PlaceValues
 from fdi_torch.plant.orifice import limit_emptying, weir_flow
-from fdi_torch.plant.placed_effects import expect_fit, placed_parameters
 from fdi_torch.plant.signal_chain import SignalChain
 from fdi_torch.plant.signals import Clock
 
@@ -117,8 +116,10 @@ class TankNetwork(nn.Module):
     ) -> OperatingPoint:
         """What the terms of the equations depend on, at one state (as in `rates`) and one set of commands (*batch)."""
         levels, states = self.split(state)
-        point = OperatingPoint.of(self.description, levels, self._actuator_names, commands, clock, values)
-        return replace(point, states=states) if states else point
+        by_tank = dict(zip((tank.name for tank in self.description.tanks), levels, strict=True))
+        by_actuator = dict(zip(self._actuator_names, commands, strict=True))
+        constants = values if isinstance(values, Constants) else Constants(values)
+        return OperatingPoint(self.description, by_tank, by_actuator, clock, constants, states)
 
     def split(self, state: Sequence[Tensor]) -> tuple[Sequence[Tensor], dict[str, tuple[Tensor, ...]]]:
         """The tanks' levels, and the states of each effect by its prefix; none for a state of levels alone."""

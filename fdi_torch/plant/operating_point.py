@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -53,21 +53,7 @@ class OperatingPoint:
     commands: Mapping[str, Tensor]
     clock: Clock
     values: Constants
-    states: Mapping[str, tuple[Tensor, ...]] = field(default_factory=dict)
-
-    @classmethod
-    def of(
-        cls,
-        plant: PlantDescription,
-        levels: Sequence[Tensor],
-        actuators: Sequence[str],
-        commands: Sequence[Tensor],
-        clock: Clock,
-        values: PlaceValues,
-    ) -> OperatingPoint:
-        by_tank = dict(zip((tank.name for tank in plant.tanks), levels, strict=True))
-        constants = values if isinstance(values, Constants) else Constants(values)
-        return cls(plant, by_tank, dict(zip(actuators, commands, strict=True)), clock, constants)
+    states: Mapping[str, tuple[Tensor, ...]]
 
     @property
     def gravity(self) -> Tensor:

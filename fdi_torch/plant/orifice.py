@@ -33,11 +33,6 @@ def regular_width(rate: float, resolution: torch.Tensor) -> torch.Tensor:
     return bound * bound
 
 
-def orifice_capacity(discharge_coefficient: torch.Tensor, area: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:
-    """C_d a sqrt(2 g): flow at 1 m of head, m^2.5/s (Torricelli)."""
-    return discharge_coefficient * area * torch.sqrt(2.0 * gravity)
-
-
 def weir_strength(coefficient: torch.Tensor | float, crest: torch.Tensor, gravity: torch.Tensor) -> torch.Tensor:
     """Weir coefficient (2/3) C sqrt(2 g) b of a sharp crest of length b, m^1.5/s; flow over it at 1 m above the crest.
 

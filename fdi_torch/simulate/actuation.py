@@ -13,8 +13,7 @@ from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.linearised_stage import Signals, linearise_stage, solve_memory
-from fdi_torch.simulate.pointwise import Row, partials
+from fdi_torch.simulate.linearised_stage import Row, Signals, linearise_stage, partials, solve_memory
 
 
 @dataclass(frozen=True)

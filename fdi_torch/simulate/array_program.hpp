@@ -13,29 +13,9 @@ struct Instruction {
     int32_t operation, out, a, b, c;
 };
 
-struct Code {
-    int64_t count;
-    const Instruction* instructions;
-};
-
-// Numbers of one lane, (lanes, count) with `stride` between lanes: each fills a register.
-struct Scalars {
-    int64_t count, stride;
-    const double* values;
-    const int32_t* registers;
-};
-
-// Arrays in time, each with its own stride between lanes.
-struct Arrays {
-    int64_t count;
-    double* const* starts;
-    const int64_t* strides;
-    const int32_t* registers;
-};
-
-static void carry_out(const Code& code, Register* registers) {
-    for (int64_t i = 0; i < code.count; ++i) {
-        const Instruction& now = code.instructions[i];
+static void carry_out(const Instruction* code, int64_t count, Register* registers) {
+    for (int64_t i = 0; i < count; ++i) {
+        const Instruction& now = code[i];
         double* out = registers[now.out].of_step;
         double *a = registers[now.a].of_step, *b = registers[now.b].of_step, *c = registers[now.c].of_step;
         switch (now.operation) {
@@ -44,38 +24,41 @@ static void carry_out(const Code& code, Register* registers) {
     }
 }
 
-// fixed: what does not vary in time, once per lane. varying: the rest, once per block. An output is stored as soon as
-// its position in `outputs` comes: `stores` holds the number of instructions of `varying` after which each is complete.
+// values (lanes, scalars): numbers of one lane, each of which fills a register. inputs, outputs: arrays in time, each with
+// its own stride between lanes. fixed_code: what does not vary in time, once per lane. varying_code: the rest, once per
+// block. An output is stored as soon as its position comes: `stores` holds the number of instructions of `varying_code`
+// after which each is complete.
 struct Program {
-    int64_t registers;
-    Scalars scalars;
-    Arrays inputs;
-    Code fixed, varying;
+    int64_t registers, scalars, inputs, outputs, fixed, varying;
+    const double* values;
+    const int32_t *scalar_registers, *input_registers, *output_registers;
+    const Instruction *fixed_code, *varying_code;
     const int64_t* stores;
-    Arrays outputs;
+    double* const* input_starts;
+    const int64_t* input_strides;
+    double* const* output_starts;
+    const int64_t* output_strides;
 };
 
-static void carry_out_fixed(const Program& program, int64_t lane, Register* registers) {
-    const Scalars& scalars = program.scalars;
-    for (int64_t i = 0; i < scalars.count; ++i) {
-        double* to = registers[scalars.registers[i]].of_step;
-        std::fill(to, to + BLOCK, scalars.values[lane * scalars.stride + i]);
+static void carry_out_fixed(const Program& x, int64_t lane, Register* registers) {
+    for (int64_t i = 0; i < x.scalars; ++i) {
+        double* to = registers[x.scalar_registers[i]].of_step;
+        std::fill(to, to + BLOCK, x.values[lane * x.scalars + i]);
     }
-    carry_out(program.fixed, registers);
+    carry_out(x.fixed_code, x.fixed, registers);
 }
 
-static void carry_out_block(const Program& program, int64_t lane, int64_t start, int64_t length, Register* registers) {
-    const Arrays &inputs = program.inputs, &outputs = program.outputs;
-    for (int64_t i = 0; i < inputs.count; ++i) {
-        const double* from = inputs.starts[i] + lane * inputs.strides[i] + start;
-        std::copy(from, from + length, registers[inputs.registers[i]].of_step);
+static void carry_out_block(const Program& x, int64_t lane, int64_t start, int64_t length, Register* registers) {
+    for (int64_t i = 0; i < x.inputs; ++i) {
+        const double* from = x.input_starts[i] + lane * x.input_strides[i] + start;
+        std::copy(from, from + length, registers[x.input_registers[i]].of_step);
     }
     int64_t done = 0;
-    for (int64_t i = 0; i < outputs.count; ++i) {
-        carry_out({program.stores[i] - done, program.varying.instructions + done}, registers);
-        done = program.stores[i];
-        const double* from = registers[outputs.registers[i]].of_step;
-        std::copy(from, from + length, outputs.starts[i] + lane * outputs.strides[i] + start);
+    for (int64_t i = 0; i < x.outputs; ++i) {
+        carry_out(x.varying_code + done, x.stores[i] - done, registers);
+        done = x.stores[i];
+        const double* from = registers[x.output_registers[i]].of_step;
+        std::copy(from, from + length, x.output_starts[i] + lane * x.output_strides[i] + start);
     }
 }
 

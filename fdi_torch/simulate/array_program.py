@@ -9,34 +9,110 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from fdi_torch.simulate.assembly import NUMBER, Instructions, assemble
 from fdi_torch.simulate.build import BuildError, load_library
 from fdi_torch.simulate.cpp_source import primitives
-from fdi_torch.simulate.expression import Graph, Varies
+from fdi_torch.simulate.expression import Graph, Place, Varies
 from fdi_torch.simulate.operations import OPERATIONS
 from fdi_torch.simulate.scan import is_plain
-from fdi_torch.simulate.section import Place
+
+NUMBER = {name: i for i, name in enumerate(OPERATIONS)}
+"""The number of each operation in an instruction."""
+
+
+@dataclass
+class _Registers:
+    """Allocation of registers; one that is free is used again."""
+
+    count: int = 0
+    free: list[int] = field(default_factory=list)
+
+    def take(self) -> int:
+        if self.free:
+            return self.free.pop()
+        self.count += 1
+        return self.count - 1
+
+
+@dataclass(frozen=True)
+class Instructions:
+    """Instructions (N, 5), int32. order: of the outputs, as they are completed; stores and output_registers follow it.
+
+    stores: number of varying instructions after which an output is complete.
+    """
+
+    registers: int
+    scalar_registers: Tensor
+    array_registers: Tensor
+    fixed: Tensor
+    varying: Tensor
+    order: list[int]
+    stores: Tensor
+    output_registers: Tensor
+
+
+def assemble(
+    graph: Graph, nodes: Sequence[int], scalars: Sequence[int], arrays: Sequence[int], outputs: Sequence[int]
+) -> Instructions:
+    registers, places = _Registers(), {}
+    for i in (*scalars, *arrays):
+        places[i] = registers.take()
+    computed = [i for i in nodes if graph.nodes[i].arguments]
+    fixed = [i for i in computed if not graph.nodes[i].varies & Varies.STEP]
+    varying = [i for i in computed if graph.nodes[i].varies & Varies.STEP]
+    code: dict[str, list[tuple[int, ...]]] = {"fixed": [], "varying": []}
+
+    def write(part: str, i: int, arguments: Sequence[int]) -> None:
+        used = [*(places[a] for a in arguments), 0, 0]
+        code[part].append((NUMBER[graph.nodes[i].operation], places[i], *used[:3]))
+
+    for i in fixed:
+        places[i] = registers.take()
+        write("fixed", i, graph.nodes[i].arguments)
+    last_use = {a: i for i in varying for a in graph.nodes[i].arguments}
+    wanted: dict[int, list[int]] = {}
+    for k, i in enumerate(outputs):
+        wanted.setdefault(i, []).append(k)
+    order, stores = [k for i, ks in wanted.items() if i not in set(varying) for k in ks], []
+    stores += [0] * len(order)
+    output_registers = [places[outputs[k]] for k in order]
+    for done, i in enumerate(varying, 1):
+        arguments = graph.nodes[i].arguments
+        places[i] = registers.take()  # before its arguments are freed: an operation may not overwrite them
+        write("varying", i, arguments)
+        for k in wanted.get(i, ()):
+            order.append(k)
+            stores.append(done)
+            output_registers.append(places[i])
+        ended = {a for a in arguments if last_use[a] == i and a in places and graph.nodes[a].arguments}
+        ended |= {i} if i not in last_use else set()
+        registers.free += [places[a] for a in ended if graph.nodes[a].varies & Varies.STEP]
+    return Instructions(
+        registers.count,
+        _int32([places[i] for i in scalars]),
+        _int32([places[i] for i in arrays]),
+        _int32(code["fixed"]),
+        _int32(code["varying"]),
+        order,
+        torch.tensor(stores, dtype=torch.int64),
+        _int32(output_registers),
+    )
+
+
+def _int32(values: Sequence[object]) -> Tensor:
+    return torch.tensor(values, dtype=torch.int32)
+
 
 BLOCK = 64
 """Steps in a block; a multiple of the numbers in a vector register."""
 _SKELETON = Path(__file__).with_name("array_program.hpp")
-
-
-@dataclass(frozen=True)
-class NewtonControl:
-    """tolerance: largest correction, m, at which Newton's method has converged. rounds: maximum number of
-    corrections of a block of steps. guessed: whether the path is a guess of the trajectory."""
-
-    tolerance: float
-    rounds: int
-    guessed: bool
 
 
 class ArrayProgram:
@@ -69,13 +145,16 @@ class ArrayProgram:
         slopes: Sequence[tuple[int, int]],
         span: Tensor,
         path: Tensor,
-        control: NewtonControl,
+        guessed: bool,
+        tolerance: float,
+        rounds: int,
     ) -> bool:
         """Solve trajectories path (L, n, K+1) from their first states by the implicit midpoint rule, in place.
 
         Some of the inputs are views of middle (n, K), which holds the states in the middle of each step. The program
-        computes the n rates, and then their slopes by (rate, state). span (K,): lengths of the steps, s. Returns False
-        without a compiler.
+        computes the n rates, and then their slopes by (rate, state). span (K,): lengths of the steps, s. guessed:
+        whether the path is a guess of the trajectory. tolerance: largest correction, m, at which Newton's method has
+        converged. rounds: maximum number of corrections of a block of steps. Returns False without a compiler.
         """
         (lanes, n, _), steps, library = path.shape, len(span), _library()
         if library is None:
@@ -89,9 +168,9 @@ class ArrayProgram:
         library.solve_trajectories(
             ctypes.byref(program),
             ctypes.byref(trajectory),
-            ctypes.c_int64(control.guessed),
-            ctypes.c_double(control.tolerance),
-            ctypes.c_int64(control.rounds),
+            ctypes.c_int64(guessed),
+            ctypes.c_double(tolerance),
+            ctypes.c_int64(rounds),
         )
         return True
 
@@ -125,14 +204,12 @@ class ArrayProgram:
         code, (lanes, steps) = self._code, into[0].shape
         together = torch.cat([s.expand(lanes).unsqueeze(-1) for s in scalars], dim=-1) if scalars else into[0][:, :0]
         rows = [a if a.stride(-1) == 1 or steps == 1 else a.contiguous() for a in arrays]
+        into = [into[k] for k in code.order]
         program = _Program(
-            code.registers,
-            _Scalars(len(scalars), len(scalars), together.data_ptr(), code.scalar_registers.data_ptr()),
-            _arrays(rows, code.array_registers),
-            _Code(len(code.fixed), code.fixed.data_ptr()),
-            _Code(len(code.varying), code.varying.data_ptr()),
-            code.stores.data_ptr(),
-            _arrays([into[k] for k in code.order], code.output_registers),
+            *(code.registers, len(scalars), len(rows), len(into), len(code.fixed), len(code.varying)),
+            *(t.data_ptr() for t in (together, code.scalar_registers, code.array_registers, code.output_registers)),
+            *(t.data_ptr() for t in (code.fixed, code.varying, code.stores)),
+            *(*_rows(rows), *_rows(into)),
         )
         program.kept = together, rows  # their memory
         return program
@@ -142,45 +219,21 @@ class ArrayProgram:
         return assemble(self._graph, self._nodes, self._scalars, self._arrays, self._outputs)
 
 
-class _Scalars(ctypes.Structure):
-    """`Scalars` of array_program.hpp."""
-
-    _fields_ = (
-        ("count", ctypes.c_int64),
-        ("stride", ctypes.c_int64),
-        ("values", ctypes.c_void_p),
-        ("registers", ctypes.c_void_p),
-    )
-
-
-class _Arrays(ctypes.Structure):
-    """`Arrays` of array_program.hpp."""
-
-    _fields_ = (
-        ("count", ctypes.c_int64),
-        ("starts", ctypes.POINTER(ctypes.c_void_p)),
-        ("strides", ctypes.POINTER(ctypes.c_int64)),
-        ("registers", ctypes.c_void_p),
-    )
-
-
-class _Code(ctypes.Structure):
-    """`Code` of array_program.hpp."""
-
-    _fields_ = (("count", ctypes.c_int64), ("instructions", ctypes.c_void_p))
+def _fields(kind: Any, names: str) -> tuple[tuple[str, Any], ...]:
+    return tuple((name, kind) for name in names.split())
 
 
 class _Program(ctypes.Structure):
     """`Program` of array_program.hpp."""
 
     _fields_ = (
-        ("registers", ctypes.c_int64),
-        ("scalars", _Scalars),
-        ("inputs", _Arrays),
-        ("fixed", _Code),
-        ("varying", _Code),
-        ("stores", ctypes.c_void_p),
-        ("outputs", _Arrays),
+        *_fields(ctypes.c_int64, "registers scalars inputs outputs fixed varying"),
+        *_fields(ctypes.c_void_p, "values scalar_registers input_registers output_registers"),
+        *_fields(ctypes.c_void_p, "fixed_code varying_code stores"),
+        *_fields(ctypes.POINTER(ctypes.c_void_p), "input_starts"),
+        *_fields(ctypes.POINTER(ctypes.c_int64), "input_strides"),
+        *_fields(ctypes.POINTER(ctypes.c_void_p), "output_starts"),
+        *_fields(ctypes.POINTER(ctypes.c_int64), "output_strides"),
     )
     kept: object
 
@@ -188,17 +241,16 @@ class _Program(ctypes.Structure):
 class _Trajectory(ctypes.Structure):
     """`Trajectory` of array_program.hpp."""
 
-    _fields_ = tuple((name, ctypes.c_int64) for name in ("lanes", "n", "steps", "count")) + tuple(
-        (name, ctypes.c_void_p) for name in ("rows", "columns", "span", "rates", "slopes", "middle", "path")
+    _fields_ = (
+        *_fields(ctypes.c_int64, "lanes n steps count"),
+        *_fields(ctypes.c_void_p, "rows columns span rates slopes middle path"),
     )
 
 
-def _arrays(rows: Sequence[Tensor], registers: Tensor) -> _Arrays:
-    """Pointers to rows (L, K) of contiguous steps."""
-    count = len(rows)
-    starts = (ctypes.c_void_p * count)(*(r.data_ptr() for r in rows))
-    strides = (ctypes.c_int64 * count)(*(r.stride(0) for r in rows))
-    return _Arrays(count, starts, strides, registers.data_ptr())
+def _rows(rows: Sequence[Tensor]) -> tuple[object, object]:
+    """Pointers to rows (L, K) of contiguous steps, and their strides between lanes."""
+    starts = (ctypes.c_void_p * len(rows))(*(r.data_ptr() for r in rows))
+    return starts, (ctypes.c_int64 * len(rows))(*(r.stride(0) for r in rows))
 
 
 @lru_cache(maxsize=1)

@@ -60,6 +60,15 @@ def warm_up() -> None:
     load_library("#include <thread>\n#include <vector>\nstd::vector<std::thread> threads;\n")
 
 
+def can_compile() -> bool:
+    """Whether a compiler works here."""
+    try:
+        warm_up()
+    except BuildError:
+        return False
+    return True
+
+
 def cache_folder() -> Path:
     """$XDG_CACHE_HOME/fdi_torch or ~/.cache/fdi_torch; without a home folder, one of this user in the temporary
     folder.

@@ -25,13 +25,11 @@ from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.scales import length_scale
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.actuation import Actuation, with_parameters
-from fdi_torch.simulate.array_program import NewtonControl
 from fdi_torch.simulate.experiment import Experiment
 from fdi_torch.simulate.linearised import Linearised
-from fdi_torch.simulate.midpoint import newton_correction, newton_step
+from fdi_torch.simulate.linearised_stage import partials
 from fdi_torch.simulate.output_map import LinearisedOutputs, OutputMap
-from fdi_torch.simulate.pointwise import partials
-from fdi_torch.simulate.scan import scan_in_time
+from fdi_torch.simulate.scan import newton_correction, newton_step, scan_in_time
 from fdi_torch.simulate.traced_rates import traced_rates
 
 # Newton's method has converged at corrections below these, in units of the plant's length scale: of the whole plant,
@@ -119,8 +117,8 @@ class Collocation:
         path = self._path(theta, constant if guess is None else guess).clone()
         path[..., 0] = start
         rates, commands = traced_rates(self.network, self.space.names), self._commands(values, [], len(theta))[0]
-        control = NewtonControl(tolerance, ROUNDS, guess is not None)
-        if rates.solve(path, commands, theta, self.network.nominal, self._actuation.clock, control):
+        guessed, clock = guess is not None, self._actuation.clock
+        if rates.solve(path, commands, theta, self.network.nominal, clock, guessed, tolerance, ROUNDS):
             return path.movedim(1, 2)
         return torch.cat([self._by_torch(*lane, tolerance) for lane in zip(theta.split(1), path.split(1), strict=True)])
 

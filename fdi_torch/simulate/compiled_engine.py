@@ -15,9 +15,8 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.build import load_library
 from fdi_torch.simulate.cpp_source import emit
-from fdi_torch.simulate.engine import Engine, Readings, expect_columns, expect_problems
+from fdi_torch.simulate.engine import Engine, Readings, expect_no_gradient, expect_problems
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.gradient import expect_no_gradient, is_differentiated, readings_with_gradient
 from fdi_torch.simulate.injection import Injection, expect_injectable
 from fdi_torch.simulate.program import Program, build_program
 
@@ -67,36 +66,19 @@ class CompiledEngine(Engine):
     exception that a signal handler raises while a loop runs.
     """
 
-    name = "compiled"
+    name, own_steps = "compiled", True
 
     def __init__(self, network: TankNetwork, space: ParameterSpace, experiment: Experiment, why: str = "") -> None:
-        self.network, self.space, self.experiment, self.why = network, space, experiment, why
+        super().__init__(network, space, experiment, why)
         shares = experiment.sample_share
         inner = bool(((shares > 0) & (shares < 1)).any())
         self._form = experiment.step_control is not None, inner
         self._tables: dict[torch.dtype, dict[str, Tensor]] = {}
 
-    def levels(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S tanks"]:
-        expect_no_gradient(self, theta, "levels")
-        out = self._empty(theta, len(self.network.description.tanks))
-        self._run("levels", theta, out)
-        return out
-
-    def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
-        expect_columns(self, theta)
-        if is_differentiated(theta):
-            return readings_with_gradient(self, theta)
-        out = self._empty(theta, self._sensors)
-        self._run("readings", theta, out)
-        return out
-
-    def linearise(
-        self, theta: Float[Tensor, "*batch P"]
-    ) -> tuple[Float[Tensor, "*batch S C"], Float[Tensor, "*batch S C P"]]:
-        expect_no_gradient(self, theta, "linearise")
-        out = self._empty(theta, self._sensors)
-        jacobian = self._empty(theta, self._sensors, len(self.space))
-        self._run("linearise", theta, out, jacobian)
+    def _simulate(self, mode: str, theta: Tensor) -> tuple[Tensor, Tensor | None]:
+        out = self._empty(theta, len(self.network.description.tanks) if mode == "levels" else self._sensors)
+        jacobian = self._empty(theta, self._sensors, len(self.space)) if mode == "linearise" else None
+        self._run(mode, theta, out, jacobian)
         return out, jacobian
 
     def moments(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C 3"]:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from fdi_torch.simulate.cpp_statements import EXPENSIVE, Statements, stored
-from fdi_torch.simulate.expression import Graph, Node, Varies
+from fdi_torch.simulate.cpp_statements import Statements, stored
+from fdi_torch.simulate.expression import Output, Place, Row, Section, Varies
 from fdi_torch.simulate.program import Program
-from fdi_torch.simulate.section import Output, Place, Row, Section
 
 
 class SectionWriter:
@@ -18,9 +17,6 @@ class SectionWriter:
         self.lane_constants: dict[int, int] = {}
         self.uniform_constants: dict[int, int] = {}
         self.rows: dict[Place, tuple[int, Row]] = {}
-        self.step_invariant_nodes = step_invariant_nodes(program.graph)
-        self.steady: dict[tuple[str, int], int] = {}
-        self.spans: list[str] = []
 
     def sections(self) -> str:
         p = self.program
@@ -43,7 +39,7 @@ class SectionWriter:
         directions.
         """
         outputs = [o for part in parts for o in part]
-        body = Statements(self.graph, lambda i: self.constant(i, name), self.step_invariant_nodes)
+        body = Statements(self.graph, self.constant)
         ends = self._ends(parts)
         needed = [self._wanted(part, end) for part, end in zip(parts, ends, strict=True)]
         body.keep(needed, [slope for o in outputs for slope, _ in o.row.terms])
@@ -55,20 +51,7 @@ class SectionWriter:
         head += [f"    alignas(64) Lane kept[{max(len(body.kept), 1)}];", *body.common]
         tail = ["    (void)kept; (void)clock; (void)channel;", "}"]
         lines += self._directions(outputs, body)
-        return "\n".join([*head, *self._refresh(name), *lines, *tail])
-
-    def _refresh(self, name: str) -> list[str]:
-        """Statements that recompute a section's step invariants when the step's length changes."""
-        nodes = {i: k for (section, i), k in self.steady.items() if section == name}
-        if not nodes:
-            return []
-        body = Statements(self.graph, self.constant)
-        lanes = body.compute(list(nodes))
-        lanes += [stored(f"b.steady[{k}]", body.number(i)) for i, k in nodes.items()]
-        self.spans.append(name)
-        span = f"b.span[{len(self.spans) - 1}]"
-        head = [f"    if (clock[1] != {span}) {{", f"    {span} = clock[1];", *body.common]
-        return [*head, "    EACH_VECTOR {", *lanes, "    }", "    }"]
+        return "\n".join([*head, *lines, *tail])
 
     def _ends(self, parts: Sequence[Section]) -> list[list[Output]]:
         """The outputs that each part stores; new states are stored by the last part, when their old values are no
@@ -118,12 +101,10 @@ class SectionWriter:
         """The storage location of an output; end slopes are stored only if samples lie within steps."""
         return "" if place[0] == "slope1" and not self.inner_samples else place_text(place)
 
-    def constant(self, i: int, section: str = "") -> str:
-        """The storage location of a node that `prepare` computes, or of a step invariant of the section."""
+    def constant(self, i: int) -> str:
+        """The storage location of a node that `prepare` computes."""
         node = self.graph.nodes[i]
-        if section and i in self.step_invariant_nodes:
-            text = f"AT(b.steady[{self.steady.setdefault((section, i), len(self.steady))}])"
-        elif node.varies & Varies.LANE:
+        if node.varies & Varies.LANE:
             text = f"AT(b.lane[{self.lane_constants.setdefault(i, len(self.lane_constants))}])"
         else:
             text = f"b.uniform[{self.uniform_constants.setdefault(i, len(self.uniform_constants))}]"
@@ -186,23 +167,3 @@ def d_place_text(place: Place) -> str:
 
 def d_name(place: Place) -> str:
     return f"d_{place[0]}_{place[1]}"
-
-
-def step_invariant_nodes(graph: Graph) -> frozenset[int]:
-    """The nodes that vary between lanes and otherwise only with the length of a step, such as a lag's exp(-dt / tau).
-
-    They are recomputed only when that length changes. Nodes without an expensive operation (EXPENSIVE) are left out,
-    because to store them costs more than to recompute them.
-    """
-    steady: set[int] = set()
-    expensive: set[int] = set()
-    for i, node in enumerate(graph.nodes):
-        if node.operation in EXPENSIVE or any(a in expensive for a in node.arguments):
-            expensive.add(i)
-        if _is_steady(node) if node.operation in ("input", "literal") else all(a in steady for a in node.arguments):
-            steady.add(i)
-    return frozenset(i for i in steady & expensive if graph.nodes[i].varies == Varies.BOTH)
-
-
-def _is_steady(node: Node) -> bool:
-    return not node.varies & Varies.STEP or (node.kind == "clock" and node.index == 1)

@@ -14,9 +14,17 @@ from pathlib import Path
 
 from fdi_torch.simulate.build import REGISTER
 from fdi_torch.simulate.cpp_sections import SectionWriter
-from fdi_torch.simulate.implicit import DIAGONAL, ERROR, NEWTON_ROUNDING, NEWTON_ROUNDS, NEWTON_SHARE, STAGES
 from fdi_torch.simulate.program import Program
-from fdi_torch.simulate.step_control import LONGER, SHORTER
+from fdi_torch.simulate.step_control import (
+    DIAGONAL,
+    ERROR,
+    LONGER,
+    NEWTON_ROUNDING,
+    NEWTON_ROUNDS,
+    NEWTON_SHARE,
+    SHORTER,
+    STAGES,
+)
 
 _SKELETON, _PRIMITIVES = (Path(__file__).with_name(name) for name in ("kernel.hpp", "vector.hpp"))
 # glibc has vector versions of these functions, which a compiler may use once they are declared.
@@ -59,8 +67,6 @@ def emit(program: Program, inner_samples: bool, real: str, lanes: int | str) -> 
         "LANE_CONSTANTS": len(writer.lane_constants),
         "UNIFORM_CONSTANTS": len(writer.uniform_constants),
         "ROWS": len(writer.rows),
-        "STEADY": len(writer.steady),
-        "SPANS": len(writer.spans),
     }
     head = [f"#define {name} {value}" for name, value in defines.items()]
     head += [
@@ -93,7 +99,7 @@ def _law_tables(program: Program) -> list[str]:
 
 
 def _implicit_tables(program: Program) -> list[str]:
-    """The coefficients of `implicit.py` and the operations of its elimination."""
+    """The coefficients of `step_control.py` and the operations of its elimination."""
     elimination = program.elimination
     ends = list(accumulate(len(updates) for updates in elimination.updates))
     beyond_ends = list(accumulate(len(row) for row in elimination.above))

@@ -15,14 +15,11 @@ class Statements:
     """Writes the statements that compute the nodes of one section, loop by loop.
 
     constant: expression for a node that does not vary in time, or None while such nodes are themselves computed.
-    steady: further nodes for which `constant` is used. kept: index in the storage of nodes that are needed after their
-    loop.
+    kept: index in the storage of nodes that are needed after their loop.
     """
 
-    def __init__(
-        self, graph: Graph, constant: Callable[[int], str] | None = None, steady: Collection[int] = frozenset()
-    ) -> None:
-        self.graph, self.constant, self.steady = graph, constant, steady
+    def __init__(self, graph: Graph, constant: Callable[[int], str] | None = None) -> None:
+        self.graph, self.constant = graph, constant
         self.common: list[str] = []
         self.kept: dict[int, int] = {}
         self._known: set[int] = set()
@@ -31,7 +28,7 @@ class Statements:
 
     def keep(self, loops: Sequence[list[int]], slopes: Iterable[int]) -> None:
         """Select the nodes to store: slopes for the loop over directions, and nodes that later loops need."""
-        needed = [i for i in slopes if self.graph.nodes[i].varies == Varies.BOTH and i not in self.steady]
+        needed = [i for i in slopes if self.graph.nodes[i].varies == Varies.BOTH]
         computed: set[int] = set()
         for loop in loops:
             order = self._order(loop, computed)
@@ -105,10 +102,10 @@ class Statements:
     def _is_computed(self, i: int) -> bool:
         """Whether the node is the result of an operation in a loop."""
         node = self.graph.nodes[i]
-        return node.varies == Varies.BOTH and node.operation != "input" and i not in self.steady
+        return node.varies == Varies.BOTH and node.operation != "input"
 
     def _is_constant(self, i: int) -> bool:
-        return i in self.steady or not self.graph.nodes[i].varies & Varies.STEP
+        return not self.graph.nodes[i].varies & Varies.STEP
 
     def _statement(self, i: int, declared: bool = False) -> str:
         return f"{'' if declared else f'const {self._type(i)} '}v{i} = {self._formula(i)};"

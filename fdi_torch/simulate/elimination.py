@@ -9,12 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
-
-import torch
-from torch import Tensor
-
-X = TypeVar("X")
 
 
 @dataclass(frozen=True)
@@ -28,37 +22,12 @@ class Elimination:
     the diagonal.
     """
 
-    size: int
     entries: tuple[tuple[int, int], ...]
     given: tuple[int, ...]
     order: tuple[int, ...]
     rows: tuple[tuple[int, int], ...]
     updates: tuple[tuple[tuple[int, int], ...], ...]
     above: tuple[tuple[tuple[int, int], ...], ...]
-
-    def factored(self, matrix: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """LU factors in place of the matrix (one tensor per entry), and the inverse pivots."""
-        lu, inverse = list(matrix), [torch.empty(0)] * self.size
-        work = list(zip(self.rows, self.updates, strict=True))
-        for pivot in self.order:
-            inverse[pivot] = 1.0 / lu[pivot]
-            for (entry, _), updates in (w for w in work if w[0][1] == pivot):
-                lu[entry] = lu[entry] * inverse[pivot]
-                for changed, beyond in updates:
-                    lu[changed] = lu[changed] - lu[entry] * lu[beyond]
-        return lu, inverse
-
-    def solved(self, factors: tuple[list[Tensor], list[Tensor]], right: Sequence[Tensor]) -> list[Tensor]:
-        """The solution for a right-hand side, one tensor per row."""
-        (lu, inverse), x = factors, list(right)
-        for entry, pivot in self.rows:
-            row = self.entries[entry][0]
-            x[row] = x[row] - lu[entry] * x[pivot]
-        for pivot, beyond in zip(reversed(self.order), reversed(self.above), strict=True):
-            for entry, column in beyond:
-                x[pivot] = x[pivot] - lu[entry] * x[column]
-            x[pivot] = x[pivot] * inverse[pivot]
-        return x
 
 
 def eliminate(size: int, pattern: Sequence[tuple[int, int]]) -> Elimination:
@@ -93,4 +62,4 @@ def eliminate(size: int, pattern: Sequence[tuple[int, int]]) -> Elimination:
             columns[k].discard(pivot)
             rows_of_column[k].discard(pivot)
     given = tuple(index.get(at, -1) for at in entries)
-    return Elimination(size, tuple(entries), given, tuple(order), tuple(rows), tuple(updates), tuple(above))
+    return Elimination(tuple(entries), given, tuple(order), tuple(rows), tuple(updates), tuple(above))

@@ -1,9 +1,12 @@
-"""The interface of all engines: readings, their Jacobian, and sums over samples that need no stored trajectory."""
+"""The interface of all engines: readings, their gradient and Jacobian, and sums over samples that need no stored
+trajectory.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -61,14 +64,17 @@ class Engine:
     """A plant in one experiment, simulated for many parameter vectors (lanes) at once. C sensors, S samples, P
     parameters.
 
-    why: the reason for the choice of this engine, one sentence.
+    why: the reason for the choice of this engine, one sentence. own_steps: whether each lane can divide the steps of
+    the grid (`Experiment.step_control`). An engine implements `_simulate`, or `readings`, `levels` and `linearise`.
     """
 
-    name: str
-    why: str
-    network: TankNetwork
-    space: ParameterSpace
-    experiment: Experiment
+    name: ClassVar[str]
+    own_steps: ClassVar[bool] = False
+
+    def __init__(self, network: TankNetwork, space: ParameterSpace, experiment: Experiment, why: str = "") -> None:
+        if experiment.step_control is not None and not self.own_steps:
+            raise ValueError(f"expected the same steps for all lanes in the {self.name} engine, got adaptive steps")
+        self.network, self.space, self.experiment, self.why = network, space, experiment, why
 
     def __repr__(self) -> str:
         sensors, samples = len(self.network.description.sensors), len(self.experiment.sample_times)
@@ -79,17 +85,30 @@ class Engine:
         )
 
     def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
-        """Readings in SI; differentiable if theta requires a gradient."""
-        raise NotImplementedError
+        """Readings in SI; differentiable if theta requires a gradient.
+
+        With dL/dtheta = sum over S and C of dL/dy dy/dtheta: the Jacobian is computed together with the readings and
+        stored for the backward pass, 8 S C P bytes per lane in float64. Differentiating twice raises RuntimeError.
+        """
+        expect_columns(self, theta)
+        return _Readings.apply(theta, self) if _is_differentiated(theta) else self._simulate("readings", theta)[0]
 
     def levels(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S tanks"]:
         """Tank levels at the samples, m."""
-        raise NotImplementedError
+        expect_no_gradient(self, theta, "levels")
+        return self._simulate("levels", theta)[0]
 
     def linearise(
         self, theta: Float[Tensor, "*batch P"]
     ) -> tuple[Float[Tensor, "*batch S C"], Float[Tensor, "*batch S C P"]]:
         """Readings and their Jacobian, by forward mode."""
+        expect_no_gradient(self, theta, "linearise")
+        readings, jacobian = self._simulate("linearise", theta)
+        assert jacobian is not None
+        return readings, jacobian
+
+    def _simulate(self, mode: str, theta: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Levels or readings, and the Jacobian in the mode 'linearise'."""
         raise NotImplementedError
 
     def moments(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C 3"]:
@@ -122,6 +141,52 @@ def expect_columns(engine: Engine, theta: object) -> None:
         f"theta: expected a tensor of floating-point numbers with {columns}, got {got}; "
         f"write torch.tensor({example}, dtype=torch.float64)"
     )
+
+
+def _is_differentiated(theta: Tensor) -> bool:
+    """Whether autograd records operations on these parameters."""
+    return theta.requires_grad and torch.is_grad_enabled()
+
+
+def expect_no_gradient(engine: Engine, theta: Tensor, what: str) -> None:
+    """Raises ValueError if theta does not fit the engine or requires a gradient that this operation would lose."""
+    expect_columns(engine, theta)
+    if _is_differentiated(theta):
+        raise ValueError(
+            f"{what}: expected theta without requires_grad on the {engine.name} engine, got one with it; differentiate "
+            "readings(theta), take the reference engine, or pass theta.detach()"
+        )
+
+
+class _Readings(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, theta: Tensor, engine: Engine) -> Tensor:
+        readings, jacobian = engine.linearise(theta.detach())
+        ctx.save_for_backward(jacobian, theta)
+        ctx.engine = engine.name
+        return readings
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> tuple[Tensor, None]:
+        jacobian, theta = ctx.saved_tensors
+        slope = torch.einsum("...sc,...scp->...p", gradients[0], jacobian)
+        return (_Once.apply(slope, theta, ctx.engine) if torch.is_grad_enabled() else slope), None
+
+
+class _Once(torch.autograd.Function):
+    """A gradient that cannot be differentiated again, because the engine has no second derivatives."""
+
+    @staticmethod
+    def forward(ctx: Any, slope: Tensor, theta: Tensor, engine: str) -> Tensor:
+        ctx.engine = engine
+        return slope.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> tuple[Tensor, None, None]:
+        raise RuntimeError(
+            f"expected a first derivative of the {ctx.engine} engine's readings, got a request for the second; take "
+            "engine='reference', which torch differentiates any number of times"
+        )
 
 
 def expect_problems(theta: Float[Tensor, "*problems N P"], data: Readings) -> None:

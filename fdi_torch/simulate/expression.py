@@ -7,7 +7,7 @@ computes what does not vary in time once per trajectory, and what does not vary 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from fdi_torch.simulate.operations import FOLDED, OPERATIONS
 
@@ -226,3 +226,31 @@ class Graph:
             self._known[key] = len(self.nodes)
             self.nodes.append(node)
         return self._known[key]
+
+
+Place = tuple[str, int]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One output's change: the sum of coefficient x change of an input, plus one coefficient for each column of
+    theta.
+    """
+
+    terms: tuple[tuple[int, Place], ...] = ()
+    theta: Mapping[int, int] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.terms or self.theta)
+
+
+@dataclass(frozen=True)
+class Output:
+    """A result of a section: where it is stored, the node of the graph that computes it, and its change with theta."""
+
+    place: Place
+    node: int
+    row: Row = Row()
+
+
+Section = tuple[Output, ...]

@@ -40,18 +40,6 @@ def constants_with_slopes(values: PlaceValues) -> PlaceValues:
     return Constants({place: {f: with_slope(v) for f, v in constants.items()} for place, constants in values.items()})
 
 
-def value_and_slope(value: Tensor) -> tuple[Tensor, Tensor | None]:
-    """The value and the slope of a tensor; None for the slope outside forward mode."""
-    return forward_ad.unpack_dual(value)
-
-
-def stack_with_slope(value: Tensor) -> Tensor:
-    """The value and the slope of a tensor as one plain tensor (2, ...)."""
-    number, slope = value_and_slope(value)
-    assert slope is not None
-    return torch.stack([number, slope])
-
-
 def directions(lanes: Float[Tensor, "L P"]) -> Float[Tensor, "PL P"]:
     """lanes (L, P) -> (P L, P): one copy of the batch per parameter, with the unit slope by that parameter."""
     count, parameters = lanes.shape

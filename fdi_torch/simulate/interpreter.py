@@ -8,10 +8,9 @@ from typing import cast
 
 from torch import Tensor
 
-from fdi_torch.simulate.expression import Node, Varies
+from fdi_torch.simulate.expression import Node, Place, Row, Section, Varies
 from fdi_torch.simulate.operations import OPERATIONS
 from fdi_torch.simulate.program import Program
-from fdi_torch.simulate.section import Place, Row, Section
 
 Change = Tensor | None
 

@@ -70,7 +70,7 @@ using Lane = real[LANES];
 
 struct Block {
     alignas(64) Lane theta[SOME(COLUMNS)];
-    Lane lane[SOME(LANE_CONSTANTS)], steady[SOME(STEADY)];
+    Lane lane[SOME(LANE_CONSTANTS)];
     Lane level[ORDER], before[ORDER], sample[ORDER], slope_left[ORDER], slope_right[ORDER];
     Lane action[SOME(ACTUATORS)], command_memory[SOME(COMMAND_MEMORY)], late_channel[SOME(LATE_ACTUATORS)];
     Lane integral[SOME(LATE_ACTUATORS)], late_slope[SOME(LATE_ACTUATORS)];   // of delayed channels, up to the present
@@ -101,7 +101,7 @@ struct Block {
     Lane d_seen[COLUMNS][SENSORS], d_reading[COLUMNS][SENSORS], d_reading_memory[COLUMNS][SOME(READING_MEMORY)];
     Lane gram[SENSORS][PAIRS], column[WIDTH];
 #endif
-    real uniform[SOME(UNIFORM_CONSTANTS)], span[SOME(SPANS)];    // span: step lengths for which `steady` was computed
+    real uniform[SOME(UNIFORM_CONSTANTS)];
     int64_t end[SOME(LATE_ACTUATORS)][LANES], past[SOME(LATE_SENSORS)][LANES];
     int64_t problem[LANES];
     bool one_problem, looks;
@@ -346,7 +346,6 @@ static void load(const Job &job, Block &b, const Rows &rows) {
         for (int i = 0; i < COLUMNS; ++i) b.theta[i][l] = job.theta[lane * COLUMNS + i];
         b.problem[l] = lane / job.lanes_per_problem;
     }
-    for (real &span : b.span) span = NAN;
     b.one_problem = b.problem[0] == b.problem[LANES - 1];
     std::memset(b.end, 0, sizeof b.end);
     std::memset(b.past, 0, sizeof b.past);
@@ -449,7 +448,8 @@ static void end(Block &b, const real *clock, const real *channel) {
 #endif
 
 #if WITHIN
-// As `next_step` in step_control.py. Returns whether any lane is unfinished.
+// Begins the next step of each lane: its planned length, or less, so that no short step remains before the end of the
+// span; a finished lane takes one that is not used. Returns whether any lane is unfinished.
 static bool set_out(Block &b, real start, real span) {
     int open = 0;
     EACH_LANE {
@@ -543,7 +543,7 @@ static void solve_stage(const Job &job, Block &b, const real *clock, const real 
     EACH_LANE b.failed[l] = active[l] != 0 ? 1 : b.failed[l];
 }
 
-// As `ImplicitStep` in implicit.py.
+// One step of each lane, see step_control.py.
 static void step(const Job &job, Block &b, const real *clock, const real *channel) {
     EACH_LANE b.failed[l] = 0;
     take_rates(b, clock, channel, 0);
@@ -581,7 +581,9 @@ static void step(const Job &job, Block &b, const real *clock, const real *channe
     }
 }
 
-// As `accept_steps` in step_control.py. NaN levels are accepted unchanged.
+// Keeps a step of a lane if its error is at most the tolerance, or if it is the shortest allowed. The next length follows
+// from the error, which grows with step^4; that of slopes counts relative to the largest slope by the parameter so far.
+// NaN levels are accepted unchanged.
 static void keep_or_undo(const Job &job, Block &b, real span) {
     const real tolerance = job.tolerance, shortest = job.shortest;
     Lane kept, error;

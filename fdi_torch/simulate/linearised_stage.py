@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from fdi_torch.plant.effect import Memory
-from fdi_torch.simulate.pointwise import Row, partials
 from fdi_torch.simulate.scan import scan_in_time
 
 ROUNDS = 40
 CONVERGED = 1e-11
+Row = Sequence[Tensor | None]
+Pointwise = Callable[[list[Tensor]], Sequence[Tensor]]
 Signals = Sequence[Tensor]
 Step = Callable[[Signals, Memory, Signals], tuple[Signals, Memory]]  # signals, memory, theta -> outputs, new memory
 First = Callable[[Signals, Signals], Memory]  # signals at the first instant, theta -> initial memory
@@ -121,7 +122,7 @@ def solve_memory(
     initial = torch.stack([m.expand(*shape[:-1], 1) for m in first([s[..., :1] for s in signals], theta)], -1)
     path = initial.expand(*shape, memories).clone()
     for _ in range(ROUNDS):
-        after, slopes = _slopes(lambda m: step(signals, m, theta)[1], path)
+        after, slopes = _slopes_by_memory(lambda m: step(signals, m, theta)[1], path)
         scale = path.abs().max() + 1e-12
         defect = torch.cat([path[..., :1, :] - initial, path[..., 1:, :] - after[..., :-1, :]], dim=-2)
         if float(defect.abs().max() / scale) < CONVERGED:
@@ -132,7 +133,7 @@ def solve_memory(
     return [m.contiguous() for m in path.unbind(-1)]
 
 
-def _slopes(after: Callable[[Memory], Memory], path: Tensor) -> tuple[Tensor, Tensor]:
+def _slopes_by_memory(after: Callable[[Memory], Memory], path: Tensor) -> tuple[Tensor, Tensor]:
     """New memory (L, K, n) and its slope by the old memory (L, K, n, n), by finite differences."""
 
     def stacked(memory: Tensor) -> Tensor:
@@ -169,3 +170,21 @@ def _sum(terms: list[Tensor], by_theta: Row, moves: Sequence[int]) -> Tensor | N
     for q, slope in direct:
         total[:, q] += slope
     return total
+
+
+def partials(function: Pointwise, inputs: Sequence[Tensor], shape: Sequence[int]) -> tuple[list[Tensor], list[Row]]:
+    """y_i = function(x)_i and dy_i/dx_j, each of `shape`; None where y_i does not depend on x_j. One backward pass per
+    output."""
+    leaves = [x.detach().expand(shape).requires_grad_() for x in inputs]
+    with torch.enable_grad():
+        outputs = [y.expand(shape) for y in function(leaves)]
+        # The sum's gradient holds all elementwise slopes, since no element depends on another element's inputs.
+        totals = [y.sum() for y in outputs]
+    return [y.detach() for y in outputs], [_slopes(total, leaves) for total in totals]
+
+
+def _slopes(total: Tensor, leaves: Sequence[Tensor]) -> Row:
+    """Gradient of a sum by each leaf."""
+    if not total.requires_grad or not leaves:
+        return [None] * len(leaves)
+    return torch.autograd.grad(total, leaves, retain_graph=True, allow_unused=True)

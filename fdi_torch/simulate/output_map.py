@@ -16,8 +16,7 @@ from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.actuation import NetworkStage, with_parameters
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.linearised_stage import LinearisedStage, Signals, linearise_stage, solve_memory
-from fdi_torch.simulate.pointwise import Row, partials
+from fdi_torch.simulate.linearised_stage import LinearisedStage, Row, Signals, linearise_stage, partials, solve_memory
 
 
 @dataclass(frozen=True)

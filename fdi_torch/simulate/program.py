@@ -8,7 +8,6 @@ with its inputs and with theta. Rates are differentiated stage by stage, so that
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 from torch import Tensor
@@ -17,14 +16,11 @@ from fdi_torch.parameters import by_prefix
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.signals import Clock
 from fdi_torch.simulate.elimination import Elimination, eliminate
-from fdi_torch.simulate.expression import Graph, Varies
+from fdi_torch.simulate.expression import Graph, Output, Place, Row, Section, Varies
 from fdi_torch.simulate.runge_kutta import Stages, substituted
-from fdi_torch.simulate.section import Output, Place, Row, Section
-from fdi_torch.simulate.structure import Structure, structure_of
-from fdi_torch.simulate.tracer import Tracer
+from fdi_torch.simulate.tracer import Structure, Tracer, structure_of
 
 
-@dataclass(frozen=True, eq=False)
 class Program:
     """The sections of a simulation, each a tuple of outputs.
 
@@ -34,37 +30,35 @@ class Program:
     levels and then its rates ('slope'), four of each in turn. advance: level. end: slope at the end of the step. read:
     reading, next_reading_memory.
 
-    adaptive: each lane divides the steps of the grid, see `implicit.py`. unrolled: there are stages, advance and end,
+    adaptive: each lane divides the steps of the grid (`step_control.py`). unrolled: there are stages, advance and end,
     which share common subexpressions. If not, there is `law`, evaluated at every stage: the rates ('slope') with their
     direct changes by theta and the actions, and their slopes by the levels ('by_level'), one output per (row, column)
     of `pattern`. late_actuators, late_sensors: indices of those with dead time, in the order of the delays.
     """
 
-    graph: Graph
-    tangent: bool
-    adaptive: bool
-    unrolled: bool
-    columns: int
-    order: int
-    tanks: int
-    actuators: int
-    sensors: int
-    channels: tuple[int, ...]
-    sensor_tanks: tuple[int, ...]
-    command_memory: int
-    reading_memory: int
-    late_actuators: tuple[int, ...]
-    late_sensors: tuple[int, ...]
-    prepare: Section
-    settle_commands: Section
-    act: Section
-    stages: tuple[Section, ...]
-    advance: Section
-    end: Section
-    law: Section
-    pattern: tuple[tuple[int, int], ...]
-    settle_readings: Section
-    read: Section
+    def __init__(
+        self, network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptive: bool, unrolled: bool
+    ) -> None:
+        self.network, self.tangent, self.adaptive, self.unrolled = network, tangent, adaptive, unrolled
+        self.columns, self.order, self.tanks = len(names), network.order, len(network.description.tanks)
+        self.actuators, self.sensors = len(network.actuators()), len(network.description.sensors)
+        self.channels = tuple(channel for _, channel in network.actuators())
+        self.sensor_tanks = tuple(network.sensor_tanks())
+        self.command_memory, self.reading_memory = network.command_memory, network.reading_memory
+        self.graph = Graph()
+        self.tracer = Tracer(self.graph)
+        self.theta = [self.graph.input("theta", i, Varies.LANE) for i in range(len(names))]
+        self.values = self._values(names)
+        tensor = self.tracer.tensor
+        resolution = self.graph.input("resolution", 0, Varies.NEVER)
+        self.span = [self.graph.input("clock", i, Varies.STEP) for i in (0, 1)]
+        self.clock = Clock(tensor(self.span[0]), tensor(self.span[1]), tensor(resolution))
+        self.prepare, self.late_actuators, self.late_sensors = self._prepare()
+        self.settle_commands, self.act = self._commands(self.late_actuators)
+        self.stages, self.advance, self.end = self._rates(self.act) if unrolled else ((), (), ())
+        self.law, self.pattern = ((), ()) if unrolled else self._law(self.act)
+        self.settle_readings, self.read = self._readings()
+        del self.tracer, self.values, self.clock  # programs are cached, and the traced tensors would fill the memory
 
     @cached_property
     def step(self) -> Section:
@@ -76,37 +70,6 @@ class Program:
         """The elimination for the levels of an implicit step."""
         return eliminate(self.order, self.pattern)
 
-
-@lru_cache(maxsize=64)
-def build_program(
-    network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptive: bool = False, unrolled: bool = True
-) -> Program:
-    """The program of a plant whose parameters `names` are the columns of theta; tangent: with the Jacobian.
-
-    Adaptive steps are never unrolled. Equal plants share one program.
-    """
-    return _shared(structure_of(network, names), names, tangent, adaptive, unrolled and not adaptive)
-
-
-@lru_cache(maxsize=64)
-def _shared(structure: Structure, names: tuple[str, ...], tangent: bool, adaptive: bool, unrolled: bool) -> Program:
-    return _Builder(structure.network, names, tangent, adaptive, unrolled).program()
-
-
-class _Builder:
-    def __init__(
-        self, network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptive: bool, unrolled: bool
-    ) -> None:
-        self.network, self.tangent, self.adaptive, self.unrolled = network, tangent, adaptive, unrolled
-        self.graph = Graph()
-        self.tracer = Tracer(self.graph)
-        self.theta = [self.graph.input("theta", i, Varies.LANE) for i in range(len(names))]
-        self.values = self._values(names)
-        tensor = self.tracer.tensor
-        resolution = self.graph.input("resolution", 0, Varies.NEVER)
-        self.span = [self.graph.input("clock", i, Varies.STEP) for i in (0, 1)]
-        self.clock = Clock(tensor(self.span[0]), tensor(self.span[1]), tensor(resolution))
-
     def _values(self, names: tuple[str, ...]) -> dict[str, dict[str, Tensor]]:
         """As `TankNetwork.bind`, with inputs of the program in place of numbers."""
         values: dict[str, Tensor] = {}
@@ -116,41 +79,6 @@ class _Builder:
         for name in names:
             self.network.constants.index(name)
         return by_prefix(values)
-
-    def program(self) -> Program:
-        network = self.network
-        prepare, late_actuators, late_sensors = self._prepare()
-        settle_commands, act = self._commands(late_actuators)
-        stages, advance, end = self._rates(act) if self.unrolled else ((), (), ())
-        law, pattern = ((), ()) if self.unrolled else self._law(act)
-        settle_readings, read = self._readings()
-        return Program(
-            graph=self.graph,
-            tangent=self.tangent,
-            adaptive=self.adaptive,
-            unrolled=self.unrolled,
-            columns=len(self.theta),
-            order=network.order,
-            tanks=len(network.description.tanks),
-            actuators=len(network.actuators()),
-            sensors=len(network.description.sensors),
-            channels=tuple(channel for _, channel in network.actuators()),
-            sensor_tanks=tuple(network.sensor_tanks()),
-            command_memory=network.command_memory,
-            reading_memory=network.reading_memory,
-            late_actuators=late_actuators,
-            late_sensors=late_sensors,
-            prepare=prepare,
-            settle_commands=settle_commands,
-            act=act,
-            stages=stages,
-            advance=advance,
-            end=end,
-            law=law,
-            pattern=pattern,
-            settle_readings=settle_readings,
-            read=read,
-        )
 
     def _inputs(self, kind: str, count: int) -> list[int]:
         return [self.graph.input(kind, i, Varies.BOTH) for i in range(count)]
@@ -276,3 +204,19 @@ class _Builder:
             )
             for slopes in self.graph.partials(nodes, [*moving, *self.theta])
         ]
+
+
+@lru_cache(maxsize=64)
+def build_program(
+    network: TankNetwork, names: tuple[str, ...], tangent: bool, adaptive: bool = False, unrolled: bool = True
+) -> Program:
+    """The program of a plant whose parameters `names` are the columns of theta; tangent: with the Jacobian.
+
+    Adaptive steps are never unrolled. Equal plants share one program.
+    """
+    return _shared(structure_of(network, names), names, tangent, adaptive, unrolled and not adaptive)
+
+
+@lru_cache(maxsize=64)
+def _shared(structure: Structure, names: tuple[str, ...], tangent: bool, adaptive: bool, unrolled: bool) -> Program:
+    return Program(structure.network, names, tangent, adaptive, unrolled)

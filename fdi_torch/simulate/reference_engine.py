@@ -15,17 +15,9 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.effect import Memory
 from fdi_torch.plant.network import PlaceValues, TankNetwork
 from fdi_torch.plant.signals import Clock
-from fdi_torch.simulate.engine import Engine, expect_columns
+from fdi_torch.simulate.engine import Engine, expect_columns, expect_no_gradient
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.forward_mode import (
-    ZeroSlopes,
-    constants_with_slopes,
-    directions,
-    stack_with_slope,
-    value_and_slope,
-    with_slope,
-)
-from fdi_torch.simulate.gradient import expect_no_gradient
+from fdi_torch.simulate.forward_mode import ZeroSlopes, constants_with_slopes, directions, with_slope
 
 
 class ReferenceEngine(Engine):
@@ -51,13 +43,10 @@ class ReferenceEngine(Engine):
         why: str = "",
         every_node: bool = True,
     ) -> None:
-        if experiment.step_control is not None:
-            raise ValueError("expected the same steps for all lanes in the reference engine, got adaptive steps")
-        self.network, self.space, self.experiment, self.why = network, space, experiment, why
+        super().__init__(network, space, experiment, why)
         self.method, self.rtol, self.atol, self.every_node = method, rtol, atol, every_node
 
     def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
-        """theta (*batch, P) -> readings (*batch, S, sensors) in SI."""
         expect_columns(self, theta)
         batch = theta.shape[:-1]
         lanes = theta.reshape(batch.numel(), theta.shape[-1])
@@ -68,7 +57,6 @@ class ReferenceEngine(Engine):
         return result.movedim(1, 0).reshape(*batch, *result.shape[::2])
 
     def levels(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S tanks"]:
-        """theta (*batch, P) -> tank levels at the samples (*batch, S, tanks), m."""
         expect_columns(self, theta)
         lanes = theta.reshape(theta.shape[:-1].numel(), theta.shape[-1])
         states = self._sample(*self._integrate(self.network.bind(self.space, lanes), len(lanes)))
@@ -78,10 +66,7 @@ class ReferenceEngine(Engine):
     def linearise(
         self, theta: Float[Tensor, "*batch P"]
     ) -> tuple[Float[Tensor, "*batch S C"], Float[Tensor, "*batch S C P"]]:
-        """theta (*batch, P) -> readings (*batch, S, sensors), their Jacobian (*batch, S, sensors, P), forward mode.
-
-        Levels and their slopes are integrated together; torch differentiates each operation of the right-hand side.
-        """
+        """Levels and slopes are integrated together; torch differentiates each operation of the right-hand side."""
         expect_no_gradient(self, theta, "linearise")
         lanes = theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
         parts = [self._run_with_slopes(p) for p in ([lanes] if self.method == "rk4" else lanes.split(1))]
@@ -97,14 +82,13 @@ class ReferenceEngine(Engine):
         with forward_ad.dual_level():
             engine = copy(self)
             engine.experiment, engine.arithmetic = self.experiment.mapped(with_slope), ZeroSlopes()
-            readings, slopes = value_and_slope(engine._run(directions(lanes)))
-        assert slopes is not None
+            readings, slopes = forward_ad.unpack_dual(engine._run(directions(lanes)))
         return readings[:, : len(lanes)], slopes.unflatten(1, (lanes.shape[-1], len(lanes))).movedim(1, -1)
 
     def _run(self, lanes: Tensor) -> Tensor:
         """lanes (L, P) -> readings (S, L, sensors), with slopes if the lanes have them."""
         values = self.network.bind(self.space, lanes)
-        if value_and_slope(lanes)[1] is not None:
+        if forward_ad.unpack_dual(lanes)[1] is not None:
             values = constants_with_slopes(values)
         levels, commands, values = self._integrate(values, len(lanes))
         with self.arithmetic:
@@ -122,7 +106,7 @@ class ReferenceEngine(Engine):
             commands = self._commands(values, lanes)
             levels, first = self.network.start_levels(values), self._clock(e.nodes[0], e.steps[0])
             state = self.network.with_steady_states(levels, commands[0].unbind(-1), first, values)
-            start, slopes = value_and_slope(torch.stack([x.expand(lanes) for x in state], dim=-1))
+            start, slopes = forward_ad.unpack_dual(torch.stack([x.expand(lanes) for x in state], dim=-1))
         instants = e.nodes.detach()
         edges, held = instants.tolist(), commands.unbind()
         clocks = [self._clock(begin, step) for begin, step in zip(e.nodes[:-1].unbind(), e.steps.unbind(), strict=True)]
@@ -132,7 +116,8 @@ class ReferenceEngine(Engine):
             if slopes is None:
                 return self.network(state, held[k], clocks[k], values)
             with self.arithmetic:
-                return stack_with_slope(self.network(with_slope(*state.unbind()), held[k], clocks[k], values))
+                rate = self.network(with_slope(*state.unbind()), held[k], clocks[k], values)
+                return torch.stack([*forward_ad.unpack_dual(rate)])
 
         # `perturb` evaluates slopes just inside each step, so that a switch at its end does not act early.
         restarts = instants[1:-1]

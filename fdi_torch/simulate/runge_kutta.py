@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from fdi_torch.simulate.expression import Graph
-from fdi_torch.simulate.section import Output, Row, Section
+from fdi_torch.simulate.expression import Graph, Output, Row, Section
 
 Slopes = tuple[tuple[int, int], ...]
 

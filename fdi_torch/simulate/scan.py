@@ -1,4 +1,9 @@
-"""A linear recurrence in time: a compiled loop, or a few dozen vector operations on blocks of blocks for all K steps.
+"""Linear recurrences in time: a compiled loop, or some vector operations on all K steps.
+
+One of them is Newton's correction x of a whole trajectory under the implicit midpoint rule, with its sensitivities s to
+the parameters. With M = 1 - dt/2 df/dh at each step, both obey
+
+    M x_{k+1} = (2 - M) x_k + forcing_k,   forcing: dt f - (h_{k+1} - h_k) for x, dt df/dtheta for s.
 
 The loops are compiled at the first use for each number of tanks, up to `MOST`, because they keep matrices of a block of
 steps on the stack. Without a compiler, and for tensors that they cannot take (gradients, float32, GPU), torch does the
@@ -18,7 +23,6 @@ from torch import Tensor
 
 from fdi_torch.simulate.build import BuildError, load_library
 
-LENGTH = 8  # sequential steps in each block, and in blocks of blocks
 MOST = 32
 _SOURCE = Path(__file__).with_name("recurrence.hpp")
 
@@ -31,59 +35,22 @@ def scan_in_time(
 ) -> Float[Tensor, "L n m K+1"]:
     """x_{k+1} = A_k x_k + b_k for k = 0..K-1: a (L, n, n, K), b (L, n, m, K), first (L, n, m) -> x (L, n, m, K+1).
 
-    gain: G (L, n, n, K), if the forcing is G_k b_k. Without a compiled loop, all blocks run in parallel from zero
-    together with the products of their A; the starts of the blocks obey such a recurrence again, and then every x
-    follows.
+    gain: G (L, n, n, K), if the forcing is G_k b_k. Without a compiled loop, each state follows from that 1, 2, 4 ...
+    steps before it, with the products of the A between them (Hillis and Steele, 1986).
     """
-    m, count = b.shape[2], b.shape[-1]
+    count = b.shape[-1]
     a, x = a.expand(b.shape[0], *a.shape[1:]), b.new_empty(*b.shape[:-1], count + 1)
     if run_loop("scan_in_time", b.shape, [a, gain, b, first], [x]):
         return x
     if gain is not None:
         b = product(gain, b)
-    if count <= LENGTH:
-        return torch.stack(_one_by_one(a, b, first), dim=-1)
-    blocks = -(-count // LENGTH)
-    inner = _side_by_side(_in_blocks(a, blocks, one=True), _in_blocks(b, blocks, one=False))
-    ends = inner[-1][..., :-1]
-    start = scan_in_time(ends[:, :, m:], ends[:, :, :m], first)
-    x = b.new_empty(*b.shape[:-1], blocks * LENGTH + 1)
-    x[..., 0] = first
-    steps = x[..., 1:].unflatten(-1, (blocks, LENGTH))
-    for k, y in enumerate(inner):
-        steps[..., k] = product(y[:, :, m:], start).add_(y[:, :, :m])
-    return x[..., : count + 1]
-
-
-def _in_blocks(x: Tensor, blocks: int, one: bool) -> Tensor:
-    """(L, n, m, K) -> (LENGTH, L, n, m, blocks), the last block padded with identity matrices (`one`) or zeros."""
-    lanes, n, m, count = x.shape
-    whole, remainder = divmod(count, LENGTH)
-    blocked = x.new_empty(LENGTH, lanes, n, m, blocks)
-    blocked[..., :whole] = x[..., : whole * LENGTH].unflatten(-1, (whole, LENGTH)).permute(4, 0, 1, 2, 3)
-    if remainder:
-        blocked[:remainder, ..., whole] = x[..., whole * LENGTH :].permute(3, 0, 1, 2)
-        blocked[remainder:, ..., whole] = torch.eye(n, m, dtype=x.dtype, device=x.device) if one else 0.0
-    return blocked
-
-
-def _side_by_side(a: Tensor, b: Tensor) -> list[Tensor]:
-    """[x from zero | product of A] after each step within each block, (L, n, m + n, blocks)."""
-    m = b.shape[3]
-    state = torch.cat([b[0], a[0]], dim=2)
-    states = [state]
-    for k in range(1, len(a)):
-        state = product(a[k], state)
-        state[:, :, :m] += b[k]
-        states.append(state)
-    return states
-
-
-def _one_by_one(a: Tensor, b: Tensor, first: Tensor) -> list[Tensor]:
-    states = [first]
-    for k in range(b.shape[-1]):
-        states.append(product(a[..., k : k + 1], states[-1].unsqueeze(-1))[..., 0] + b[..., k])
-    return states
+    x = torch.cat([product(a[..., :1], first.unsqueeze(-1)) + b[..., :1], b[..., 1:]], dim=-1)
+    reach = 1
+    while reach < count:
+        later, between = x[..., reach:] + product(a[..., reach:], x[..., :-reach]), a[..., reach:]
+        a = torch.cat([a[..., :reach], product(between, a[..., :-reach])], dim=-1)
+        x, reach = torch.cat([x[..., :reach], later], dim=-1), 2 * reach
+    return torch.cat([first.unsqueeze(-1), x], dim=-1)
 
 
 def product(a: Float[Tensor, "L n n K"], x: Float[Tensor, "L n m K"]) -> Float[Tensor, "L n m K"]:
@@ -118,3 +85,58 @@ def _library(tanks: int) -> ctypes.CDLL | None:
         return load_library(source, "scan_in_time", "midpoint_step")
     except BuildError:
         return None
+
+
+def newton_step(
+    span: Float[Tensor, " K"],
+    path: Float[Tensor, "L n K+1"],
+    rates: Float[Tensor, "L n K"],
+    by_level: Float[Tensor, "L n n K"],
+    by_theta: Float[Tensor, "L n P K"],
+    start: Float[Tensor, "L n"],
+    start_slopes: Float[Tensor, "L n P"],
+) -> tuple[Tensor, ...]:
+    """One Newton step of all lanes and steps at once.
+
+    span: lengths of the steps, s. path: levels. rates: at mid-step, with their slopes by_level and by_theta. start and
+    start_slopes: initial levels and their slopes.
+
+    Returns the corrected levels (L, n, K+1), their sensitivities (L, n, P, K+1), transition and gain of a disturbance
+    (L, n, n, K), and the largest correction (L,).
+    """
+    inputs = [span, path, rates, by_level, by_theta, start, start_slopes]
+    slopes, defect = path.new_empty(*by_theta.shape[:-1], path.shape[-1]), path.new_empty(len(path))
+    outputs = [torch.empty_like(path), slopes, torch.empty_like(by_level), torch.empty_like(by_level), defect]
+    if run_loop("midpoint_step", by_theta.shape, inputs, outputs):
+        return tuple(outputs)
+    transition, gain, forcing = _recurrence(span, path, rates, by_level)
+    forcing = torch.cat([forcing, product(gain, by_theta)], dim=2)
+    first = torch.cat([(start - path[..., 0]).unsqueeze(-1), start_slopes], dim=-1)
+    solution = scan_in_time(transition, forcing, first)
+    return path + solution[:, :, 0], solution[:, :, 1:], transition, gain, solution[:, :, 0].abs().amax(dim=(-1, -2))
+
+
+def newton_correction(
+    span: Float[Tensor, " K"],
+    path: Float[Tensor, "L n K+1"],
+    rates: Float[Tensor, "L n K"],
+    by_level: Float[Tensor, "L n n K"],
+    start: Float[Tensor, "L n"],
+) -> tuple[Float[Tensor, "L n K+1"], Float[Tensor, " L"]]:
+    """The corrected levels and the largest correction of `newton_step`, without sensitivities."""
+    lanes, n, steps = rates.shape
+    levels, defect = torch.empty_like(path), path.new_empty(lanes)
+    inputs = [span, path, rates, by_level, None, start, None]
+    if run_loop("midpoint_step", torch.Size((lanes, n, 0, steps)), inputs, [levels, None, None, None, defect]):
+        return levels, defect
+    transition, _, forcing = _recurrence(span, path, rates, by_level)
+    correction = scan_in_time(transition, forcing, (start - path[..., 0]).unsqueeze(-1))[:, :, 0]
+    return path + correction, correction.abs().amax(dim=(-1, -2))
+
+
+def _recurrence(span: Tensor, path: Tensor, rates: Tensor, by_level: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Transition and gain (L, n, n, K) of the correction, and its forcing (L, n, 1, K)."""
+    one = torch.eye(path.shape[1], dtype=path.dtype, device=path.device).unsqueeze(-1)
+    inverse = torch.linalg.inv((one - 0.5 * span * by_level).movedim(-1, 1)).movedim(1, -1)
+    misfit = (span * rates - (path[..., 1:] - path[..., :-1])).unsqueeze(2)
+    return 2.0 * inverse - one, inverse * span, product(inverse, misfit)

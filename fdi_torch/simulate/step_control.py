@@ -1,6 +1,12 @@
-"""Step size control for lanes that divide the grid's steps individually, as accurately as a tolerance requires.
+"""Adaptive steps, in which each lane divides the grid's steps as a tolerance requires: their accuracy and coefficients.
 
-kernel.hpp has the same rules for single lanes; here they are tensors (L,). No lane depends on another one.
+kernel.hpp takes the steps, by the L-stable Runge-Kutta method of order 4 with an embedded error estimate
+ARK4(3)6L[2]SA-ESDIRK of Kennedy and Carpenter (2003), "Additive Runge-Kutta schemes for convection-diffusion-reaction
+equations", Appl. Numer. Math. 44: 139-181. Nearly equal levels equalise within milliseconds. That limits the steps of
+an explicit method; the steps of an L-stable one are limited only by the actual rates of change.
+
+Each stage is Y = r + g f(Y) with r = h + dt sum a_sj k_j and g = dt / 4, solved by Newton's method with the exact J =
+df/dh. Its sensitivity to theta obeys (1 - g J) dY = dr + g df/dtheta, the exact derivative of the step.
 """
 
 from __future__ import annotations
@@ -8,8 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import fastest_exchange, length_scale
@@ -23,6 +27,30 @@ CROSSING = 0.25
 # Number of steps whose errors accumulate before the tanks' dynamics damp them.
 ADDED_UP = 100.0
 LONGER, SHORTER = 3.0, 0.1  # maximum and minimum ratio of successive steps
+
+DIAGONAL = 0.25
+STAGES: tuple[tuple[float, ...], ...] = (
+    (0.25,),
+    (8611 / 62500, -1743 / 31250),
+    (5012029 / 34652500, -654441 / 2922500, 174375 / 388108),
+    (15267082809 / 155376265600, -71443401 / 120774400, 730878875 / 902184768, 2285395 / 8070912),
+    (82889 / 524892, 0.0, 15625 / 83664, 69875 / 102672, -2260 / 8211),
+)
+"""a_sj of the five implicit stages; the last one is the step itself."""
+EMBEDDED = (
+    4586570599 / 29645900160,
+    0.0,
+    178811875 / 945068544,
+    814220225 / 1159782912,
+    -3700637 / 11593932,
+    61727 / 225920,
+)
+"""Weights of the embedded step of order 3, for the error estimate."""
+ERROR = tuple(a - b for a, b in zip((*STAGES[-1], DIAGONAL), EMBEDDED, strict=True))
+
+# Newton's method ends when the next correction, extrapolated from the last two, would be below this fraction of the
+# step's tolerance, or when the last one was rounding error (in units of the level's last place).
+NEWTON_SHARE, NEWTON_ROUNDING, NEWTON_ROUNDS = 1e-4, 8.0, 8
 
 
 @dataclass(frozen=True)
@@ -68,42 +96,3 @@ class StepControl:
 def _step_of_unit_error(plant: PlantDescription) -> float:
     """The step whose error is the plant's length scale, s."""
     return STEP_FOR_ONE_METRE * fastest_exchange(plant)
-
-
-def next_step(elapsed: Float[Tensor, " L"], length: Float[Tensor, " L"], span: Tensor) -> Float[Tensor, " L"]:
-    """Length of each lane's next step (L,), s, after `elapsed` s of `span`.
-
-    The step is the lane's `length`, shortened so that no short step remains before the end; `span` for a finished lane.
-    """
-    remaining = span - elapsed
-    step = torch.where(remaining <= length, remaining, torch.where(remaining < 2.0 * length, remaining / 2.0, length))
-    return torch.where(remaining > 0.0, step, span)
-
-
-def accept_steps(
-    step: Float[Tensor, " L"],
-    error: Float[Tensor, " L"],
-    elapsed: Float[Tensor, " L"],
-    length: Float[Tensor, " L"],
-    span: Tensor,
-    shortest: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Accept or reject a step of each lane (L,): the accepted lanes, the times they have reached, and their next
-    lengths, s.
-
-    step: length of the step taken; elapsed: time reached before it; length: the lane's planned length (a step may be
-    shorter at the end of the span). error: relative to the tolerance; infinite for a step without a solution. A step is
-    accepted if its error is at most 1, or if it is the shortest allowed. The next length follows from the error, which
-    grows with step^4. Levels that are NaN are accepted unchanged.
-    """
-    cut = torch.sqrt(torch.sqrt(torch.nan_to_num(error, nan=0.0))) / 0.9
-    proposed = step / torch.clamp(cut, 1.0 / LONGER, 1.0 / SHORTER)
-    is_open, accurate = elapsed < span, ~(error > 1.0)
-    next_length = torch.where(accurate & (step < length) & (proposed < length), length, proposed)
-    accepted = is_open & (accurate | (step <= shortest))
-    reached = torch.where(span - elapsed <= step, span, elapsed + step)
-    return (
-        accepted,
-        torch.where(accepted, reached, elapsed),
-        torch.where(is_open, torch.clamp(next_length, min=shortest), length),
-    )

@@ -5,52 +5,25 @@ Slower than the compiled engine, faster than differentiation through torchdiffeq
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.network import TankNetwork
-from fdi_torch.simulate.engine import Engine, Readings, expect_columns
+from fdi_torch.simulate.engine import Engine, Readings, expect_no_gradient
 from fdi_torch.simulate.experiment import Experiment
-from fdi_torch.simulate.gradient import expect_no_gradient, is_differentiated, readings_with_gradient
-from fdi_torch.simulate.implicit import ImplicitStep
 from fdi_torch.simulate.injection import Injection, expect_injectable
 from fdi_torch.simulate.interpreter import Change, Interpreter
 from fdi_torch.simulate.program import Program, build_program
 from fdi_torch.simulate.reference_engine import hermite
-from fdi_torch.simulate.step_control import accept_steps, next_step
 
 
 class TracedEngine(Engine):
-    """Readings and their Jacobians (forward mode) of many parameter vectors at once, by fixed-step RK4 or adaptive
-    steps.
-    """
+    """Readings and their Jacobians (forward mode) of many parameter vectors at once, by fixed-step RK4."""
 
     name = "traced"
-
-    def __init__(self, network: TankNetwork, space: ParameterSpace, experiment: Experiment, why: str = "") -> None:
-        self.network, self.space, self.experiment, self.why = network, space, experiment, why
-
-    def levels(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S tanks"]:
-        expect_no_gradient(self, theta, "levels")
-        return self._simulate(theta, tangent=False, levels=True)[0]
-
-    def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
-        expect_columns(self, theta)
-        if is_differentiated(theta):
-            return readings_with_gradient(self, theta)
-        return self._simulate(theta, tangent=False)[0]
-
-    def linearise(
-        self, theta: Float[Tensor, "*batch P"]
-    ) -> tuple[Float[Tensor, "*batch S C"], Float[Tensor, "*batch S C P"]]:
-        expect_no_gradient(self, theta, "linearise")
-        readings, jacobian = self._simulate(theta, tangent=True)
-        assert jacobian is not None
-        return readings, jacobian
 
     def moments(self, theta: Float[Tensor, "*problems N P"], data: Readings) -> Float[Tensor, "*problems N C 3"]:
         expect_no_gradient(self, theta, "moments")
@@ -60,22 +33,25 @@ class TracedEngine(Engine):
         self, theta: Float[Tensor, "*batch P"], data: Readings, injection: Injection
     ) -> Float[Tensor, "*batch S columns"]:
         expect_no_gradient(self, theta, "observe")
-        program = build_program(self.network, self.space.names, False, self.experiment.step_control is not None)
-        expect_injectable(self.experiment, injection, program.command_memory + program.reading_memory)
         lanes = theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
-        run = _Run(program, self.network, self.experiment, lanes, injection)
+        run = self._run(lanes, False, injection)
+        expect_injectable(self.experiment, injection, run.program.command_memory + run.program.reading_memory)
         values, weight = (t.expand(len(lanes), *t.shape[-2:]) for t in (data.known, data.weight))
         rows = [run.correct(s, values[:, s], weight[:, s]) for s in run.samples()]
         return torch.stack(rows, dim=1).reshape(*theta.shape[:-1], len(rows), -1)
 
-    def _simulate(self, theta: Tensor, tangent: bool, levels: bool = False) -> tuple[Tensor, Tensor | None]:
-        program = build_program(self.network, self.space.names, tangent, self.experiment.step_control is not None)
-        run = _Run(
-            program, self.network, self.experiment, theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1])
-        )
-        rows = [run.levels() if levels else run.read(s) for s in run.samples()]
+    def _run(self, lanes: Tensor, tangent: bool, injection: Injection | None = None) -> _Run:
+        program = build_program(self.network, self.space.names, tangent)
+        return _Run(program, self.network, self.experiment, lanes, injection)
+
+    def _simulate(self, mode: str, theta: Tensor) -> tuple[Tensor, Tensor | None]:
+        tangent = mode == "linearise"
+        run = self._run(theta.detach().reshape(theta.shape[:-1].numel(), theta.shape[-1]), tangent)
+        if mode == "levels":
+            rows = [run.levels()[: run.program.tanks] for _ in run.samples()]
+        else:
+            rows = [run.read(s) for s in run.samples()]
         lanes = len(run.lanes)
-        rows = [row[: program.tanks] for row in rows] if levels else rows
         values = torch.stack([torch.stack([v.expand(lanes) for v, _ in row], dim=-1) for row in rows], dim=1)
         values = values.reshape(*theta.shape[:-1], *values.shape[1:])
         if not tangent:
@@ -96,13 +72,9 @@ class _Run:
         injection: Injection | None = None,
     ) -> None:
         self.program, self.experiment, self.lanes, self.injection = program, experiment, lanes, injection
-        self.resolution = experiment.resolution.to(lanes)
-        interpreter = Interpreter(program, lanes, network.nominal, self.resolution)
+        interpreter = Interpreter(program, lanes, network.nominal, experiment.resolution.to(lanes))
         self.state, self.compute, self.full = interpreter.state, interpreter.run, interpreter.full
         self.history: list[list[tuple[Tensor, Change]]] = []
-        self.implicit = ImplicitStep(program, self.state, self.compute, self.full)
-        self.step_length = lanes.new_full((len(lanes),), torch.inf)
-        self.size = lanes.new_zeros(lanes.shape[::-1])
 
     def samples(self) -> Iterator[int]:
         """Run the simulation; yields the index of each sample while the state holds its levels as 'sample'."""
@@ -123,7 +95,7 @@ class _Run:
                 yield s
             self._set_clock(e.nodes[k], e.steps[k])  # reading a sample has changed the clock
             before = self._levels()
-            self._step(k)
+            self._step()
             if any(0.0 < shares[s] < 1.0 for s in due):
                 self.compute(p.end)
             for s in [s for s in due if shares[s] > 0.0]:
@@ -172,46 +144,9 @@ class _Run:
         if self.injection is not None and self.injection.memory is not None:
             self._set_state(kind, self.injection.memory[..., first : first + count])
 
-    def _step(self, k: int) -> None:
-        """One step of the grid: at once, or for each lane in as many adaptive steps as it needs."""
-        e, p, values = self.experiment, self.program, self.state.values
-        if e.step_control is None:
-            return self.compute(p.step)
-        self.compute(p.act)
-        start, span = values["clock", 0], values["clock", 1]
-        elapsed = torch.zeros_like(self.step_length)
-        while bool((elapsed < span).any()):
-            step = next_step(elapsed, self.step_length, span)
-            values["part", 0], values["part", 1] = start + elapsed, step
-            before = self._levels()
-            error, slope_errors = self.implicit.take(step, e.step_control.tolerance)
-            size = self._largest_slopes(slope_errors)
-            accepted, elapsed, self.step_length = accept_steps(
-                step, self._worst(error, slope_errors, size), elapsed, self.step_length, span, e.step_control.shortest
-            )
-            self.size = torch.where(accepted, size, self.size)
-            rows = zip(self._levels(), before, strict=True)
-            self.state.put("level", [self._select(accepted, now, then) for now, then in rows])
-
-    def _largest_slopes(self, slope_errors: Sequence[Tensor]) -> Tensor:
-        """Largest slope of any level by each parameter so far, (P, L)."""
-        if not slope_errors:
-            return self.size
-        return torch.maximum(self.size, torch.stack([self.full(d).abs() for _, d in self._levels()]).amax(dim=0))
-
-    def _worst(self, error: Tensor, slope_errors: Sequence[Tensor], size: Tensor) -> Tensor:
-        """The larger of a step's relative errors of levels and slopes, (L,)."""
-        if not slope_errors or not len(size):
-            return error
-        assert self.experiment.step_control is not None
-        largest = torch.stack(list(slope_errors)).amax(dim=0)
-        share = torch.where(largest > 0.0, largest / (self.experiment.step_control.slope_tolerance * size), 0.0)
-        return torch.fmax(error, torch.nan_to_num(share, nan=0.0).amax(dim=0))
-
-    def _select(self, yes: Tensor, x: tuple[Tensor, Change], y: tuple[Tensor, Change]) -> tuple[Tensor, Change]:
-        level = torch.where(yes, x[0], y[0])
-        both = x[1] is None and y[1] is None
-        return level, None if both else torch.where(yes, self.full(x[1]), self.full(y[1]))
+    def _step(self) -> None:
+        """One step of the grid."""
+        self.compute(self.program.step)
 
     def _levels(self) -> list[tuple[Tensor, Change]]:
         return self.state.group("level", self.program.order)

@@ -12,11 +12,9 @@ from torch import Tensor
 from fdi_torch.parameters import by_prefix
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.signals import Clock
-from fdi_torch.simulate.array_program import ArrayProgram, NewtonControl
-from fdi_torch.simulate.expression import Graph, Varies
-from fdi_torch.simulate.section import Place
-from fdi_torch.simulate.structure import Structure, structure_of_rates
-from fdi_torch.simulate.tracer import Tracer
+from fdi_torch.simulate.array_program import ArrayProgram
+from fdi_torch.simulate.expression import Graph, Place, Varies
+from fdi_torch.simulate.tracer import Structure, Tracer, structure_of_rates
 
 Entry = tuple[int, int]
 
@@ -90,14 +88,18 @@ class TracedRates:
         theta: Float[Tensor, "L P"],
         nominal: Float[Tensor, " constants"],
         clock: Clock,
-        control: NewtonControl,
+        guessed: bool,
+        tolerance: float,
+        rounds: int,
     ) -> bool:
         """Solve trajectories from their first states by the implicit midpoint rule, in place; False without a
-        compiler."""
+        compiler. guessed, tolerance, rounds: see `ArrayProgram.solve_trajectories`."""
         slopes, middle = self._slopes(frozenset(), frozenset()), path.new_empty(path.shape[1], len(clock.step))
         inputs = self._inputs(middle.expand(len(path), -1, -1), commands, theta, nominal, clock)
         spans = clock.step.contiguous()
-        return slopes.program.solve_trajectories(inputs, middle, slopes.by_state, spans, path, control)
+        return slopes.program.solve_trajectories(
+            inputs, middle, slopes.by_state, spans, path, guessed, tolerance, rounds
+        )
 
     def _inputs(
         self, state: Tensor, commands: Sequence[Tensor], theta: Tensor, nominal: Tensor, clock: Clock

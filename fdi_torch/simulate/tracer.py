@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from fdi_torch.plant.network import TankNetwork
 from fdi_torch.simulate.expression import Graph, Varies
 
 _LANES = 2  # any number above 1, which distinguishes lanes from single numbers
@@ -157,3 +158,30 @@ _SPECIAL: dict[str, Callable[[Tracer, Sequence[Any], dict[str, Any]], int]] = {
     "ones_like": lambda t, a, k: t.graph.literal(1.0),
     "full_like": lambda t, a, k: t.node(a[1]),
 }
+
+
+class Structure:
+    """A network as the key of a cache: two are equal if all that their equations depend on is equal."""
+
+    def __init__(self, key: tuple[object, ...], network: TankNetwork) -> None:
+        self.key, self.network, self._hash = key, network, hash(key)
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Structure) and self.key == other.key
+
+
+def structure_of_rates(network: TankNetwork, names: Sequence[str]) -> Structure:
+    """For dh/dt as a function of the state, the actuators' outputs and the parameters `names`."""
+    plant = network.description
+    parts = type(network), network.may_overflow, plant.gravity, plant.tanks, *plant.flow_components()
+    effects = tuple((p.location, p.effect) for p in network.placements)
+    return Structure((parts, effects, network.constants.names, tuple(names)), network)
+
+
+def structure_of(network: TankNetwork, names: Sequence[str]) -> Structure:
+    """For all equations from the input channels to the readings."""
+    of_rates = structure_of_rates(network, names)
+    return Structure((*of_rates.key, network.description.sensors), network)

@@ -18,67 +18,32 @@ typedef Bits BitsVec __attribute__((vector_size(REGISTER_BYTES)));
 #define AT(lane) (*reinterpret_cast<Kept *>((lane) + l))
 
 // Mask: a truth value for each element. ANY: whether one is true.
-#if defined(__AVX512F__) && defined(__GNUC__) && !defined(__clang__)
-// The builtins behind immintrin.h, whose 46,000 lines would take a third of a second to compile.
-#if REAL_BITS == 64
-#define BUILT_IN(name, end) __builtin_ia32_##name##pd##end
-#else
-#define BUILT_IN(name, end) __builtin_ia32_##name##ps##end
-#endif
-#define COMPARED(a, symbol, code, b) Mask{uint16_t(BUILT_IN(cmp, 512_mask)(a, b, code, -1, 4))}
-#define CHOSEN(m, yes, no) BUILT_IN(blendm, _512_mask)(no, yes, m.bits)
-#define ROUGH_INVERSE_ROOT(s) BUILT_IN(rsqrt14, 512_mask)(s, s, -1)
-#elif defined(__AVX512F__)
-#include <immintrin.h>
-#if REAL_BITS == 64
-#define OF_REALS(name, end) name##_pd##end
-#else
-#define OF_REALS(name, end) name##_ps##end
-#endif
-#define COMPARED(a, symbol, code, b) Mask{OF_REALS(_mm512_cmp, _mask)(a, b, code)}
-#define CHOSEN(m, yes, no) OF_REALS(_mm512_mask_blend, )(m.bits, no, yes)
-#define ROUGH_INVERSE_ROOT(s) OF_REALS(_mm512_rsqrt14, )(s)
-#else
-#define COMPARED(a, symbol, code, b) ((a)symbol(b))
-#endif
-#if defined(__AVX512F__)
-struct Mask { uint16_t bits; };
-INLINE Mask mask(bool x) { return {uint16_t(x ? -1 : 0)}; }
-INLINE Mask operator&(Mask a, Mask b) { return {uint16_t(a.bits & b.bits)}; }
-INLINE Mask operator|(Mask a, Mask b) { return {uint16_t(a.bits | b.bits)}; }
-INLINE Mask operator~(Mask a) { return {uint16_t(~a.bits)}; }
-INLINE bool ANY(Mask a) { return a.bits & ((1 << VECTOR) - 1); }
-INLINE Vec chosen(Mask m, Vec yes, Vec no) { return CHOSEN(m, yes, no); }
-INLINE Vec rough_inverse_root(Vec s) { return ROUGH_INVERSE_ROOT(s); }
-#else
 typedef BitsVec Mask;
 INLINE Mask mask(bool x) { return Mask{} - Bits(x); }
+INLINE Mask mask(Mask x) { return x; }
+INLINE bool ANY(bool a) { return a; }
 INLINE bool ANY(Mask a) {
     Bits any = 0;
     for (int i = 0; i < VECTOR; ++i) any |= a[i];
     return any;
 }
-INLINE Vec chosen(Mask m, Vec yes, Vec no) { return m ? yes : no; }
-#endif
 INLINE Vec greater(Vec a, Vec b) { return a > b ? a : b; }  // b where either is NaN, as in a processor's own instruction
 INLINE Vec lesser(Vec a, Vec b) { return a < b ? a : b; }
-INLINE bool ANY(bool a) { return a; }
-INLINE Mask mask(Mask x) { return x; }
 INLINE Vec wide(Vec x) { return x; }
 INLINE Vec wide(real x) { return x - Vec{}; }
 
 template <class... X> constexpr bool SHARED = (... && std::is_arithmetic<X>::value);
-#define COMPARISON(NAME, symbol, code)                                       \
+#define COMPARISON(NAME, symbol)                                             \
     template <class A, class B> INLINE auto NAME(A a, B b) {                 \
         if constexpr (SHARED<A, B>) return a symbol b;                       \
-        else return COMPARED(wide(a), symbol, code, wide(b));                \
+        else return wide(a) symbol wide(b);                                  \
     }
-COMPARISON(LESS, <, 17)
-COMPARISON(AT_MOST_AS, <=, 18)
-COMPARISON(MORE, >, 30)
-COMPARISON(AT_LEAST_AS, >=, 29)
-COMPARISON(EQUAL, ==, 0)
-COMPARISON(DIFFERENT, !=, 4)
+COMPARISON(LESS, <)
+COMPARISON(AT_MOST_AS, <=)
+COMPARISON(MORE, >)
+COMPARISON(AT_LEAST_AS, >=)
+COMPARISON(EQUAL, ==)
+COMPARISON(DIFFERENT, !=)
 template <class A, class B> INLINE auto BOTH(A a, B b) {
     if constexpr (SHARED<A, B>) return a && b;
     else return mask(a) & mask(b);
@@ -93,8 +58,7 @@ template <class A> INLINE A NOT(A a) {
 }
 template <class C, class A, class B> INLINE auto WHERE(C condition, A yes, B no) {
     if constexpr (SHARED<C, A, B>) return condition ? yes : no;
-    else if constexpr (SHARED<C>) return condition ? wide(yes) : wide(no);
-    else return chosen(condition, wide(yes), wide(no));
+    else return condition ? wide(yes) : wide(no);
 }
 template <class A, class B> INLINE auto AT_LEAST(A x, B low) {
     if constexpr (SHARED<A, B>) return x < low ? low : x;
@@ -150,6 +114,12 @@ INLINE Vec refined(Vec s, Vec y) {
     return y + y * h * (real(0.25) + h * (real(5.0 / 32.0 + 1.3e-8) + h * real(15.0 / 128.0)));
 }
 #if defined(__AVX512F__)
+// The builtins behind immintrin.h, whose 46,000 lines would take a third of a second to compile.
+#if REAL_BITS == 64
+INLINE Vec rough_inverse_root(Vec s) { return __builtin_ia32_rsqrt14pd512_mask(s, s, -1); }
+#else
+INLINE Vec rough_inverse_root(Vec s) { return __builtin_ia32_rsqrt14ps512_mask(s, s, -1); }
+#endif
 INLINE Vec INVERSE_FOURTH_ROOT(Vec s) {
     const Vec inverse_root = rough_inverse_root(s);
     return refined(s, inverse_root * rough_inverse_root(inverse_root));

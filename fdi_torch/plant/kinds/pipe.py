@@ -18,7 +18,7 @@ from fdi_torch.plant.flow_component import (
     coefficient_problems,
 )
 from fdi_torch.plant.local_conditions import Local, Values
-from fdi_torch.plant.orifice import orifice_capacity, regular_width
+from fdi_torch.plant.orifice import regular_width
 from fdi_torch.recording import LARGEST
 
 BOW_TIE = ((-0.12, 0.08), (-0.12, -0.08), (0.12, 0.08), (0.12, -0.08))
@@ -98,7 +98,7 @@ class Pipe(FlowComponent):
         return self.discharge_coefficient * self.area * math.sqrt(2.0 * gravity)
 
     def capacity(self, constants: Values, gravity: torch.Tensor) -> torch.Tensor:
-        return orifice_capacity(constants["discharge_coefficient"], constants["area"], gravity)
+        return constants["discharge_coefficient"] * constants["area"] * torch.sqrt(2.0 * gravity)
 
     def smoothing_width(self, gravity: float, inverse_areas: float, resolution: torch.Tensor) -> torch.Tensor:
         return regular_width(self.nominal_capacity(gravity) * inverse_areas, resolution)
