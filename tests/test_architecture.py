@@ -26,6 +26,7 @@ LAYERS = (
         "names",
         "untrusted_input",
         "parameters",
+        "progress",
         "quantities",
         "recording",
         "sample_noise",

@@ -389,7 +389,7 @@ def test_progress_is_plain_lines_on_standard_error_when_nobody_watches(capsys: p
 def test_quiet_shows_no_progress_but_complaints(capsys: pytest.CaptureFixture[str]) -> None:
     screen = Screen(quiet=True)
     with screen.progress("searching") as advance:
-        advance(1.0)
+        advance(1.0, "done")
     screen.note("half way")
     screen.complain("stuck")
     assert capsys.readouterr().err == "stuck\n"

@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     log = free_path(folder, "gap")
     with screen.progress("gap") as advance:
 
-        def next_stage(share: float, text: str) -> None:
+        def next_stage(share: float | None, text: str) -> None:
             release_memory()
             advance(share, text)
 

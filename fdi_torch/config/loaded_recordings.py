@@ -73,7 +73,10 @@ def known_segments_of(whole: Recording, config: RecordingConfig, plant: PlantDes
         raise ConfigError([f"{whole.source}: expected a segment with all inputs known, got none: {_unknown(whole)}"])
     first = float(whole.time[0])
     levels = [config.start_levels if float(part.time[0]) == first else "free" for part in segments]
-    return [LoadedRecording(part, _levels(level, plant, config)) for part, level in zip(segments, levels, strict=True)]
+    return [
+        LoadedRecording(part, start_levels_of(level, plant, config))
+        for part, level in zip(segments, levels, strict=True)
+    ]
 
 
 def _unknown(whole: Recording) -> str:
@@ -268,7 +271,7 @@ def _source(config: FileConfig, path: Path, mapping: Mapping[str, ChannelSource]
     return FileSource(path, mapping, rows, config.header, config.sheet)
 
 
-def _levels(start_levels: Any, plant: PlantDescription, config: RecordingConfig) -> dict[str, StartLevel]:
+def start_levels_of(start_levels: Any, plant: PlantDescription, config: RecordingConfig) -> dict[str, StartLevel]:
     """The start level of each tank; tanks that are not mentioned are free."""
     tanks = [tank.name for tank in plant.tanks]
     if not isinstance(start_levels, dict):

@@ -15,7 +15,7 @@ from fdi_torch.config.live_source import SourceConfig
 from fdi_torch.config.loaded_recordings import separate_recordings
 from fdi_torch.config.problems import Source, naming, naming_source
 from fdi_torch.config.recording_config import RecordingConfig
-from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
+from fdi_torch.config.resolved_config import JobConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.strict import ScaledSeconds, Seconds, Strict
 from fdi_torch.monitor.monitor_settings import CONFIRM, LONGEST, LOOKBACK, MonitorSettings
 from fdi_torch.plant.description import PlantDescription
@@ -38,8 +38,7 @@ class WindowConfig(Strict):
         return MonitorSettings(**self.model_dump(exclude={"stride"}))
 
 
-class MonitorConfig(Strict):
-    plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
+class MonitorConfig(JobConfig):
     recording: RecordingConfig = Field(description="the recording to follow; leave it out with `source`")
     source: SourceConfig | None = Field(None, description="a live source in place of a recording")
     fault_free: tuple[Seconds, Seconds] = Field(
@@ -65,8 +64,6 @@ class MonitorConfig(Strict):
     step: Seconds | None = Field(
         None, description="longest integration step, s; by default about a hundredth of the tanks' emptying time"
     )
-    output: OutputConfig = Field(default_factory=OutputConfig)
-    seed: int = Field(0, ge=0, description="seed of the draws of the noise that set the threshold")
 
     @model_validator(mode="before")
     @classmethod

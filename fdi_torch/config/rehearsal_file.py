@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 from pydantic import BeforeValidator, Field
 
 from fdi_torch.capacity import expect_room
 from fdi_torch.config.monitor_file import WindowConfig
-from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
+from fdi_torch.config.resolved_config import JobConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.simulation import reading_noise
 from fdi_torch.config.strict import ScaledSeconds, Share, Strict, quantity
 from fdi_torch.effects import build_network, full_name, placements_for
@@ -62,8 +62,7 @@ class NamingConfig(Strict):
     window: WindowConfig = Field(default_factory=WindowConfig)
 
 
-class RehearsalConfig(Strict):
-    plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
+class RehearsalConfig(JobConfig):
     inputs: list[str | float] = Field(
         description="list of constant commands, one per channel of the plant, in its order"
     )
@@ -74,8 +73,6 @@ class RehearsalConfig(Strict):
     false_alarms: FalseAlarmConfig | None = Field(None, description="measure the false alarm rate")
     faults_found: FaultsFoundConfig | None = Field(None, description="measure detection delay, power and isolation")
     naming: NamingConfig | None = Field(None, description="measure isolation of component, sensor and actuator faults")
-    output: OutputConfig = Field(default_factory=OutputConfig)
-    seed: int = Field(0, ge=0, description="seed of all random numbers")
 
 
 Plan = FalseAlarmPlan | DetectionPlan | IsolationPlan

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from pydantic import Field, ValidationError, field_validator
 
@@ -35,19 +35,15 @@ class OutputConfig(Strict):
         return name
 
 
-class _WithOutput(Protocol):
-    """What the models of run, monitor and rehearsal files share."""
+class JobConfig(Strict):
+    """What run, monitor and rehearsal files have in common."""
 
-    @property
-    def output(self) -> OutputConfig: ...
-
-    @property
-    def seed(self) -> int: ...
-
-    def model_dump(self, *, mode: str) -> dict[str, Any]: ...
+    plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
+    output: OutputConfig = Field(default_factory=OutputConfig)
+    seed: int = Field(0, ge=0, description="seed of all random numbers")
 
 
-AnyConfig = TypeVar("AnyConfig", bound=_WithOutput)
+AnyConfig = TypeVar("AnyConfig", bound=JobConfig)
 
 
 @dataclass(frozen=True)

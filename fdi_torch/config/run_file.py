@@ -14,21 +14,17 @@ from fdi_torch.config.estimation import EstimationConfig
 from fdi_torch.config.loaded_recordings import separate_recordings
 from fdi_torch.config.problems import Source
 from fdi_torch.config.recording_config import RecordingConfig
-from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
+from fdi_torch.config.resolved_config import JobConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.simulation import SimulationConfig
-from fdi_torch.config.strict import Strict
 from fdi_torch.config.yaml_files import DEFAULT_RUN
 from fdi_torch.estimate.fitting import EngineKind
 from fdi_torch.recording import Recording
 
 
-class RunConfig(Strict):
-    plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
+class RunConfig(JobConfig):
     recordings: list[RecordingConfig] = Field(default_factory=list, description="recordings of the rig")
     simulate: SimulationConfig | None = Field(None, description="or a run to be simulated")
     estimate: EstimationConfig = Field(default_factory=EstimationConfig)
-    output: OutputConfig = Field(default_factory=OutputConfig)
-    seed: int = Field(0, ge=0, description="seed of all random numbers")
     device: str = Field("cpu", description="of the search and the refinement: cpu or cuda")
     engine: EngineKind = Field("auto", description="simulation engine; compiled only on the CPU")
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import orjson
 
-from fdi_torch.config.growing_recordings import Row
 from fdi_torch.disk import named_errors
+from fdi_torch.live.row_buffer import Row
 
 Item = Row | str
 

@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import TypeVar
 
 from fdi_torch.clock import clock_text, show_clock
-from fdi_torch.config.growing_recordings import Row, growing_rows
+from fdi_torch.config.growing_recordings import growing_rows
 from fdi_torch.config.live_source import LiveRows
 from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.jobs.learning_items import LearningItems
-from fdi_torch.jobs.log_paths import RESUMES, expect_unfinished, free_path, partial_path
+from fdi_torch.jobs.log_paths import RESUMES, log_to_write, partial_path
 from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.monitor_rows import (
     ALARM,
@@ -36,6 +36,7 @@ from fdi_torch.jobs.monitor_rows import (
     rows_in,
     rows_until,
 )
+from fdi_torch.live.row_buffer import Row
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook import RunLog
 from fdi_torch.names import counted
@@ -65,7 +66,7 @@ def run_monitor(
     run of the same file or source; the result is the same as without the interruption, and events in the earlier log
     are not reported again.
     """
-    path, unfinished = _log_to_write(run, resume)
+    path, unfinished = log_to_write(Path(run.config.output.folder), run.name, run.text, resume)
     follow = follow or run.config.source is not None
     if not follow:
         callbacks.tell(0.0, "reading")
@@ -96,12 +97,6 @@ def run_monitor(
         finally:
             log.result({"events": monitor.events, "faults": monitor.faults()})
     return MonitorSummary(monitor.alarms, monitor.lasted, monitor.spent, path)
-
-
-def _log_to_write(run: MonitorRun, resume: bool) -> tuple[Path, LoggedRun | None]:
-    """Path of the log to write, and with `resume` the unfinished log to continue."""
-    folder = Path(run.config.output.folder)
-    return expect_unfinished(folder, run.name, run.text) if resume else (free_path(folder, run.name), None)
 
 
 def _earlier(

@@ -12,8 +12,8 @@ from typing import Any
 import orjson
 import torch
 
-from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.monitor_file import MonitorRun
+from fdi_torch.live.row_buffer import Row
 from fdi_torch.logbook import Run as Log
 from fdi_torch.logbook import series
 from fdi_torch.monitor.events import FORMAT, Event

@@ -30,12 +30,12 @@ from fdi_torch.jobs.gap import library_entries, one_thread, run_gap
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
-from fdi_torch.jobs.progress import Tell, TellEndless, rounded, silent
 from fdi_torch.jobs.python_results import FreeRun, GapResult, MonitorResult, RefitResult
 from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.monitor.events import Event
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.progress import Tell, rounded, silent
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import doubts_about
 
@@ -176,7 +176,7 @@ def monitor(
     plant: AnyPlant | MonitorRun | Mapping[str, Any],
     recording: AnyRecording | None = None,
     *,
-    tell: TellEndless = silent,
+    tell: Tell = silent,
     **keys: Any,
 ) -> MonitorResult:
     """Run a monitor along a recording, as `fdi monitor` does.
