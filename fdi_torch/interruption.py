@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from types import FrameType, TracebackType
+from types import FrameType
 
 
 class Terminated(SystemExit):
@@ -32,9 +32,7 @@ class _Undisturbed:
         if threading.get_ident() == self._main:
             self._depth += 1
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if threading.get_ident() == self._main:
             self._depth -= 1
             if self._postponed is not None and not self._depth:
@@ -60,11 +58,9 @@ class SteadyLock:
         UNDISTURBED.__enter__()
         self._lock.acquire()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._lock.release()
-        UNDISTURBED.__exit__(kind, error, trace)
+        UNDISTURBED.__exit__(*error)
 
 
 def catch_signals() -> None:

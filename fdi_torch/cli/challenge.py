@@ -72,7 +72,7 @@ def _benchmarked(
     if arguments.plant and arguments.rig:
         raise ValueError("expected --rig or --plant, got both; leave one out")
     rig = _rig(arguments)
-    left_out = LIBRARY if arguments.leave_out == "all" else tuple(n for n in arguments.leave_out.split(",") if n)
+    left_out = LIBRARY if arguments.leave_out == ("all",) else arguments.leave_out
     code = git_state()
     with _mapper(arguments.cluster) as each, screen.progress("blind benchmark") as advance, _resumable(out):
         rows = blind_benchmark(
@@ -81,7 +81,7 @@ def _benchmarked(
             out,
             _diagnose,
             rig=rig,
-            kinds=tuple(arguments.kinds.split(",")) if arguments.kinds else (),
+            kinds=arguments.kinds,
             library=LIBRARY,
             leave_out=left_out,
             rivals=rivals,

@@ -26,8 +26,7 @@ from fdi_torch.recording import Recording
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     plant = chosen_plant(arguments.plant)
-    named = [full_name(name.strip(), plant) for name in (arguments.faults or "").split(",") if name.strip()]
-    faults = named or usual_faults(plant)
+    faults = [full_name(name, plant) for name in arguments.faults] or usual_faults(plant)
     recording, constant = _inputs(arguments, plant)
     uncertain = uncertain_constants(plant, faults)
     report = diagnosability(

@@ -14,7 +14,7 @@ from typing import Any, get_args
 
 import orjson
 
-from fdi_torch.cli.options import access_text, host_and_port, live
+from fdi_torch.cli.options import access_text, host_and_port, live, overrides
 from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.clock import clock_text
 from fdi_torch.config.monitor_file import load_monitor
@@ -30,9 +30,7 @@ Publish = Callable[[dict[str, Any]], None]
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
-    folder = [f"output.folder={arguments.out}"] if arguments.out else []
-    url = [f"source.url={arguments.source}"] if arguments.source else []
-    monitor_run = load_monitor(arguments.config, [*arguments.set, *folder, *url])
+    monitor_run = load_monitor(arguments.config, overrides(arguments))
     with (
         screen.progress("monitor") as advance,
         outlets(arguments, monitor_run.name, screen) as (

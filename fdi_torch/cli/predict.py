@@ -7,6 +7,7 @@ estimate.misfit.misfit_of → recordings.check.doubts_about → cli.explained.sa
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -62,7 +63,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     if arguments.settle is None and max(map(len, recordings)) <= arguments.start_samples:
         first = "all samples: a longer recording would test the prediction"
     screen.say(f"free run of {plant.name}, initial levels from {first}")
-    before = [_predict(other, recording, arguments, vary="") for recording in recordings] if other else []
+    before = [_predict(other, recording, arguments, vary=()) for recording in recordings] if other else []
     own_name, other_name = _names(plant, other, arguments)
     rows = [[own_name, *_row(plant, recording, prediction)] for recording, prediction in predictions]
     rows += [[other_name, *_row(plant, *each)] for each in zip(recordings, before, strict=bool(other))]
@@ -91,9 +92,9 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 
 def _predict(
-    plant: PlantDescription, recording: Recording, arguments: argparse.Namespace, vary: str | None = None
+    plant: PlantDescription, recording: Recording, arguments: argparse.Namespace, vary: Sequence[str] | None = None
 ) -> Prediction:
-    patterns = [name for name in (arguments.vary if vary is None else vary).split(",") if name]
+    patterns = arguments.vary if vary is None else vary
     return predict(plant, recording, arguments.start_samples, settle=arguments.settle, vary=patterns)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -34,7 +35,7 @@ from fdi_torch.config.yaml_files import YAML_ENDINGS, expect_kind, find_data, fi
 from fdi_torch.logbook import LogError
 from fdi_torch.names import nearest, unknown
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.quantities import display_also_in
+from fdi_torch.quantities import display_in, displayed_units
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_csv_files
 from fdi_torch.recordings.database import is_query, write_query
@@ -171,7 +172,9 @@ def read_recording(
     folder = base or Path.cwd()
     try:
         if in_memory is None and is_query(config.file):
-            recording = _read_query(config, folder, plant, channels, columns)
+            with _as_file(config.file) as path:  # its hash is that of the table
+                write_query(config.file, path, lambda name: find_data(name, folder))
+                recording = replace(_read(config, path, folder, plant, channels, columns), source=config.file)
         elif in_memory is None:
             path = find_data(config.file, folder)
             recording = _read(config, path, folder, plant, channels, columns)
@@ -183,7 +186,7 @@ def read_recording(
         stop = math.inf if config.stop is None else in_seconds(config.stop, recording, config)
         masks = [(in_seconds(a, recording, config), in_seconds(b, recording, config)) for a, b in config.mask]
         selected = recording.window(start, stop).masked(masks).every(config.every)
-        display_also_in(recording.written)
+        display_in({**displayed_units(), **recording.written})
         return replace(selected, trusted=config.trusted or selected.trusted)
     except (ValueError, LogError) as error:
         raise ConfigError([str(error)]) from None
@@ -210,31 +213,26 @@ def read_frame(frame: Any, plant: AnyPlant, **keys: Any) -> Recording:
     timed = frame.index.name is not None
     named = frame.rename(columns=header)
     named = named.rename_axis(index=header(frame.index.name)) if timed else named
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "frame.csv"
+    with _as_file("data frame") as path:
         named.to_csv(path, index=timed)
         try:
             config = RecordingConfig.model_validate({"file": str(path), **keys})
-            return replace(read_recording(config, plant), source="data frame", sha256="")
         except ValidationError as error:
             raise explain(error, Source("data frame")) from None
-        except ConfigError as error:
-            raise ConfigError([problem.replace(str(path), "data frame") for problem in error.problems]) from None
+        return replace(read_recording(config, plant), source="data frame", sha256="")
 
 
-def _read_query(
-    config: RecordingConfig, base: Path, plant: PlantDescription, inputs: Sequence[str], outputs: Sequence[str]
-) -> Recording:
-    """Read the table of a database query as a CSV file; its hash is that of the table."""
+@contextmanager
+def _as_file(name: str) -> Iterator[Path]:
+    """A path for a table that is not a file; errors call it by its name."""
     with TemporaryDirectory() as folder:
-        path = Path(folder) / "query"
+        path = Path(folder) / "table.csv"
         try:
-            write_query(config.file, path, lambda name: find_data(name, base))
-            return replace(_read(config, path, base, plant, inputs, outputs), source=config.file)
+            yield path
         except ConfigError as error:
-            raise ConfigError([problem.replace(str(path), config.file) for problem in error.problems]) from None
+            raise ConfigError([problem.replace(str(path), name) for problem in error.problems]) from None
         except (ValueError, ImportError) as error:
-            raise ValueError(str(error).replace(str(path), config.file)) from None
+            raise ValueError(str(error).replace(str(path), name)) from None
 
 
 def _read(

@@ -23,11 +23,11 @@ from fdi_torch.config.growing_recordings import growing_rows
 from fdi_torch.config.live_source import LiveRows
 from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor_file import MonitorRun
-from fdi_torch.jobs.learning_items import LearningItems
 from fdi_torch.jobs.log_paths import RESUMES, log_to_write, partial_path
 from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.monitor_rows import (
     ALARM,
+    LearningItems,
     event_key,
     fault_free_recording,
     logged_items,

@@ -20,10 +20,9 @@ from fdi_torch.monitor.monte_carlo.simulated_runs import ResultTable
 from fdi_torch.names import counted
 from fdi_torch.progress import Tell, silent
 from fdi_torch.study.cluster import run_on_cluster
-from fdi_torch.study.mode_isolation import Isolation, count_modes
 from fdi_torch.study.monte_carlo import Trial, run_blocks
 from fdi_torch.study.study_plan import Plan
-from fdi_torch.study.summary import Score, Summary, summarise
+from fdi_torch.study.summary import Isolation, Score, Summary, count_modes, summarise
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
 
 TRIAL = "/study/trial"
