@@ -22,7 +22,7 @@ from fdi_torch.config.channels import (
     without_column,
 )
 from fdi_torch.config.plant_file import AnyPlant, chosen_plant
-from fdi_torch.config.problems import ConfigError, Source, explain
+from fdi_torch.config.problems import ConfigError, Source, explain, naming
 from fdi_torch.config.recording_config import (
     ColumnConfig,
     FileConfig,
@@ -61,10 +61,20 @@ def load_recordings(
 ) -> list[LoadedRecording]:
     """All recordings, cut into segments with known inputs. given: as for `read_recording`."""
     segments = []
-    for config in configs:
+    for k, config in enumerate(configs):
+        expect_file(config, f"recordings.{k}", base, given)
         whole = read_recording(config, plant, base, given)
         segments += known_segments_of(whole, config, plant)
     return segments
+
+
+def expect_file(
+    config: RecordingConfig, place: str, base: Path | None = None, given: Mapping[str, Recording] | None = None
+) -> None:
+    """Raises ConfigError, naming the place of the entry, if its file is missing. given: as for `read_recording`."""
+    if config.file not in (given or {}) and not is_query(config.file):
+        with naming(f"{place}.file"):
+            find_data(config.file, base or Path.cwd())
 
 
 def known_segments_of(whole: Recording, config: RecordingConfig, plant: PlantDescription) -> list[LoadedRecording]:

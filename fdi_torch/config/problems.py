@@ -19,17 +19,21 @@ class ConfigError(ValueError):
     """
 
     def __init__(self, problems: Sequence[str], place: str = "") -> None:
-        self.place = place
+        self.place, self.sentences = place, tuple(problems)
         self.problems = tuple(f"{place}: {problem}" if place else problem for problem in problems)
         super().__init__("\n".join(self.problems))
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where a configuration comes from: its file, or other words for it, and overrides 'KEY=VALUE' of its values."""
+    """Where a configuration comes from: its file, or other words for it, and overrides 'KEY=VALUE' of its values.
+
+    within: a key around all that was given, which messages leave out.
+    """
 
     file: str
     overrides: tuple[str, ...] = ()
+    within: str = ""
 
     def __str__(self) -> str:
         return self.file
@@ -45,7 +49,8 @@ class Source:
 
     def at(self, place: str) -> str:
         """The beginning of a message about a key."""
-        return f"{self.of(place)}: {place}" if place else self.file
+        inside = place.removeprefix(self.within).removeprefix(".")
+        return f"{self.of(place)}: {inside}" if inside else self.of(place)
 
 
 class UnknownKeyError(ValueError):
@@ -71,7 +76,7 @@ def _explained(finding: Mapping[str, Any], source: Source, known: Mapping[str, s
     place = ".".join(map(str, finding["loc"]))
     unknown_key = getattr(finding.get("ctx", {}).get("error"), "key", "")
     origin = source.of(".".join(filter(None, (place, unknown_key))))
-    return ": ".join(filter(None, (origin, place, _sentence(finding, known))))
+    return f"{origin}{source.at(place).removeprefix(source.of(place))}: {_sentence(finding, known)}"
 
 
 @contextmanager
@@ -91,7 +96,7 @@ def naming_source(source: Source) -> Iterator[None]:
     except ConfigError as error:
         if not error.place:
             raise
-        raise ConfigError([f"{source.of(error.place)}: {problem}" for problem in error.problems]) from None
+        raise ConfigError([f"{source.at(error.place)}: {sentence}" for sentence in error.sentences]) from None
 
 
 def _sentence(finding: Any, known: Mapping[str, str]) -> str:

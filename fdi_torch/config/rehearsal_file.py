@@ -40,26 +40,25 @@ class FalseAlarmConfig(Strict):
     calibrations: int = Field(8, ge=1, description="number of runs from which the noise is estimated")
 
 
-class FaultsFoundConfig(Strict):
-    faults: list[str] = Field(min_length=1, description="faults, one per run")
-    sizes: list[Share] = Field([0.02, 0.05, 0.1, 0.2], min_length=1, description="shares of the fault's range")
-    runs: int = Field(500, ge=1, description="number of runs of each size")
-    named: int = Field(100, ge=0, description="number of these runs in which the monitor also isolates the fault")
+class _FaultyRuns(Strict):
+    faults: list[str] = Field(min_length=1, description="faults, one per run; under naming, abrupt and incipient")
     onset: ScaledSeconds = Field(300.0, description="onset of the fault, s")
     lasts: ScaledSeconds = Field(900.0, description="duration of each run, s")
     window: WindowConfig = Field(default_factory=WindowConfig)
 
 
-class NamingConfig(Strict):
-    faults: list[str] = Field(min_length=1, description="faults, abrupt and (if possible) incipient")
+class FaultsFoundConfig(_FaultyRuns):
+    sizes: list[Share] = Field([0.02, 0.05, 0.1, 0.2], min_length=1, description="shares of the fault's range")
+    runs: int = Field(500, ge=1, description="number of runs of each size")
+    named: int = Field(100, ge=0, description="number of these runs in which the monitor also isolates the fault")
+
+
+class NamingConfig(_FaultyRuns):
     loops: list[Literal["closed", "open"]] = Field(["closed", "open"], description="level control, or commands alone")
     swing: Metres = Field(0.03, description="change of the set points each minute")
     share: Share = Field(0.5, description="relative change of the commands each minute")
     runs: int = Field(200, ge=1, description="number of runs of each loop")
     times: float = Field(3.0, gt=0, description="size of the faults as a multiple of the smallest isolable size")
-    onset: ScaledSeconds = Field(300.0, description="onset of the fault, s")
-    lasts: ScaledSeconds = Field(900.0, description="duration of each run, s")
-    window: WindowConfig = Field(default_factory=WindowConfig)
 
 
 class RehearsalConfig(JobConfig):

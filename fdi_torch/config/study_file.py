@@ -104,17 +104,14 @@ def build_study(data: Mapping[str, Any], base: Path, source: Source) -> Study:
 
 def _plan(config: StudyConfig, run: Run) -> Plan:
     fitting = _fitting(run)
+    as_configured = ("search_step", "search_every", "starts", "searches", "data_step")
     method = Method(
         estimators=tuple(config.estimators),
         objective=run.config.estimate.objective.search,
         search=EvolutionSettings(population=config.population, evaluations=config.evaluations),
-        search_step=config.search_step,
-        search_every=config.search_every,
-        starts=config.starts,
-        searches=config.searches,
         steps=tuple(config.steps),
         refine=RefineSettings(iterations=run.config.estimate.refine.iterations),
-        data_step=config.data_step,
+        **{name: getattr(config, name) for name in as_configured},
     )
     definition = run.config.simulate.noise.definition if run.config.simulate else "variance"
     with tensors_on(fitting.device):

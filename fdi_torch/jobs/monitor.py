@@ -21,8 +21,9 @@ from typing import TypeVar
 from fdi_torch.clock import clock_text, show_clock
 from fdi_torch.config.growing_recordings import growing_rows
 from fdi_torch.config.live_source import LiveRows
-from fdi_torch.config.loaded_recordings import read_recording
+from fdi_torch.config.loaded_recordings import expect_file, read_recording
 from fdi_torch.config.monitor_file import MonitorRun
+from fdi_torch.config.problems import naming_source
 from fdi_torch.jobs.log_paths import RESUMES, log_to_write, partial_path
 from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.monitor_rows import (
@@ -68,9 +69,12 @@ def run_monitor(
     """
     path, unfinished = log_to_write(Path(run.config.output.folder), run.name, run.text, resume)
     follow = follow or run.config.source is not None
+    whole = None
     if not follow:
         callbacks.tell(0.0, "reading")
-    whole = None if follow else read_recording(run.config.recording, run.plant, run.base, run.given)
+        with naming_source(run.source):
+            expect_file(run.config.recording, "recording", run.base, run.given)
+        whole = read_recording(run.config.recording, run.plant, run.base, run.given)
     kept = LearningItems(path) if run.config.source is not None else None
     earlier, origin = _earlier(run, unfinished, kept, resume) if follow else ([], None)
     messages = unfinished.messages([ALARM]) if unfinished is not None else ()

@@ -14,7 +14,7 @@ from typing import Any
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings, read_recording
 from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monitor
 from fdi_torch.config.plant_file import AnyPlant, chosen_plant
-from fdi_torch.config.problems import ConfigError, Source
+from fdi_torch.config.problems import Source
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.study_file import Study, build_study, load_study
 from fdi_torch.effects.catalogue import Catalogue
@@ -103,11 +103,8 @@ def simulate(
     if isinstance(plant, Run | Mapping):
         raise TypeError("simulate: expected either a run or a plant with the keys of simulate, got both; keep one")
     named = {} if plant is None else {"plant": plant}
-    try:
-        return simulate_recording(build_run({**named, "simulate": given}, Path.cwd(), Source("simulate")))
-    except ConfigError as error:  # in a run file, the arguments are the keys of simulate
-        problems = [problem.removeprefix("simulate: ").removeprefix("simulate.") for problem in error.problems]
-        raise ConfigError([f"simulate: {problem}" for problem in problems]) from None
+    source = Source("simulate", within="simulate")  # the arguments are keys of simulate in a run file
+    return simulate_recording(build_run({**named, "simulate": given}, Path.cwd(), source))
 
 
 def train(

@@ -36,8 +36,8 @@ def read_mcap(
     scale = 1.0
     if any(":" in (source.column or "") for source in sources.values()):
         places = {name: _place(path, name, source) for name, source in sources.items()}
-        both = ({name: places[name] for name in names if name in places} for names in (inputs, outputs))
-        signals = mapped_signals(run, *both, mapping.get("t", ChannelSource()).column)
+        of_inputs, of_outputs = ({n: places[n] for n in names if n in places} for names in (inputs, outputs))
+        signals = mapped_signals(run, of_inputs, of_outputs, mapping.get("t", ChannelSource()).column)
         scale, table = _seconds(path, mapping.get("t")), _by_name(signals)
     else:
         signals = own_signals(run)

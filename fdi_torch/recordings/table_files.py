@@ -37,8 +37,8 @@ class Format:
 
 
 FORMATS = (
-    Format(b"PAR1", "a Parquet file", "parquet"),
-    Format(b"ARROW1", "a Feather file", "feather"),
+    Format(b"PAR1", "a Parquet file", "arrow"),
+    Format(b"ARROW1", "a Feather file", "arrow"),
     Format(b"PK\x03\x04", "an Excel workbook", "excel"),
     Format(b"MATLAB 5.0", "a MATLAB file", "matlab"),
     Format(b"\x89HDF", "an HDF5 file", "hdf5"),
