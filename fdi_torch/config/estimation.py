@@ -14,7 +14,7 @@ from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity, qu
 from fdi_torch.effects import all_placements, build_network, full_name, placements_for, unknown_parameter
 from fdi_torch.estimate.evolution_settings import STRATEGIES, EvolutionSettings
 from fdi_torch.estimate.objectives import Objective
-from fdi_torch.names import shortened
+from fdi_torch.names import matching, shortened
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
@@ -165,13 +165,8 @@ def _calibrated(
 ) -> list[str]:
     if config.calibrate == "auto":
         return list(plant.tolerances) if real_data else []
-    names: dict[str, None] = {}
-    for pattern in config.calibrate:
-        matched = [name for name in constants.names if fnmatchcase(name, pattern)]
-        if not matched:
-            raise ConfigError([unknown_parameter(pattern, constants, plant)], "estimate.calibrate")
-        names |= dict.fromkeys(matched)
-    return list(names)
+    with naming("estimate.calibrate"):
+        return matching("a constant", config.calibrate, constants.names)
 
 
 def parameter_values(values: dict[str, Amount], constants: ParameterSpace, plant: PlantDescription) -> dict[str, float]:

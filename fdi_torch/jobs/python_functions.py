@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings, read_recording
 from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monitor
@@ -40,6 +40,7 @@ from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import doubts_about
 
 AnyRecording = Recording | Mapping[str, Any] | str | Path
+Resolved = TypeVar("Resolved")
 AnyRun = Run | Mapping[str, Any] | str | Path
 
 
@@ -54,11 +55,16 @@ def _keys(run: Any, advice: str = "name its recordings as the next argument; ") 
     return run
 
 
+def _resolved(given: Any, kind: type[Resolved], load: Any, build: Any, job: str, **advice: str) -> Resolved:
+    """What a file, its keys, or itself describe. job: named in messages about keys; advice: as of `_keys`."""
+    if isinstance(given, str | Path):
+        return load(given)
+    return given if isinstance(given, kind) else build(_keys(given, **advice), Path.cwd(), Source(job))
+
+
 def _run_of(run: Any, job: str) -> Run:
-    """The run of a file, of its keys, or the built-in example for None. job: named in messages about a mapping."""
-    if run is None or isinstance(run, str | Path):
-        return load_run(run)
-    return run if isinstance(run, Run) else build_run(_keys(run), Path.cwd(), Source(job))
+    """The run of a file, of its keys, or the built-in example for None."""
+    return load_run() if run is None else _resolved(run, Run, load_run, build_run, job)
 
 
 def _plant_and_recordings(plant: Any, recordings: Any, job: str) -> tuple[PlantDescription, list[Recording]]:
@@ -188,10 +194,7 @@ def monitor(
         run = {"plant": plant, "recording": recording, **keys}
     elif keys:
         raise TypeError(f"monitor: expected a recording beside {', '.join(keys)}, got none; name it")
-    if isinstance(run, str | Path):
-        run = load_monitor(run)
-    elif not isinstance(run, MonitorRun):
-        run = build_monitor(_keys(run), Path.cwd(), Source("monitor"))
+    run = _resolved(run, MonitorRun, load_monitor, build_monitor, "monitor")
     events: list[Event] = []
     summary = run_monitor(run, MonitorCallbacks(rounded(tell), events.append, lambda prepared: None))
     return MonitorResult(tuple(events), summary.lasted, summary.spent, summary.log)
@@ -260,11 +263,8 @@ def study(
     or 'local'. tell(share, text): receives the progress, from 0 to 1, and a line about it; by default nothing is shown,
     and tell=print prints it.
     """
-    if isinstance(study, str | Path):
-        study = load_study(study)
-    elif not isinstance(study, Study):
-        study = build_study(_keys(study, advice=""), Path.cwd(), Source("study"))
-    return study_job.run_study(study, resume, cluster, rounded(tell))
+    given = _resolved(study, Study, load_study, build_study, "study", advice="")
+    return study_job.run_study(given, resume, cluster, rounded(tell))
 
 
 def effects(plant: AnyPlant | None = None) -> Catalogue:

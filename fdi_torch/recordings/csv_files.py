@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from fdi_torch.recording import Hold, Recording
-from fdi_torch.recordings.csv_binding import Bound, bind, bind_clock, columns_of, unit_notes
+from fdi_torch.recordings.csv_binding import Bound, bind, bind_table, unit_notes
 from fdi_torch.recordings.csv_cells import Columns, parse_carefully, parse_fast
 from fdi_torch.recordings.csv_tags import read_tags
 from fdi_torch.recordings.csv_text import heading_of, names_in, open_csv
@@ -144,13 +144,10 @@ def _table_rows(
     file: FileSource, names: Sequence[str]
 ) -> tuple[Bound, list[Bound], list[Rows], list[str], StampReader]:
     """The clock, all channels, their rows, notes, and the reader of time stamps of a file with a row per instant."""
-    path, source = file.path, clock_in(file.columns)
+    path = file.path
     with open_csv(path, file.sheet) as handle:
         heading, lines = heading_of(path, handle, file.header)
-        clock = bind_clock(path, heading.names, source)
-        bounds = [bind(path, heading.names, name, file.columns.get(name)) for name in names]
-        sparse = any(file.columns[name].held > 0.0 for name in names if name in file.columns)
-        columns = columns_of(path, heading, [clock, *bounds], source, sparse)
+        clock, bounds, columns = bind_table(path, heading, names, file.columns)
         table, notes = _read_table(lines, columns)
     numbers = np.arange(len(table))
     cells = numbers if clock.position is None else table[:, 0]
