@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import signal
 import threading
-from types import FrameType
 
 
 class Terminated(SystemExit):
@@ -70,14 +69,6 @@ def catch_signals() -> None:
     """
     if threading.current_thread() is not threading.main_thread():
         return
-    signal.signal(signal.SIGTERM, _terminate)
+    signal.signal(signal.SIGTERM, lambda *_: UNDISTURBED.raise_or_postpone(Terminated()))
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _interrupt)
-
-
-def _terminate(number: int, frame: FrameType | None) -> None:
-    UNDISTURBED.raise_or_postpone(Terminated())
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    UNDISTURBED.raise_or_postpone(KeyboardInterrupt())
+        signal.signal(signal.SIGINT, lambda *_: UNDISTURBED.raise_or_postpone(KeyboardInterrupt()))

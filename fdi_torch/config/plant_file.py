@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Sized
+from collections.abc import Sized
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
@@ -30,7 +30,6 @@ from fdi_torch.plant.description import (
     Sensor,
     Tank,
 )
-from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.quantities import SI_UNITS, display_in, unit_factor
 from fdi_torch.untrusted_input import MOST_COMPONENTS
 
@@ -184,14 +183,13 @@ def _valid_units(units: dict[str, str], plant: Plant) -> dict[str, str]:
 
 
 def _plant(config: PlantConfig) -> Plant:
-    flows = {kind: getattr(config, kind.part()) for kind in FLOW_KINDS}
+    flows: dict[Any, dict[str, Strict]] = {kind: getattr(config, kind.part()) for kind in FLOW_KINDS}
     kinds: tuple[Sized, ...] = (config.tanks, *flows.values(), config.sensors, config.effects)
     parts = sum(len(kind) for kind in kinds)
     if parts > MOST_COMPONENTS:
         raise ValueError(f"expected at most {MOST_COMPONENTS} components and effects, got {parts}; split the plant")
     components: dict[str, Any] = {
-        kind.part(): [_flow_component(kind, name, keys) for name, keys in given.items()]
-        for kind, given in flows.items()
+        kind.part(): [kind(name, **dict(keys)) for name, keys in given.items()] for kind, given in flows.items()
     }
     tanks = [Tank(name, **dict(tank)) for name, tank in config.tanks.items()]
     for tank in tanks:
@@ -222,10 +220,6 @@ def _matter(name: str, matter: MatterConfig, plant: Plant) -> FaultPriority:
     if smallest < 0.0:
         raise ValueError(f"matters.{name}.smallest: expected no negative size, got {matter.smallest}")
     return FaultPriority(str(at.sibling(size.name)), smallest, matter.urgency)
-
-
-def _flow_component(kind: Callable[..., FlowComponent], name: str, keys: Strict) -> FlowComponent:
-    return kind(name, **dict(keys))
 
 
 def _sensor(name: str, config: SensorConfig) -> Sensor:

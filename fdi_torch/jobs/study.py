@@ -22,7 +22,7 @@ from fdi_torch.progress import Tell, silent
 from fdi_torch.study.cluster import run_on_cluster
 from fdi_torch.study.monte_carlo import Trial, run_blocks
 from fdi_torch.study.study_plan import Plan
-from fdi_torch.study.summary import Isolation, Score, Summary, count_modes, summarise
+from fdi_torch.study.summary import Isolation, Summary, count_modes, summarise
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
 
 TRIAL = "/study/trial"
@@ -48,16 +48,12 @@ class StudyResult(Shown):
     def table(self) -> Table:
         """One row per setting, estimator and parameter; bias and RMSE in the parameter's unit for display."""
         names = ("setting", "estimator", "parameter", "unit", "bias", "RMSE", "RMSE / bound", "coverage")
-        rows = [
-            (s.setting, e.estimator, e.parameter, *in_display_unit(e.parameter, e.unit, e.bias, e.rmse), *_ratios(e))
-            for s in self.summaries
-            for e in s.scores
-        ]
+        rows = []
+        for setting, e in ((summary.setting, score) for summary in self.summaries for score in summary.scores):
+            ratios = [None if ratio is None else ratio.value for ratio in (e.over_bound, e.coverage)]
+            bias = in_display_unit(e.parameter, e.unit, e.bias, e.rmse)
+            rows.append((setting, e.estimator, e.parameter, *bias, *ratios))
         return Table.of_rows(names, rows)
-
-
-def _ratios(score: Score) -> list[float | None]:
-    return [None if ratio is None else ratio.value for ratio in (score.over_bound, score.coverage)]
 
 
 def run_study(

@@ -198,14 +198,18 @@ def count_modes(space: ParameterSpace, trials: Sequence[Trial], confidence: floa
     """
     truth, value, std = (column(trials, name) for name in ("truth", "free", "free_std"))
     reach = NormalDist().inv_cdf(1.0 - (1.0 - confidence) / (2 * len(space)))
+    names = [name.removesuffix(".size") for name in space.names]
     faulty = truth != space.nominal()
     stated = (value - space.nominal()).abs() > reach * std
-    places = {code: k for k, code in enumerate(sorted({*_codes(faulty), *_codes(stated)}, key=_by_size))}
+    places = {
+        code: k
+        for k, code in enumerate(sorted({*_codes(faulty), *_codes(stated)}, key=lambda code: (code.bit_count(), code)))
+    }
     confusion = [[0] * len(places) for _ in places]
     for row, col in zip(_codes(faulty), _codes(stated), strict=True):
         confusion[places[row]][places[col]] += 1
     return Isolation(
-        labels=tuple(_label(space, code) for code in places),
+        labels=tuple(" + ".join(names[i] for i in range(len(names)) if code >> i & 1) or "none" for code in places),
         confusion=tuple(tuple(row) for row in confusion),
         trials=len(trials),
         right=int((faulty == stated).all(-1).sum()),
@@ -217,11 +221,3 @@ def count_modes(space: ParameterSpace, trials: Sequence[Trial], confidence: floa
 def _codes(faulty: Tensor) -> list[int]:
     """(trials, P) bool as one integer per trial, one bit per parameter."""
     return (faulty.to(torch.int64) << torch.arange(faulty.shape[-1])).sum(-1).tolist()
-
-
-def _by_size(code: int) -> tuple[int, int]:
-    return code.bit_count(), code
-
-
-def _label(space: ParameterSpace, code: int) -> str:
-    return " + ".join(n.removesuffix(".size") for i, n in enumerate(space.names) if code >> i & 1) or "none"
