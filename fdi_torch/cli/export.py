@@ -11,13 +11,13 @@ from collections import Counter
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.jobs.fmu_export import export_fmu
+from fdi_torch.names import counted
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     columns = export_fmu(arguments.plant, arguments.fmu, effects=arguments.effect).columns
     counts = Counter(columns["causality"])
-    kinds = ("input", "output", "parameter")
-    numbers = ", ".join(f"{counts[kind]} {kind}{'' if counts[kind] == 1 else 's'}" for kind in kinds)
+    numbers = ", ".join(counted(counts[kind], kind) for kind in ("input", "output", "parameter"))
     screen.say(f"{arguments.fmu}: FMU for co-simulation (FMI 2.0) with {numbers}")
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     starts = ["" if row["start"] is None else f"{row['start']:.6g}" for row in rows]

@@ -10,10 +10,9 @@ from typing import Annotated, Literal
 import torch
 from pydantic import BeforeValidator, Field
 
-from fdi_torch.capacity import expect_room
 from fdi_torch.config.monitor_file import WindowConfig
 from fdi_torch.config.resolved_config import JobConfig, ResolvedFile, resolve, values_in
-from fdi_torch.config.simulation import reading_noise
+from fdi_torch.config.simulation import expect_room_for_samples, reading_noise
 from fdi_torch.config.strict import ScaledSeconds, Share, Strict, quantity
 from fdi_torch.effects import build_network, full_name, placements_for
 from fdi_torch.monitor.monitor_setup import with_shapes
@@ -98,10 +97,8 @@ def _plans(c: RehearsalConfig, plant: PlantDescription) -> Iterable[Plan]:
     every = c.false_alarms_every
 
     def count(seconds: float) -> int:
-        samples = seconds / c.sampling
-        what = f"{samples:.3g} samples, one every {c.sampling:g} s for {seconds:g} s"
-        expect_room(samples, what, "simulate a shorter time, or sample more slowly")
-        return int(samples) + 1
+        expect_room_for_samples(seconds, c.sampling)
+        return int(seconds / c.sampling) + 1
 
     if (f := c.false_alarms) is not None:
         rigs = {name: _rig(c, plant, (), noise) for name, noise in f.noises.items()}

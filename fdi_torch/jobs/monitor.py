@@ -193,10 +193,6 @@ LATE, SILENT = 5.0, 2.0  # s of delay and of silence that are never reported
 BURST_INTERVALS = 10.0  # a longer silence, in sampling intervals, followed by as many samples is a burst
 
 
-class _End:
-    """Marks the end of the source."""
-
-
 class LiveBatches(Iterator[list[T]]):
     """Iterator over batches: all items that a thread has read from the source since the previous batch.
 
@@ -204,7 +200,7 @@ class LiveBatches(Iterator[list[T]]):
     """
 
     def __init__(self, source: Iterator[T]) -> None:
-        self._queue: queue.Queue[T | BaseException | _End] = queue.Queue(LARGEST_BATCH)
+        self._queue: queue.Queue[T | BaseException] = queue.Queue(LARGEST_BATCH)
         self._end: BaseException | None = None
         threading.Thread(target=self._read, args=(source,), daemon=True, name="live-batches").start()
 
@@ -212,7 +208,7 @@ class LiveBatches(Iterator[list[T]]):
         try:
             for item in source:
                 self._queue.put(item)
-            self._queue.put(_End())
+            self._queue.put(StopIteration())
         except BaseException as error:
             self._queue.put(error)
 
@@ -223,9 +219,7 @@ class LiveBatches(Iterator[list[T]]):
                 item = self._queue.get_nowait() if batch else self._queue.get()
             except queue.Empty:
                 return batch
-            if isinstance(item, _End):
-                self._end = StopIteration()
-            elif isinstance(item, BaseException):
+            if isinstance(item, BaseException):
                 self._end = item
             else:
                 batch.append(item)

@@ -5,6 +5,7 @@ A finding is a sentence with the numbers behind it, in SI. Nothing here judges a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -93,21 +94,14 @@ def doubts_about(recordings: Sequence[Recording], plant: PlantDescription) -> tu
 
 
 def _summaries(recording: Recording) -> Iterator[ChannelSummary]:
-    for name, unit, values in zip(recording.input_names, recording.input_units, recording.inputs.T, strict=True):
-        yield _summary(name, "input", unit, values, 0)
-    readings = zip(recording.output_names, recording.output_units, recording.outputs.T, recording.mask.T, strict=True)
-    for name, unit, values, mask in readings:
-        yield _summary(name, "output", unit, values, int((torch.isfinite(values) & ~mask).sum()))
-
-
-def _summary(name: str, role: str, unit: str, values: Tensor, masked: int) -> ChannelSummary:
-    finite = values[torch.isfinite(values)]
-    missing = len(values) - len(finite)
-    if not len(finite):
-        nan = float("nan")
-        return ChannelSummary(name, role, unit, nan, nan, nan, 0.0, missing, masked)
-    low, high, mean = (float(f) for f in (finite.min(), finite.max(), finite.mean()))
-    return ChannelSummary(name, role, unit, low, high, mean, resolution(finite), missing, masked)
+    r, masked = recording, torch.isfinite(recording.outputs) & ~recording.mask
+    inputs = zip(r.input_names, r.input_units, r.inputs.T, [0] * len(r.input_names), strict=True)
+    outputs = zip(r.output_names, r.output_units, r.outputs.T, masked.sum(dim=0).tolist(), strict=True)
+    for role, channels in (("input", inputs), ("output", outputs)):
+        for name, unit, values, ignored in channels:
+            known = values[torch.isfinite(values)]
+            ends = [float(end(known)) if len(known) else math.nan for end in (torch.amin, torch.amax, torch.mean)]
+            yield ChannelSummary(name, role, unit, *ends, resolution(known), len(values) - len(known), ignored)
 
 
 def _clock_findings(time: Tensor, steps: Tensor, interval: float) -> Iterator[ChannelFinding]:
