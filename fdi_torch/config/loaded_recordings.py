@@ -57,22 +57,19 @@ def load_recordings(
     configs: Sequence[RecordingConfig],
     plant: PlantDescription,
     base: Path | None = None,
-    given: Mapping[str, Recording] | None = None,
 ) -> list[LoadedRecording]:
-    """All recordings, cut into segments with known inputs. given: as for `read_recording`."""
+    """All recordings, cut into segments with known inputs."""
     segments = []
     for k, config in enumerate(configs):
-        expect_file(config, f"recordings.{k}", base, given)
-        whole = read_recording(config, plant, base, given)
+        expect_file(config, f"recordings.{k}", base)
+        whole = read_recording(config, plant, base)
         segments += known_segments_of(whole, config, plant)
     return segments
 
 
-def expect_file(
-    config: RecordingConfig, place: str, base: Path | None = None, given: Mapping[str, Recording] | None = None
-) -> None:
-    """Raises ConfigError, naming the place of the entry, if its file is missing. given: as for `read_recording`."""
-    if config.file not in (given or {}) and not is_query(config.file):
+def expect_file(config: RecordingConfig, place: str, base: Path | None = None) -> None:
+    """Raises ConfigError, naming the place of the entry, if its file is missing."""
+    if config.in_memory is None and not is_query(config.file):
         with naming(f"{place}.file"):
             find_data(config.file, base or Path.cwd())
 
@@ -147,49 +144,30 @@ def listed_recordings(
         raise explain(error, Source(f"{path}: recordings")) from None
 
 
-def separate_recordings(recordings: Sequence[Any]) -> tuple[list[Any], dict[str, Recording]]:
-    """The recordings of a run file with each `Recording` object replaced by a name, and these objects by name."""
-    given: dict[str, Recording] = {}
-    listed = []
-    for entry in recordings:
-        if isinstance(entry, Recording):
-            name = entry.source if entry.source not in given else f"{entry.source} ({len(given) + 1})"
-            given[name] = entry
-            entry = {"file": name}
-        listed.append(entry)
-    return listed, given
-
-
 def read_recording(
-    config: RecordingConfig | Mapping[str, Any] | str | Path,
-    plant: AnyPlant,
-    base: Path | None = None,
-    given: Mapping[str, Recording] | None = None,
+    config: RecordingConfig | Recording | Mapping[str, Any] | str | Path, plant: AnyPlant, base: Path | None = None
 ) -> Recording:
     """The plant's inputs and outputs in a recording, cropped, masked and decimated; unknown inputs are NaN.
 
     From now on quantities are displayed in the units of the plant, and the channels in those of the file.
     config: the name of the file, or the recording's entry in a run file: {"file": "run.xlsx", "columns": {"h1":
-    {"column": "LT-101", "unit": "mm"}}}. plant: or the name of its file. base: folder of relative paths. given:
-    recordings in memory, by the name that `file` gives them; the result is on the CPU. Raises ConfigError naming file,
-    row and column.
+    {"column": "LT-101", "unit": "mm"}}}; or a recording in memory. plant: or the name of its file. base: folder of
+    relative paths. The result is on the CPU. Raises ConfigError naming file, row and column.
     """
     if not isinstance(config, RecordingConfig):
         config = config_of(config)
     plant = chosen_plant(plant)
     channels, columns = plant.channels(), plant.outputs()
-    in_memory = (given or {}).get(config.file)
     folder = base or Path.cwd()
     try:
-        if in_memory is None and is_query(config.file):
+        if config.in_memory is not None:
+            recording = config.in_memory.to(torch.device("cpu")).selected(channels, columns)
+        elif is_query(config.file):
             with _as_file(config.file) as path:  # its hash is that of the table
                 write_query(config.file, path, lambda name: find_data(name, folder))
                 recording = replace(_read(config, path, folder, plant, channels, columns), source=config.file)
-        elif in_memory is None:
-            path = find_data(config.file, folder)
-            recording = _read(config, path, folder, plant, channels, columns)
         else:
-            recording = in_memory.to(torch.device("cpu")).selected(channels, columns)
+            recording = _read(config, find_data(config.file, folder), folder, plant, channels, columns)
         names = (*recording.input_names, *recording.output_names)
         expect_units(recording.source, names, (*recording.input_units, *recording.output_units), plant)
         start = -math.inf if config.start is None else in_seconds(config.start, recording, config)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import PurePath
 from typing import Annotated, Any, Literal
 from zoneinfo import ZoneInfo
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, ValidationError, model_validator
 
 from fdi_torch.config.problems import Source, explain, shown
 from fdi_torch.config.strict import Amount, HeldFor, Seconds, Strict, quantity
@@ -168,6 +168,21 @@ class RecordingConfig(FileConfig):
     hold: Literal["zero_order", "linear"] = Field("zero_order", description="course of inputs between samples")
     trusted: bool = Field(False, description="do not check for wrong units, swapped channels and clock errors")
     start_levels: StartLevels = Field("free", description="free, equilibrium, or a mapping such as {T1: 50 cm}")
+    _in_memory: Recording | None = PrivateAttr(None)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _of_a_recording(cls, data: Any, validated: Callable[[Any], RecordingConfig]) -> RecordingConfig:
+        """Accept a recording in memory in place of the name of its file."""
+        config = validated({"file": data.source} if isinstance(data, Recording) else data)
+        if isinstance(data, Recording):
+            config._in_memory = data
+        return config
+
+    @property
+    def in_memory(self) -> Recording | None:
+        """The recording itself, if it was given in place of a file."""
+        return self._in_memory
 
 
 def config_of(entry: Any) -> RecordingConfig:

@@ -19,6 +19,7 @@ from fdi_torch.effects import units_for_display
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.quantities import display_in
+from fdi_torch.recording import Recording
 
 LONGEST_NAME = 200
 
@@ -99,7 +100,15 @@ def resolve(
     plant = plant_of(data.get("plant", model.model_fields["plant"].default), base, source)
     config = scaled_to_plant(config, time_scale(plant))
     display_in(units_for_display(plant))
-    return config, plant, write_yaml({**data, "plant": plant_mapping(plant)})
+    written = {key: _written(value) for key, value in data.items()} | {"plant": plant_mapping(plant)}
+    return config, plant, write_yaml(written)
+
+
+def _written(value: Any) -> Any:
+    """A value as YAML holds it: a recording in memory by its name."""
+    if isinstance(value, Recording):
+        return {"file": value.source}
+    return [_written(each) for each in value] if isinstance(value, list | tuple) else value
 
 
 def plant_of(entry: Any, base: Path, source: Source) -> PlantDescription:

@@ -73,8 +73,8 @@ def run_monitor(
     if not follow:
         callbacks.tell(0.0, "reading")
         with naming_source(run.source):
-            expect_file(run.config.recording, "recording", run.base, run.given)
-        whole = read_recording(run.config.recording, run.plant, run.base, run.given)
+            expect_file(run.config.recording, "recording", run.base)
+        whole = read_recording(run.config.recording, run.plant, run.base)
     kept = LearningItems(path) if run.config.source is not None else None
     earlier, origin = _earlier(run, unfinished, kept, resume) if follow else ([], None)
     messages = unfinished.messages([ALARM]) if unfinished is not None else ()

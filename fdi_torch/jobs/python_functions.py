@@ -77,7 +77,7 @@ def _plant_and_recordings(plant: Any, recordings: Any, job: str) -> tuple[PlantD
     run = _run_of(plant, job)
     if run.config.simulate is not None:
         return run.plant, [simulate_recording(run)]
-    loaded = load_recordings(run.config.recordings, run.plant, run.base, run.given)
+    loaded = load_recordings(run.config.recordings, run.plant, run.base)
     return run.plant, [part.recording for part in loaded]
 
 
@@ -286,7 +286,5 @@ def recordings_of(wanted: AnyRecording | Sequence[AnyRecording], plant: PlantDes
         if isinstance(each, str | Path):
             segments += named_recordings(str(each), plant, Path.cwd())
             continue
-        given = {each.source: each} if isinstance(each, Recording) else None
-        whole = read_recording(each.source if isinstance(each, Recording) else each, plant, given=given)
-        segments += [part for part in whole.known_segments() if len(part) > 1]
+        segments += [part for part in read_recording(each, plant).known_segments() if len(part) > 1]
     return segments

@@ -100,8 +100,11 @@ def _summaries(recording: Recording) -> Iterator[ChannelSummary]:
     for role, channels in (("input", inputs), ("output", outputs)):
         for name, unit, values, ignored in channels:
             known = values[torch.isfinite(values)]
-            ends = [float(end(known)) if len(known) else math.nan for end in (torch.amin, torch.amax, torch.mean)]
-            yield ChannelSummary(name, role, unit, *ends, resolution(known), len(values) - len(known), ignored)
+            low, high, mean = (
+                float(f(known)) if len(known) else math.nan for f in (torch.amin, torch.amax, torch.mean)
+            )
+            step, missing = resolution(known), len(values) - len(known)
+            yield ChannelSummary(name, role, unit, low, high, mean, step, missing, ignored)
 
 
 def _clock_findings(time: Tensor, steps: Tensor, interval: float) -> Iterator[ChannelFinding]:
