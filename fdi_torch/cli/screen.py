@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import orjson
 from rich.console import Console
@@ -26,6 +26,9 @@ from rich.text import Text
 from fdi_torch.disk import named_errors
 from fdi_torch.progress import Tell, silent
 from fdi_torch.untrusted_input import printable, printable_json
+
+if TYPE_CHECKING:
+    from fdi_torch.tables import Table as Shown  # loads the library of units, for which quick commands do not wait
 
 SECONDS_BETWEEN_LINES = 2.0
 ENDLESS = 1 << 16  # characters per line of a pipe or a file
@@ -95,6 +98,10 @@ class Screen:
         for row in rows:
             table.add_row(*(_shown(row[i]) for i in filled))
         self._out.print(table, soft_wrap=False)
+
+    def show(self, table: Shown, left: int, title: str = "") -> None:
+        """Print a table of results, as it shows itself in a session; not with JSON."""
+        self.table(title, list(table.columns), table.rows(len(table)), left)
 
     def result(self, data: Any) -> None:
         """Print the result as JSON if requested; dataclasses are allowed, and non-finite numbers become null."""

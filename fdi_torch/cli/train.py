@@ -106,8 +106,7 @@ def show_uncertainty(done: TrainResult, screen: Screen) -> None:
     for profile in done.profiles:
         screen.say(f"- profile likelihood of {profile.headline}")
     if (draws := done.result.estimate.draws) is not None:
-        table = draws.table()
-        screen.table("draws from the posterior", list(table.columns), table.rows(), left=2)
+        screen.show(draws.table(), 2, "draws from the posterior")
         screen.say(draws.headline)
         screen.say()
 
