@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from fdi_torch.config.channels import channel_mapping, expect_units, is_log
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recording_config import ColumnConfig, RecordingConfig
 from fdi_torch.config.yaml_files import find_data
-from fdi_torch.live.row_buffer import Row
+from fdi_torch.live.row_buffer import Row, RowSource
 from fdi_torch.logbook import LogError, Message, follow, number_at
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import si_unit_of, unit_factor
@@ -24,17 +24,11 @@ from fdi_torch.recordings.source import ChannelSource
 POLL = 0.1  # s
 
 
-def growing_rows(
-    config: RecordingConfig,
-    plant: PlantDescription,
-    base: Path,
-    idle: float,
-    began: Callable[[float], None] | None = None,
-) -> Iterator[Row | str]:
+def growing_rows(config: RecordingConfig, plant: PlantDescription, base: Path, idle: float) -> RowSource:
     """Samples in the order of writing, and a sentence for each row that cannot be read. The file is opened at once.
 
-    Ends when the file is finished, or when nothing has arrived for `idle` s. Raises ConfigError for an unusable file.
-    began: called with time 0 as the file's clock shows it, s since 1970, if it has dates.
+    Ends when the file is finished, or when nothing has arrived for `idle` s. The origin is as the file's clock shows
+    it. Raises ConfigError for an unusable file.
     """
     clock = config.columns.get("t", ColumnConfig())
     stamped = isinstance(config.start, datetime) or isinstance(config.stop, datetime)
@@ -54,14 +48,12 @@ def growing_rows(
     try:
         mapping = channel_mapping(config, plant)
         if is_log(path):
-            rows = _mcap_rows(path, plant, mapping, idle)
-        else:
-            file = GrowingCsv(path, inputs, outputs, mapping)
-            expect_units(str(path), (*inputs, *outputs), (*file.input_units, *file.output_units), plant)
-            rows = _csv_rows(file, idle, began)
+            return RowSource(_between(_mcap_rows(path, plant, mapping, idle), config.start, config.stop), lambda: None)
+        file = GrowingCsv(path, inputs, outputs, mapping)
+        expect_units(str(path), (*inputs, *outputs), (*file.input_units, *file.output_units), plant)
     except (ValueError, LogError) as error:
         raise ConfigError([str(error)]) from None
-    return _between(rows, config.start, config.stop)
+    return RowSource(_between(_csv_rows(file, idle), config.start, config.stop), lambda: file.clock_zero)
 
 
 def _between(rows: Iterator[Row | str], start: Any, stop: Any) -> Iterator[Row | str]:
@@ -84,12 +76,10 @@ def _find(name: str, base: Path) -> Path:
         return find_data(f"{name}.partial", base)
 
 
-def _csv_rows(file: GrowingCsv, idle: float, began: Callable[[float], None] | None) -> Iterator[Row | str]:
+def _csv_rows(file: GrowingCsv, idle: float) -> Iterator[Row | str]:
     quiet_since = time.monotonic()
     while time.monotonic() - quiet_since <= idle:
         seconds, commands, readings, problems = file.new()
-        if began is not None and len(seconds) and (zero := file.clock_zero) is not None:
-            began(zero)
         rows = list(zip(seconds.tolist(), commands.tolist(), readings.tolist(), strict=True))
         first = 0
         for count, problem in problems:

@@ -20,7 +20,7 @@ from typing import TypeVar
 
 from fdi_torch.clock import clock_text, show_clock
 from fdi_torch.config.growing_recordings import growing_rows
-from fdi_torch.config.live_source import LiveRows
+from fdi_torch.config.live_source import live_rows
 from fdi_torch.config.loaded_recordings import expect_file, read_recording
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.config.problems import naming_source
@@ -37,7 +37,7 @@ from fdi_torch.jobs.monitor_rows import (
     rows_in,
     rows_until,
 )
-from fdi_torch.live.row_buffer import Row
+from fdi_torch.live.row_buffer import Row, RowSource
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook import RunLog
 from fdi_torch.names import counted
@@ -79,9 +79,8 @@ def run_monitor(
     earlier, origin = _earlier(run, unfinished, kept, resume) if follow else ([], None)
     messages = unfinished.messages([ALARM]) if unfinished is not None else ()
     reported = Counter(event_key(message.payload) for message in messages)
-    zeros: list[float] = []
     try:  # before the log begins, so that a source that cannot be reached leaves none
-        source = _source(run, idle, origin, rows_in(earlier), zeros) if follow else iter(())
+        source = _source(run, idle, origin, rows_in(earlier)) if follow else None
     except BaseException:
         if unfinished is not None:
             os.replace(unfinished.path, partial_path(path))  # for the next attempt to resume
@@ -90,9 +89,9 @@ def run_monitor(
     with RunLog(path, "monitor", **records, listener=callbacks.log, after_interruption=RESUMES) as log:
         monitor = LoggedMonitor(run, log, callbacks, reported)
         try:
-            if whole is None:
-                _follow(monitor, callbacks, source, earlier, zeros, kept)
-            else:
+            if source is not None:
+                _follow(monitor, callbacks, source, earlier, kept)
+            elif whole is not None:
                 show_clock([whole.clock_zero])
                 if run.config.recording.every > 1:  # the inputs' mean until the next kept sample is known only then
                     whole = whole.stretch(0, len(whole) - 1)
@@ -118,21 +117,18 @@ def _earlier(
     return items, origin
 
 
-def _source(
-    run: MonitorRun, idle: float | None, origin: float | None, earlier_rows: Sequence[Row], zeros: list[float]
-) -> Iterator[Row | str]:
-    """The rows of the live source, or else of the growing file, whose time 0 is appended to `zeros`."""
+def _source(run: MonitorRun, idle: float | None, origin: float | None, earlier_rows: Sequence[Row]) -> RowSource:
+    """The rows of the live source, or else of the growing file."""
     if run.config.source is not None:
-        return LiveRows(run.config.source, run.plant, math.inf if idle is None else idle, origin, earlier_rows)
-    return growing_rows(run.config.recording, run.plant, run.base, IDLE if idle is None else idle, zeros.append)
+        return live_rows(run.config.source, run.plant, math.inf if idle is None else idle, origin, earlier_rows)
+    return growing_rows(run.config.recording, run.plant, run.base, IDLE if idle is None else idle)
 
 
 def _follow(
     monitor: LoggedMonitor,
     callbacks: MonitorCallbacks,
-    source: Iterator[Row | str],
+    source: RowSource,
     earlier: Sequence[Row | str],
-    zeros: list[float],
     kept: LearningItems | None,
 ) -> None:
     """Process samples as they come, after waiting for the end of the fault-free part.
@@ -142,9 +138,9 @@ def _follow(
     run = monitor.run
     batches = LiveBatches(resumed_items(earlier, source) if rows_in(earlier) else source)
     callbacks.tell(None, "waiting for samples")
-    received = batches if kept is None else kept.keeping(batches, lambda: getattr(source, "origin", None))
+    received = batches if kept is None else kept.keeping(batches, lambda: source.origin)
     first = _until_fault_free_part_ends(run, callbacks, received)
-    zero = source.origin if isinstance(source, LiveRows) else next(iter(zeros), None)
+    zero = source.origin
     show_clock([zero])
     monitor.learn(fault_free_recording(rows_in(first), run))
     if zero is not None:
