@@ -157,17 +157,16 @@ def read_recording(
     if not isinstance(config, RecordingConfig):
         config = config_of(config)
     plant = chosen_plant(plant)
-    channels, columns = plant.channels(), plant.outputs()
     folder = base or Path.cwd()
     try:
         if config.in_memory is not None:
-            recording = config.in_memory.to(torch.device("cpu")).selected(channels, columns)
+            recording = config.in_memory.to(torch.device("cpu")).selected(plant.channels(), plant.outputs())
         elif is_query(config.file):
             with _as_file(config.file) as path:  # its hash is that of the table
                 write_query(config.file, path, lambda name: find_data(name, folder))
-                recording = replace(_read(config, path, folder, plant, channels, columns), source=config.file)
+                recording = replace(_read(config, path, folder, plant), source=config.file)
         else:
-            recording = _read(config, find_data(config.file, folder), folder, plant, channels, columns)
+            recording = _read(config, find_data(config.file, folder), folder, plant)
         names = (*recording.input_names, *recording.output_names)
         expect_units(recording.source, names, (*recording.input_units, *recording.output_units), plant)
         start = -math.inf if config.start is None else in_seconds(config.start, recording, config)
@@ -223,16 +222,9 @@ def _as_file(name: str) -> Iterator[Path]:
             raise ValueError(str(error).replace(str(path), name)) from None
 
 
-def _read(
-    config: RecordingConfig,
-    path: Path,
-    base: Path,
-    plant: PlantDescription,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-) -> Recording:
+def _read(config: RecordingConfig, path: Path, base: Path, plant: PlantDescription) -> Recording:
     """Read by the file's ending: an MCAP log (also an incomplete one), else CSV or another table."""
-    mapping = channel_mapping(config, plant)
+    mapping, inputs, outputs = channel_mapping(config, plant), plant.channels(), plant.outputs()
     if is_log(path):
         if config.also or config.tags or config.sheet or not config.header:
             raise ValueError(
