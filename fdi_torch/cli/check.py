@@ -35,8 +35,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     guesses = [] if arguments.plant is None else placeholders(find_plant(arguments.plant, Path.cwd()))
     if guesses:
         screen.say(f"{arguments.plant}: these entries are still placeholders; correct each, and delete its !")
-        for place in guesses:
-            screen.say(f"- {place}")
+        screen.points(guesses)
         screen.say()
     _show_plant(plant, screen)
     if not recordings:

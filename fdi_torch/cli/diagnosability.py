@@ -93,8 +93,7 @@ def _show(report: Diagnosability, screen: Screen) -> None:
              enumerate(zip(report.faults, report.apart, strict=True))]  # fmt: skip
     numbers = tuple(str(i + 1) for i in range(len(report.faults)))
     screen.table("sine of the angle between signatures (0: not distinguishable)", ("", "fault", *numbers), apart, 2)
-    for sentence in (*report.groups, *report.remarks):
-        screen.say(f"- {sentence}")
+    screen.points((*report.groups, *report.remarks))
 
 
 def _number(value: float) -> str:

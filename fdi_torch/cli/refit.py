@@ -123,8 +123,7 @@ def _show(result: Refit, before: PlantDescription, screen: Screen) -> None:
     screen.say(f"{counted(result.parameters, 'value')} fitted, including initial levels")
     values = torch.tensor([value for value, _ in result.fitted.values()], dtype=torch.float64)
     ends = parameters_at_bounds(ParameterSpace([constants[name] for name in result.fitted]), values)
-    for remark in [*remarks, *(f"{name} lies at the {end} end of its range" for name, end in ends.items())]:
-        screen.say(f"- {remark}")
+    screen.points([*remarks, *(f"{name} lies at the {end} end of its range" for name, end in ends.items())])
 
 
 def _show_run_specific(result: Refit, screen: Screen) -> None:

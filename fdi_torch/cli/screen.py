@@ -12,7 +12,7 @@ import os
 import sys
 import textwrap
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -79,6 +79,11 @@ class Screen:
             folded = textwrap.wrap(text, self._out.width, subsequent_indent=" " * indent, break_on_hyphens=False)
         for line in folded:
             self._out.print(_shown(line))
+
+    def points(self, sentences: Iterable[str]) -> None:
+        """Print each sentence as a point of a list; not with JSON."""
+        for sentence in sentences:
+            self.say(f"- {sentence}")
 
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> None:
         """Print a table whose first `left` columns are left-aligned; not with JSON.
