@@ -11,7 +11,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
-from pydantic import ValidationError
 
 from fdi_torch.config.channels import (
     channel_mapping,
@@ -22,7 +21,7 @@ from fdi_torch.config.channels import (
     without_column,
 )
 from fdi_torch.config.plant_file import AnyPlant, chosen_plant
-from fdi_torch.config.problems import ConfigError, Source, explain, naming
+from fdi_torch.config.problems import ConfigError, Source, naming, validated
 from fdi_torch.config.recording_config import (
     ColumnConfig,
     FileConfig,
@@ -138,10 +137,7 @@ def listed_recordings(
         expect_kind(data, "run", path, "a recording or a file with the key recordings")
         near = nearest("recordings", [key for key in data if key != "recordings"])
         raise ConfigError([f"{path}: recordings: expected at least one, got none; list files under it{near}"])
-    try:
-        return [RecordingConfig.model_validate(entry) for entry in listed], path.parent
-    except ValidationError as error:
-        raise explain(error, Source(f"{path}: recordings")) from None
+    return [validated(RecordingConfig, entry, Source(f"{path}: recordings")) for entry in listed], path.parent
 
 
 def read_recording(
@@ -202,10 +198,7 @@ def read_frame(frame: Any, plant: AnyPlant, **keys: Any) -> Recording:
     named = named.rename_axis(index=header(frame.index.name)) if timed else named
     with _as_file("data frame") as path:
         named.to_csv(path, index=timed)
-        try:
-            config = RecordingConfig.model_validate({"file": str(path), **keys})
-        except ValidationError as error:
-            raise explain(error, Source("data frame")) from None
+        config = validated(RecordingConfig, {"file": str(path), **keys}, Source("data frame"))
         return replace(read_recording(config, plant), source="data frame", sha256="")
 
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import pydantic
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from fdi_torch.config.plant_in_code import Plant, effect_in_si, effect_parameters, si_value, tolerances_in_si
-from fdi_torch.config.problems import Source, explain, naming
+from fdi_torch.config.problems import Source, naming, validated
 from fdi_torch.config.strict import Acceleration, Amount, Strict, quantity, quantity_of
 from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import expect_kind, find_plant, read_yaml
@@ -161,10 +161,7 @@ def placeholders(path: Path) -> list[str]:
 
 def build_plant(data: dict[str, Any], source: str) -> Plant:
     """The plant in a mapping. Raises ConfigError, naming `source` and the field."""
-    try:
-        config = PlantConfig.model_validate(data)
-    except ValidationError as error:
-        raise explain(error, Source(source)) from None
+    config = validated(PlantConfig, data, Source(source))
     with naming(source):
         plant = _plant(config)
         return replace(plant, units=written_units(data) | _valid_units(config.units, plant))

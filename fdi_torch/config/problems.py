@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from fdi_torch.quantities import NO_COMMAS
+
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class ConfigError(ValueError):
@@ -59,6 +61,16 @@ class UnknownKeyError(ValueError):
     def __init__(self, sentence: str, key: str) -> None:
         super().__init__(sentence)
         self.key = key
+
+
+def validated(
+    model: type[Model], data: Any, source: Source, known: Mapping[str, str] | None = None, within: tuple[str, ...] = ()
+) -> Model:
+    """The model of the data. Raises ConfigError with a sentence per problem; arguments as of `explain`."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise explain(error, source, known, within) from None
 
 
 def explain(

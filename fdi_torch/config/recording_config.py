@@ -9,9 +9,9 @@ from pathlib import PurePath
 from typing import Annotated, Any, Literal
 from zoneinfo import ZoneInfo
 
-from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, ValidationError, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, model_validator
 
-from fdi_torch.config.problems import Source, explain, shown
+from fdi_torch.config.problems import Source, shown, validated
 from fdi_torch.config.strict import Amount, HeldFor, Seconds, Strict, quantity
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.database import expect_no_password, is_query
@@ -187,7 +187,4 @@ class RecordingConfig(FileConfig):
 
 def config_of(entry: Any) -> RecordingConfig:
     """The entry of a recording from its file name alone, or from its keys. Raises ConfigError naming the key."""
-    try:
-        return RecordingConfig.model_validate(str(entry) if isinstance(entry, PurePath) else entry)
-    except ValidationError as error:
-        raise explain(error, Source("recording")) from None
+    return validated(RecordingConfig, str(entry) if isinstance(entry, PurePath) else entry, Source("recording"))

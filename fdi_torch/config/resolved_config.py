@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
 from fdi_torch.config.key_reference import meanings
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
-from fdi_torch.config.problems import ConfigError, Source, explain, naming_source, shown
+from fdi_torch.config.problems import ConfigError, Source, naming_source, shown, validated
 from fdi_torch.config.strict import Config, Strict, scaled_to_plant
 from fdi_torch.config.yaml_files import expect_kind, find_file, find_plant, read_extended, with_overrides, write_yaml
 from fdi_torch.effects import units_for_display
@@ -93,10 +93,7 @@ def resolve(
     From now on quantities are displayed in the plant's units. base: folder of relative paths. Raises ConfigError with
     one sentence per problem.
     """
-    try:
-        config = model.model_validate(dict(data))
-    except ValidationError as error:
-        raise explain(error, source, meanings(model)) from None
+    config = validated(model, dict(data), source, meanings(model))
     plant = plant_of(data.get("plant", model.model_fields["plant"].default), base, source)
     config = scaled_to_plant(config, time_scale(plant))
     display_in(units_for_display(plant))

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from fdi_torch.capacity import expect_room
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
 from fdi_torch.config.key_reference import meanings
-from fdi_torch.config.problems import ConfigError, Source, explain
+from fdi_torch.config.problems import ConfigError, Source, validated
 from fdi_torch.config.resolved_config import values_in
 from fdi_torch.config.run_file import Run, RunConfig, build_run
 from fdi_torch.config.simulation import planned_recording
@@ -94,10 +94,8 @@ def build_study(data: Mapping[str, Any], base: Path, source: Source) -> Study:
         raise ConfigError([f"{source}: expected a block study, got none; fdi train estimates a single run"])
     block = data["study"]
     run = build_run({key: value for key, value in data.items() if key != "study"}, base, source)
-    try:
-        config = scaled_to_plant(StudyConfig.model_validate(block), time_scale(run.plant))
-    except ValidationError as error:
-        raise explain(error, source, meanings(StudyFile), within=("study",)) from None
+    config = validated(StudyConfig, block, source, meanings(StudyFile), within=("study",))
+    config = scaled_to_plant(config, time_scale(run.plant))
     text = run.text + write_yaml({"study": block})
     return Study(config, run, _plan(config, run), text)
 
