@@ -14,7 +14,7 @@ from torch import Tensor
 
 from fdi_torch.names import counted
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.recording import Recording
+from fdi_torch.recording import Recording, runs_of
 from fdi_torch.recordings.input_sampling import undersampled_inputs
 from fdi_torch.recordings.plant_limits import ChannelFinding, plant_findings
 from fdi_torch.recordings.repeated_readings import resolution
@@ -166,7 +166,7 @@ def _constant_inputs(recording: Recording) -> Iterator[ChannelFinding]:
 def _missing_inputs(recording: Recording) -> Iterator[ChannelFinding]:
     for name, values in zip(recording.input_names, recording.inputs.T, strict=True):
         unknown = torch.isnan(values)
-        runs = _runs(unknown)
+        runs = runs_of(unknown)
         if len(runs) > MANY_RUNS:
             text = (
                 f"unknown at {int(unknown.sum())} of {len(values)} samples, in {len(runs)} stretches: the recording is "
@@ -174,9 +174,9 @@ def _missing_inputs(recording: Recording) -> Iterator[ChannelFinding]:
             )
             yield ChannelFinding("unknown", name, text, {"count": int(unknown.sum()), "stretches": len(runs)})
             continue
-        for first, last in runs:
-            start, stop = float(recording.time[first]), float(recording.time[last])
-            samples = counted(last - first + 1, "sample")
+        for first, after in runs:
+            start, stop = float(recording.time[first]), float(recording.time[after - 1])
+            samples = counted(after - first, "sample")
             text = f"unknown from {start:g} s to {stop:g} s ({samples}): the recording is cut there"
             yield ChannelFinding("unknown", name, text, {"start": start, "stop": stop})
 
@@ -198,10 +198,3 @@ def _missing_readings(recording: Recording) -> Iterator[ChannelFinding]:
         if missing:
             text = f"{missing} of {len(values)} readings are missing: they do not count"
             yield ChannelFinding("missing", name, text, {"count": missing})
-
-
-def _runs(flags: Tensor) -> list[tuple[int, int]]:
-    """First and last index of each run of True."""
-    padded = flags.to(torch.int8)
-    edges = torch.diff(padded, prepend=padded.new_zeros(1), append=padded.new_zeros(1)).nonzero().flatten().tolist()
-    return [(first, after - 1) for first, after in zip(edges[::2], edges[1::2], strict=True)]
