@@ -98,13 +98,8 @@ def _show_plant(plant: PlantDescription, screen: Screen) -> None:
     for tank in plant.tanks:
         sizes = (per_area * tank.area, per_height * tank.height, 1e3 * tank.area * tank.height)
         time = emptying_time(plant, tank)
-        rows.append(
-            [
-                tank.name,
-                *(significant(size, 4) for size in sizes),
-                significant(time, 3) if math.isfinite(time) else "never",
-            ]
-        )
+        empties = significant(time, 3) if math.isfinite(time) else "never"
+        rows.append([tank.name, *(significant(size, 4) for size in sizes), empties])
     header = ("tank", f"area, {area}", f"height, {height}", "volume, l", "empties from full in, s")
     screen.table("", header, rows)
     if closed := _without_outlet(plant):

@@ -32,7 +32,7 @@ from fdi_torch.monitor.samples import Samples, samples_of_recording
 from fdi_torch.monitor.window_monitor import WindowMonitor
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.progress import Tell
+from fdi_torch.progress import Tell, silent
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import data_warnings
 
@@ -46,9 +46,9 @@ class MonitorCallbacks:
     log: receives every log message.
     """
 
-    tell: Tell
-    event: Callable[[Event], None]
-    ready: Callable[[PreparedMonitor], None]
+    tell: Tell = silent
+    event: Callable[[Event], None] = lambda event: None
+    ready: Callable[[PreparedMonitor], None] = lambda prepared: None
     log: Listener | None = None
 
 

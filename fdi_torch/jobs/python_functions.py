@@ -196,7 +196,7 @@ def monitor(
         raise TypeError(f"monitor: expected a recording beside {', '.join(keys)}, got none; name it")
     run = _resolved(run, MonitorRun, load_monitor, build_monitor, "monitor")
     events: list[Event] = []
-    summary = run_monitor(run, MonitorCallbacks(rounded(tell), events.append, lambda prepared: None))
+    summary = run_monitor(run, MonitorCallbacks(rounded(tell), events.append))
     return MonitorResult(tuple(events), summary.lasted, summary.spent, summary.log)
 
 

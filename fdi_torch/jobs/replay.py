@@ -84,12 +84,11 @@ def replay_monitor(log: LoggedRun, path: Path, overrides: Sequence[str], tell: T
     """Repeat a monitor run along the samples in the log."""
     _expect_no_data(overrides, ("recording",))
     run = build_monitor(*_logged_values(log, overrides))
-    callbacks = MonitorCallbacks(tell, lambda event: None, lambda prepared: None)
     items = logged_items(log, run)
     about = log.about("data")
     data = [{"path": about["0.path"], "sha256": about.get("0.sha256", "")}] if "0.path" in about else []
     with RunLog(path, "monitor", **run.log_records(data), parent_run_id=parent) as again:
-        monitor = LoggedMonitor(run, again, callbacks)
+        monitor = LoggedMonitor(run, again, MonitorCallbacks(tell))
         monitor.learn(fault_free_recording(rows_in(items), run))
         monitor.process_items(items)
         monitor.close()
