@@ -20,8 +20,9 @@ from fdi_torch.recordings.database import is_query
 
 FALSE_ALARMS_EVERY, LEARNING = 20000.0, 1000.0
 """Mean time between false alarms, and length of a fault-free part of unknown sampling; s, for three_tank."""
-FEWEST, MARGIN = 200, 1.1
-"""Samples of a fault-free part at least, and its length as a multiple of what the monitor asks for after these."""
+FEWEST, MARGIN = 200, 1.5
+"""Samples of a fault-free part at least, and its length as a multiple of what the monitor asks for after too few: from
+another part it learns another noise, and asks for up to a third more."""
 
 
 def template(kind: str, plant: PlantDescription, plant_file: str, name: str, recording: str | None = None) -> str:
@@ -134,8 +135,9 @@ def _learning_time(
     part = fault_free_part(recording, first, first + length)
     monitor = prepare_monitor(plant, part, time_between_false_alarms=false_alarms_every).monitor
     learnt, asked = learning_times(monitor.noise, monitor.detector)
-    needed = rounded_up(MARGIN * asked + length - learnt)
-    return min(max(length, needed), longest), needed
+    needed = asked + length - learnt
+    wanted = rounded_up(MARGIN * needed) if asked > learnt else length
+    return min(wanted, longest), rounded_up(needed)
 
 
 def _inputs(plant: PlantDescription, sampling: float) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from dataclasses import fields
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BeforeValidator, TypeAdapter, ValidationError
 
@@ -13,10 +13,12 @@ from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.problems import ConfigError, Source, explain
 from fdi_torch.config.strict import with_known_keys
 from fdi_torch.config.yaml_files import parse_yaml, shipped_plants
-from fdi_torch.gap.problem import Settings
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
+
+if TYPE_CHECKING:
+    from fdi_torch.gap.problem import Settings
 
 
 def logged_mapping(log: LoggedRun) -> dict[str, Any]:
@@ -42,16 +44,15 @@ def logged_plant(log: LoggedRun) -> PlantDescription:
     return build_plant({"name": "plant", **plant}, f"{log.path}: config.yaml")
 
 
-_SETTINGS = tuple(field.name for field in fields(Settings))
-
-
 def logged_gap_settings(log: LoggedRun, overrides: Iterable[str] = ()) -> Settings:
     """The logged settings of a gap diagnosis, of which older logs lack some, with overrides KEY=VALUE.
 
     Raises ConfigError for an unknown key or a wrong value, and if the log has no settings.
     """
-    logged = log.about("config")
-    values = {key: json.loads(text) for key in _SETTINGS if (text := logged.get(f"settings.{key}")) is not None}
+    from fdi_torch.gap.problem import Settings  # loads torch, for which a list of logs does not wait
+
+    logged, keys = log.about("config"), [field.name for field in fields(Settings)]
+    values = {key: json.loads(text) for key in keys if (text := logged.get(f"settings.{key}")) is not None}
     if not values:
         raise ConfigError([f"{log.path}: expected the settings of a gap diagnosis, got none; run fdi gap again"])
     for override in overrides:
@@ -59,10 +60,8 @@ def logged_gap_settings(log: LoggedRun, overrides: Iterable[str] = ()) -> Settin
         listed = key in ("library", "leave_out")
         values[key] = [name for name in text.split(",") if name] if listed else None if text == "null" else text
     values["library"] = values["library"] or None
+    known = BeforeValidator(lambda given: with_known_keys(given, keys))
     try:
-        return _CHECKED.validate_python(values)
+        return TypeAdapter(Annotated[Settings, known]).validate_python(values)
     except ValidationError as error:
         raise explain(error, Source("--set")) from None
-
-
-_CHECKED = TypeAdapter(Annotated[Settings, BeforeValidator(lambda values: with_known_keys(values, _SETTINGS))])
