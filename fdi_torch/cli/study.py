@@ -15,7 +15,7 @@ from fdi_torch.config.study_file import load_study
 from fdi_torch.jobs.study import StudyResult, run_study
 from fdi_torch.names import counted
 from fdi_torch.quantities import significant
-from fdi_torch.study.study_plan import ESTIMATORS
+from fdi_torch.study.estimators import ESTIMATORS
 from fdi_torch.study.summary import Isolation, Ratio, Score, Summary
 from fdi_torch.tables import in_display_unit
 

@@ -27,17 +27,8 @@ from fdi_torch.estimate.levenberg_marquardt import RefineSettings
 from fdi_torch.names import unknown
 from fdi_torch.plant.operating_range import bounded_by_recording
 from fdi_torch.plant.scales import time_scale
-from fdi_torch.study.study_plan import (
-    ESTIMATORS,
-    Estimator,
-    Method,
-    Plan,
-    Setting,
-    fault_modes,
-    fixed_faults,
-    mode_faults,
-    uniform_faults,
-)
+from fdi_torch.study.estimators import ESTIMATORS, Estimator
+from fdi_torch.study.study_plan import Method, Plan, Setting, fault_modes, fixed_faults, mode_faults, uniform_faults
 from fdi_torch.untrusted_input import MOST_SETTINGS, MOST_TRIALS
 
 

@@ -6,7 +6,7 @@ process.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations, groupby
 from typing import Literal
@@ -21,16 +21,8 @@ from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings
 from fdi_torch.estimate.objectives import Objective
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.study.estimators import Estimator
 
-Estimator = Literal["free", "boxed", "correlation", "linearised", "search"]
-ESTIMATORS: Mapping[Estimator, str] = {
-    "free": "maximum likelihood without bounds on the parameters",
-    "boxed": "maximum likelihood within the bounds",
-    "correlation": "maximum correlation of readings and model, the objective of the 2020 paper",
-    "linearised": "the efficient estimator, which knows the truth",
-    "search": "the best of the global search, not refined",
-}
-"""The estimators that a study compares, with their meanings."""
 SnrDefinition = Literal["variance", "power"]
 
 # Independent random streams of a study.

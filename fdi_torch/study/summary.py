@@ -15,8 +15,9 @@ from torch import Tensor
 
 from fdi_torch.estimate.proportion import wilson
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.study.estimators import ESTIMATORS
 from fdi_torch.study.monte_carlo import Trial, is_converged
-from fdi_torch.study.study_plan import ESTIMATORS, Plan, Setting
+from fdi_torch.study.study_plan import Plan, Setting
 
 # Quantile of 95 % intervals.
 _REACH = NormalDist().inv_cdf(0.975)

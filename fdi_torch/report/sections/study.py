@@ -20,7 +20,7 @@ from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import axis, number, percent, shown_unit
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.style import MARK, MODEL, SOFT, logarithmic, panel
-from fdi_torch.study.study_plan import ESTIMATORS, Estimator
+from fdi_torch.study.estimators import ESTIMATORS, Estimator
 
 TRIAL, SUMMARY = "/study/trial", "/study/summary"
 MOST_PANELS, MOST_GROUPS, MOST_ROWS = 9, 40, 30
