@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import signal
 import threading
-from types import FrameType, TracebackType
 
 
 class Terminated(SystemExit):
@@ -32,9 +31,7 @@ class _Undisturbed:
         if threading.get_ident() == self._main:
             self._depth += 1
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if threading.get_ident() == self._main:
             self._depth -= 1
             if self._postponed is not None and not self._depth:
@@ -60,11 +57,9 @@ class SteadyLock:
         UNDISTURBED.__enter__()
         self._lock.acquire()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._lock.release()
-        UNDISTURBED.__exit__(kind, error, trace)
+        UNDISTURBED.__exit__(*error)
 
 
 def catch_signals() -> None:
@@ -74,14 +69,6 @@ def catch_signals() -> None:
     """
     if threading.current_thread() is not threading.main_thread():
         return
-    signal.signal(signal.SIGTERM, _terminate)
+    signal.signal(signal.SIGTERM, lambda *_: UNDISTURBED.raise_or_postpone(Terminated()))
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _interrupt)
-
-
-def _terminate(number: int, frame: FrameType | None) -> None:
-    UNDISTURBED.raise_or_postpone(Terminated())
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    UNDISTURBED.raise_or_postpone(KeyboardInterrupt())
+        signal.signal(signal.SIGINT, lambda *_: UNDISTURBED.raise_or_postpone(KeyboardInterrupt()))

@@ -114,11 +114,6 @@ def display_in(units: Mapping[str, str]) -> None:
     _DISPLAYED.set(dict(units))
 
 
-def display_also_in(units: Mapping[str, str]) -> None:
-    """Add units for display to those of this context."""
-    _DISPLAYED.set({**_DISPLAYED.get(), **units})
-
-
 @contextmanager
 def displayed_in(units: Mapping[str, str]) -> Iterator[None]:
     """Context within which quantities are displayed in these units, as `display_in` sets them."""

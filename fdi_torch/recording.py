@@ -284,9 +284,14 @@ class Recording(Shown):
 
     def known_segments(self) -> list[Recording]:
         """The longest segments in which all inputs are known."""
-        known = torch.isfinite(self.inputs).all(dim=1).to(torch.int8)
-        edges = torch.diff(known, prepend=known.new_zeros(1), append=known.new_zeros(1)).nonzero().flatten().tolist()
-        return [self.stretch(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+        return [self.stretch(*run) for run in runs_of(torch.isfinite(self.inputs).all(dim=1))]
+
+
+def runs_of(flags: torch.Tensor) -> list[tuple[int, int]]:
+    """The first index of each run of True, and the first one after it."""
+    padded = flags.to(torch.int8)
+    edges = torch.diff(padded, prepend=padded.new_zeros(1), append=padded.new_zeros(1)).nonzero().flatten().tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _range(values: torch.Tensor) -> tuple[float, float]:

@@ -1,11 +1,11 @@
-"""Units in text: 'cm^2', 'l/min/mA', 'cm3_s', 'm³·h⁻¹'. The only parser of units, and the only file that imports pint.
+"""Units in text: 'cm^2', 'l/min/mA', 'cm3_s', 'm³·h⁻¹'. The only file that parses units and imports pint.
 
     unit     = factor { ('*' | '·' | '/' | ' ') factor }
     factor   = '1' | name [power] | '(' unit ')' [power]
     power    = ('^' | '**') integer | superscript digits,     |integer| <= 9
     quantity = number unit
 
-Untrusted text is never evaluated: text outside this grammar, or longer than `MOST_CHARACTERS`, is not a unit.
+Text outside this grammar, or longer than `MOST_CHARACTERS`, never reaches pint: it is not a unit.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 import re
 from functools import lru_cache
+from tokenize import TokenError
 from typing import Any
 
 import pint
@@ -26,12 +27,12 @@ _registry.define("percent = 0.01 = pct")
 for _short, _long in {"gpm": "gallon / minute", "gph": "gallon / hour", "lpm": "l / minute", "lph": "l / hour"}.items():
     _registry.define(f"{_short} = {_long}")
 
-_SIGNS = {"%": "percent", "‰": "permille"}
 _HEADER_WORDS = {"pct": "%", "percent": "%", "lps": "l/s", "lpm": "l/min", "lph": "l/h", "gpm": "gal/min"}
-_SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")
-_NAME = r"[A-Za-zµμΩΩ°][A-Za-zµμ0-9_]*|[%‰]"
-_POWER = r"(?:\^|\*\*)\s*(?P<power>[+-]?[0-9])(?![0-9])|(?P<super>⁻?[¹²³⁴⁵⁶⁷⁸⁹])"
-_TOKEN = re.compile(rf"\s*(?:(?P<name>{_NAME})|(?P<one>1)(?![\d.])|{_POWER}|(?P<sign>[*·/()]))", re.UNICODE)
+_NAME = r"[A-Za-zµμΩΩ°][A-Za-zµμ0-9_]*+|[%‰]"
+_POWER = r"\s*(?:(?:\^|\*\*)\s*[+-]?[0-9](?![\w.])|⁻?[¹²³⁴⁵⁶⁷⁸⁹])"
+_FACTOR = rf"[\s(]*+(?:{_NAME}|1(?![\d.]))(?:{_POWER})?+(?:\s*\)(?:{_POWER})?+)*+\s*+"
+_UNIT = re.compile(rf"{_FACTOR}(?:[*·/]?{_FACTOR})*+", re.UNICODE)
+_FOR_PINT = str.maketrans({"·": "*", "%": " percent", "‰": " permille"})
 _NUMBER = re.compile(r"\s*([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)(?![\d.])\s*(.*)", re.DOTALL | re.ASCII)
 _VOLUME_A_TIME = re.compile(r"^((?:[cdm]?m|ft|in)3|m?[lL]|gal)_(s|min|h)$")  # headers of loggers without '/'
 _CUBE = re.compile(r"(?<=[a-z])([23])(?![0-9])")
@@ -98,62 +99,10 @@ def _parsed(text: str) -> Any:
     """The unit as an object of pint. Raises UnitError."""
     if len(text) > MOST_CHARACTERS:
         raise UnitError(f"too long for a unit: {text[:MOST_CHARACTERS]}...")
-    return _Parser(_CUBE.sub(r"^\1", _VOLUME_A_TIME.sub(r"\1/\2", text.strip()))).whole()
-
-
-class _Parser:
-    """Recursive-descent parser of a unit text; the text's length bounds its depth."""
-
-    def __init__(self, text: str) -> None:
-        self._text = text
-        self._tokens: list[tuple[str, str]] = []
-        place = 0
-        while place < len(text):
-            token = _TOKEN.match(text, place)
-            if token is None or token.end() == place:
-                raise self._wrong()
-            self._tokens.append((str(token.lastgroup), token[str(token.lastgroup)]))
-            place = token.end()
-
-    def whole(self) -> Any:
-        unit = self._product()
-        if self._tokens:
-            raise self._wrong()
-        return unit
-
-    def _product(self) -> Any:
-        unit = self._factor()
-        while self._tokens and self._tokens[0] != ("sign", ")"):
-            divided = self._tokens[0] == ("sign", "/")
-            if self._tokens[0][0] == "sign" and self._tokens[0][1] in "*·/":
-                self._tokens.pop(0)
-            unit = unit / self._factor() if divided else unit * self._factor()
-        return unit
-
-    def _factor(self) -> Any:
-        kind, text = self._tokens.pop(0) if self._tokens else ("end", "")
-        if kind == "one":
-            return _registry.Unit("")
-        if kind == "name":
-            unit = _known(text)
-        elif (kind, text) == ("sign", "("):
-            unit = self._product()
-            if not self._tokens or self._tokens.pop(0) != ("sign", ")"):
-                raise self._wrong()
-        else:
-            raise self._wrong()
-        if self._tokens and self._tokens[0][0] in ("power", "super"):
-            unit = unit ** int(self._tokens.pop(0)[1].translate(_SUPERSCRIPTS))
-        return unit
-
-    def _wrong(self) -> UnitError:
-        return UnitError(f"no unit: {self._text}")
-
-
-def _known(name: str) -> Any:
-    """The unit with that name, including a prefix. Raises UnitError for an unknown name."""
-    name = _SIGNS.get(name, name)
+    text = _CUBE.sub(r"^\1", _VOLUME_A_TIME.sub(r"\1/\2", text.strip()))
+    if not _UNIT.fullmatch(text) or text.count("(") != text.count(")"):
+        raise UnitError(f"no unit: {text}")
     try:
-        return _registry.Unit(_registry.UnitsContainer({_registry.get_name(name): 1}))
-    except (pint.PintError, KeyError, ValueError):
-        raise UnitError(f"no unit: {name}") from None
+        return _registry.parse_units(text.translate(_FOR_PINT), as_delta=False)
+    except (pint.PintError, KeyError, ValueError, TypeError, SyntaxError, TokenError):
+        raise UnitError(f"no unit: {text}") from None

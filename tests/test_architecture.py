@@ -26,6 +26,7 @@ LAYERS = (
         "names",
         "untrusted_input",
         "parameters",
+        "progress",
         "quantities",
         "recording",
         "sample_noise",
@@ -41,7 +42,7 @@ LAYERS = (
     {"config"},
     {"jobs"},
     {"view"},
-    {"cli", "train", "__main__", "__init__"},
+    {"cli", "__main__", "__init__"},
 )
 RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
 
@@ -49,7 +50,7 @@ RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
 DOORS = {
     "pint": ("units.py",),
     "torchdiffeq": ("simulate/reference_engine.py",),
-    "pyarrow": ("recordings/parquet.py", "recordings/feather.py"),
+    "pyarrow": ("recordings/arrow.py",),
     "openpyxl": ("recordings/excel.py",),
     "h5py": ("recordings/hdf5.py",),
     "influxdb_client_3": ("recordings/database.py",),

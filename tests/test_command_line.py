@@ -125,7 +125,7 @@ def test_check_shows_channels_and_findings(rig: str, capsys: pytest.CaptureFixtu
         ),
         ("simulate.faults.T1.leak=30", "simulate.faults.T1.leak: expected a size from 0 to 1, got 30"),
         ("simulate.duration=600", "simulate.duration: expected a quantity in s, got the bare number 600"),
-        ("foo=1", "expected a known key (plant, recordings, "),
+        ("foo=1", "expected a known key (plant, output, seed, recordings, "),
         ("estimate.search={population: 2}", "estimate.search: expected a population of at least 4"),
         ("simulate.noise.std.hh1=1 mm", "simulate.noise.std.hh1: expected an output of the plant (h1, h2, h3)"),
         ("estimate.search.populaton=40", "estimate.search: expected a known key (strategy, population"),
@@ -389,7 +389,7 @@ def test_progress_is_plain_lines_on_standard_error_when_nobody_watches(capsys: p
 def test_quiet_shows_no_progress_but_complaints(capsys: pytest.CaptureFixture[str]) -> None:
     screen = Screen(quiet=True)
     with screen.progress("searching") as advance:
-        advance(1.0)
+        advance(1.0, "done")
     screen.note("half way")
     screen.complain("stuck")
     assert capsys.readouterr().err == "stuck\n"

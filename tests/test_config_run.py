@@ -347,7 +347,7 @@ def test_shipped_runs_on_real_data_read_their_recordings(real_data: Path, monkey
     ("text", "sentence"),
     [
         ("parameters: [T1.leak]", "got 'parameters'; there is estimate.parameters"),
-        ("estimate: {seed: 3}", "got 'seed'.*; there is simulate.seed and seed"),
+        ("estimate: {seed: 3}", "got 'seed'.*; there is seed and simulate.seed"),
         ("recordings: [{file:run.csv}]", "got 'file:run.csv'.*; separate key and value by a colon and a space"),
         ("estimate: {step: 0,5 s}", "got '5 s'; a comma ends a value: write 10.5 for decimals, and 10000 "),
         ("simulate: {inputs: {Q1: 1,5 l/min}}", "inputs.5 l/min: .* got nothing; a comma ends a value: write 10.5"),

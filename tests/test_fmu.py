@@ -238,8 +238,8 @@ def test_the_command_tells_the_variables(tmp_path: Path, capsys: pytest.CaptureF
     assert leak in shown["variables"]
     assert cli.main(["export", "--plant", "three_tank", "--fmu", str(file), "--effect", "T1.leak"]) == cli.DONE
     told = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert told[-len(shown["variables"]) - 1] == ["variable", "causality", "unit", "start"]
-    assert ["T1.leak.size", "parameter", "1", "0"] in told and ["h1", "output", "m"] in told
+    assert told[-len(shown["variables"]) - 1] == ["name", "causality", "variability", "unit", "start"]
+    assert ["T1.leak.size", "parameter", "tunable", "1", "0"] in told
     assert [row[0] for row in told[-len(shown["variables"]) :]] == [each["name"] for each in shown["variables"]]
     assert cli.main(["export", "--plant", "three_tank", "--fmu", str(file), "--effect", "leak"]) == cli.MISUSE
     assert "such as T1.leak" in capsys.readouterr().err

@@ -12,14 +12,13 @@ import pytest
 import torch
 
 from fdi_torch import cli
-from fdi_torch.config.logged_config import logged_plant
+from fdi_torch.config.logged_config import logged_gap_settings, logged_plant
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.gap.answer import Amount, Answer, Cause, adopted
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.stage_progress import StageProgress
 from fdi_torch.jobs.gap import run_gap
-from fdi_torch.jobs.replay import settings_of
 from fdi_torch.logbook import own_signals, read_run, series
 from fdi_torch.plant.constants import leak_pipe, nominal_capacity
 from fdi_torch.recordings.csv_writing import write_csv
@@ -115,13 +114,13 @@ def test_a_key_that_a_gap_diagnosis_lacks_is_refused(
 
 def test_every_setting_of_a_diagnosis_can_be_overridden(logged: Path) -> None:
     run = read_run(logged)
-    assert settings_of(run) == Settings(LIBRARY)
+    assert logged_gap_settings(run) == Settings(LIBRARY)
     words = ("library=leak@T1,pump_lag", "leave_out=pump_gain", "step=0.5", "most=2", "named_only=true")
-    assert settings_of(run, words) == Settings(("leak@T1", "pump_lag"), ("pump_gain",), 0.5, 2, True)
-    assert settings_of(run, ["library=", "step=null"]) == Settings(None)
+    assert logged_gap_settings(run, words) == Settings(("leak@T1", "pump_lag"), ("pump_gain",), 0.5, 2, True)
+    assert logged_gap_settings(run, ["library=", "step=null"]) == Settings(None)
     for wrong in ("step=often", "step=-1", "most=1.5", "most=", "named_only=maybe"):
         with pytest.raises(ValueError, match=f"--set: {wrong.partition('=')[0]}: expected"):
-            settings_of(run, [wrong])
+            logged_gap_settings(run, [wrong])
 
 
 def test_the_command_prints_the_verdict_and_writes_all_files(

@@ -453,7 +453,7 @@ def test_the_traceback_of_a_mistake_shows_its_message_alone(here: Path, what: st
 def test_one_recording_and_one_effect_need_no_list(tmp_path: Path) -> None:
     blank, estimate = simulated(), {"parameters": ["A.leak"]}
     run = build_run({"plant": RIG, "recordings": blank, "estimate": estimate}, tmp_path, Source("train"))
-    assert [recording is blank for recording in run.given.values()] == [True]
+    assert [entry.in_memory is blank for entry in run.config.recordings] == [True]
     found = fdi_torch.gap(RIG, blank, library="leak", out=tmp_path)
     assert found.answer.verdict
 

@@ -102,17 +102,17 @@ def test_a_recording_through_a_server_gives_the_events_of_the_file(
 
 
 def test_without_a_clock_the_time_of_polling_counts(tmp_path: Path, plc: Plc) -> None:
-    from fdi_torch.config.live_source import LiveRows
+    from fdi_torch.config.live_source import live_rows
     from fdi_torch.config.monitor_file import load_monitor
 
     run = load_monitor(config(tmp_path, recording=None, source=source(plc.port, clock=None, period="0.1 s")))
     assert run.config.source is not None
-    rows = LiveRows(run.config.source, run.plant)
+    rows = live_rows(run.config.source, run.plant)
     first = [row for row in (next(rows) for _ in range(4)) if not isinstance(row, str)]
     assert [t for t, _, _ in first] == pytest.approx([0.0, 0.1, 0.2, 0.3], abs=1e-5)
     assert rows.origin == pytest.approx(time.time(), abs=10.0)
     assert first[0][2] == pytest.approx([0.01 * MESSAGES[0][name] for name in ("h1", "h2", "h3")])
-    rows._connection.close()
+    rows._rows.close()
 
 
 @pytest.mark.parametrize(

@@ -222,7 +222,7 @@ def logged_events_as_told(log: Path) -> list[dict[str, object]]:
 
 
 def test_one_topic_per_value_without_a_clock_gives_a_row_per_period(tmp_path: Path, running: Broker) -> None:
-    from fdi_torch.config.live_source import LiveRows
+    from fdi_torch.config.live_source import live_rows
     from fdi_torch.config.monitor_file import load_monitor
 
     tags = {name: {"tag": name, "unit": "cm^3/s", "factor": 2.0, "offset": 1.0} for name in ("Q1", "Q2")}
@@ -230,7 +230,7 @@ def test_one_topic_per_value_without_a_clock_gives_a_row_per_period(tmp_path: Pa
     path = live_config(tmp_path, running.port, tags=tags, clock=None, period="0.1 s", reorder="0.3 s")
     run = load_monitor(path)
     assert run.config.source is not None
-    rows = LiveRows(run.config.source, run.plant, idle=1.0)
+    rows = live_rows(run.config.source, run.plant, idle=1.0)
     rig = Rig(running.port)
     for topic, payload in {"Q1": 10, "Q2": 20, "h1/level": 30, "h2/level": 31.5, "h3/level": None}.items():
         rig.client.publish(f"rig/{topic}", json.dumps(payload), qos=1)

@@ -191,13 +191,13 @@ def test_a_server_that_is_stopped_and_started_again_loses_no_event(
 
 
 def test_a_bad_status_is_a_missing_reading(tmp_path: Path, plc: Plc) -> None:
-    from fdi_torch.config.live_source import LiveRows
+    from fdi_torch.config.live_source import live_rows
     from fdi_torch.config.monitor_file import load_monitor
 
     run = load_monitor(config(tmp_path, recording=None, source=source(plc.port)))
     assert run.config.source is not None
     plc.write(MESSAGES[0])
-    rows = LiveRows(run.config.source, run.plant, idle=3.0)
+    rows = live_rows(run.config.source, run.plant, idle=3.0)
     plc.write(MESSAGES[1], bad=("h2",))
     got = [row for row in rows if not isinstance(row, str)]
     assert [t for t, _, _ in got] == [0.0, 1.0]
@@ -244,7 +244,7 @@ def test_ctrl_c_ends_the_command(tmp_path: Path, plc: Plc) -> None:
 
 def test_a_level_that_has_not_changed_for_hours_does_not_set_time_zero(tmp_path: Path, plc: Plc) -> None:
     """The first value of a node has the time of its last change."""
-    from fdi_torch.config.live_source import LiveRows
+    from fdi_torch.config.live_source import live_rows
     from fdi_torch.config.monitor_file import load_monitor
 
     run = load_monitor(config(tmp_path, recording=None, source=source(plc.port)))
@@ -252,7 +252,7 @@ def test_a_level_that_has_not_changed_for_hours_does_not_set_time_zero(tmp_path:
     moving = tuple(name for name in NAMES if name != "h1")
     plc.write(MESSAGES[0] | {"t": -10800.0})
     plc.write(MESSAGES[0], only=moving)
-    rows = LiveRows(run.config.source, run.plant, idle=3.0)
+    rows = live_rows(run.config.source, run.plant, idle=3.0)
     plc.write(MESSAGES[1], only=moving)
     got = [row for row in rows if not isinstance(row, str)]
     assert [t for t, _, _ in got] == [0.0, 1.0] and rows.origin == START.timestamp()

@@ -19,7 +19,6 @@ import pytest
 import yaml
 
 from fdi_torch.cli import INTERRUPTED, main
-from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
@@ -28,6 +27,7 @@ from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import LARGEST_BATCH, DelayWatch, LiveBatches
 from fdi_torch.jobs.monitor_rows import resumed_items, rows_until
 from fdi_torch.jobs.replay import repeat_run
+from fdi_torch.live.row_buffer import Row
 from fdi_torch.logbook import RunLog, content_hash, follow, read_run, series
 from tests.test_monitor import recorded, step_to
 

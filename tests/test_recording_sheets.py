@@ -204,7 +204,7 @@ def test_a_last_line_that_is_cut_off_is_left_out_with_a_word(plant: PlantDescrip
     [
         ({"h": {"held": "3 s"}}, r"run.csv: columns.h.held: expected this key of an input only; leave it out"),
         ({"Q": {"zone": "Europe/Berlin"}}, r"columns.Q.zone: expected this key of t only"),
-        ({"t": {"held": "3 s"}}, r"columns.t.held: expected this key of a channel only"),
+        ({"t": {"held": "3 s"}}, r"columns.t.held: expected this key of an input only"),
         ({"V": {"words": {"OPEN": "100 %"}}}, r"columns.V.words.OPEN: expected a number in the unit of the column"),
         ({"h": {"quality": "h.Q"}}, r"expected a column 'h.Q', got t_s, Q_l_min, V_pct, h_mm"),
     ],

@@ -21,8 +21,7 @@ from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.recording import Recording
-from fdi_torch.recordings import parquet as parquet_reader
-from fdi_torch.recordings import table_files
+from fdi_torch.recordings import arrow, table_files
 from fdi_torch.recordings.csv_files import read_csv
 from fdi_torch.recordings.source import ChannelSource
 
@@ -362,7 +361,7 @@ def test_bytes_and_lists_in_parquet_are_not_unpacked(tmp_path: Path, monkeypatch
             yield batch
 
     monkeypatch.setattr(parquet.ParquetFile, "iter_batches", spied)
-    rows = list(parquet_reader.rows(tmp_path / "mixed.parquet", None))
+    rows = list(arrow.rows(tmp_path / "mixed.parquet", None))
     assert rows[0] == list(columns)
     assert rows[1:] == [
         (0.0, "(binary)", "(list<element: double>)", 1.0),

@@ -18,10 +18,20 @@ from fdi_torch.logbook import read_run
 from fdi_torch.quantities import displayed_in
 from fdi_torch.report.material import gather
 from fdi_torch.report.predictions import progress_of
-from fdi_torch.study.mode_isolation import count_modes
 from fdi_torch.study.monte_carlo import Trial, limits, make_trials, run_block, run_blocks
 from fdi_torch.study.study_plan import Block, Plan, Setting, fault_modes, fixed_faults, mode_faults, uniform_faults
-from fdi_torch.study.summary import Ratio, Score, Summary, column, covered, rms_ratio, rms_with_error, share, summarise
+from fdi_torch.study.summary import (
+    Ratio,
+    Score,
+    Summary,
+    column,
+    count_modes,
+    covered,
+    rms_ratio,
+    rms_with_error,
+    share,
+    summarise,
+)
 
 NOISE = "configs/studies/table3_noise.yaml"
 QUICK = ["study.steps=[1 s]", "study.data_step=0.2 s", "study.evaluations=600", "study.population=24"]

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import pytest
 
 from fdi_torch.config.study_file import load_study
-from fdi_torch.study.cluster import connected, each_on, run_on_cluster, run_with
-from fdi_torch.study.monte_carlo import Trial, run_blocks
+from fdi_torch.study.cluster import connected, each_on, run_on_cluster
+from fdi_torch.study.monte_carlo import Trial, run_block, run_blocks
 from fdi_torch.study.study_plan import Plan
 
 pytest.importorskip("distributed")
@@ -39,7 +39,7 @@ def test_killing_one_of_two_workers_changes_no_trial(plan: Plan) -> None:
         assert len(places) == 3 and all(place.startswith("tcp://127.0.0.1:") for place in places)
 
         def with_a_murder() -> Iterator[list[Trial]]:
-            for k, block in enumerate(run_with(client, plan, plan.blocks())):
+            for k, block in enumerate(each_on(client, run_block, plan.blocks(), plan)):
                 if k == 1:
                     victim = next(iter(client.run(os.getpid).values()))
                     os.kill(victim, signal.SIGKILL)

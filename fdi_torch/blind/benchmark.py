@@ -32,6 +32,7 @@ from fdi_torch.blind.plants import Rig, three_tank
 from fdi_torch.blind.scored_rows import Row, judged
 from fdi_torch.estimate.uncertainty import plain_value
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.progress import Tell, silent
 from fdi_torch.recording import Recording
 
 Diagnosis = Callable[..., dict[str, Any]]
@@ -39,7 +40,6 @@ Task = tuple[str, Mapping[str, Any]]
 """Name of the diagnosis, and a case's line of the manifest."""
 Done = tuple[str, dict[str, Any]]
 Each = Callable[[Callable[[Task], Done], Iterable[Task]], Iterable[Done]]
-Tell = Callable[[float, str], None]
 CHUNK = 200
 
 
@@ -57,7 +57,7 @@ def blind_benchmark(
     each: Each = map,
     minutes: float = math.inf,
     code: str = "",
-    tell: Tell = lambda share, text: None,
+    tell: Tell = silent,
 ) -> list[Row]:
     """Let `diagnose` and competing methods answer `cases` recordings; an interrupted benchmark is resumed.
 
@@ -86,7 +86,7 @@ def seal(
     kinds: Sequence[str],
     library: Collection[str] = (),
     leave_out: Sequence[str] = (),
-    tell: Tell = lambda share, text: None,
+    tell: Tell = silent,
 ) -> None:
     """Simulate and seal the missing ones of the first `cases` cases.
 

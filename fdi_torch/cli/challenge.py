@@ -72,7 +72,7 @@ def _benchmarked(
     if arguments.plant and arguments.rig:
         raise ValueError("expected --rig or --plant, got both; leave one out")
     rig = _rig(arguments)
-    left_out = LIBRARY if arguments.leave_out == "all" else tuple(n for n in arguments.leave_out.split(",") if n)
+    left_out = LIBRARY if arguments.leave_out == ("all",) else arguments.leave_out
     code = git_state()
     with _mapper(arguments.cluster) as each, screen.progress("blind benchmark") as advance, _resumable(out):
         rows = blind_benchmark(
@@ -81,7 +81,7 @@ def _benchmarked(
             out,
             _diagnose,
             rig=rig,
-            kinds=tuple(arguments.kinds.split(",")) if arguments.kinds else (),
+            kinds=arguments.kinds,
             library=LIBRARY,
             leave_out=left_out,
             rivals=rivals,
@@ -96,21 +96,17 @@ def _benchmarked(
 
 
 def _rig(arguments: argparse.Namespace) -> Rig | Networks:
-    if arguments.tanks and arguments.plant != NETWORK:
+    tanks, ends = arguments.tanks, (arguments.tanks or "").split("..")
+    if tanks and arguments.plant != NETWORK:
         raise ValueError(f"--tanks: expected --plant {NETWORK} with it; add that or leave --tanks out")
+    if tanks and (not all(end.isdigit() for end in ends) or len(ends) > 2):
+        raise ValueError(f"--tanks: expected a number or a range, got '{tanks}'; write for example 6 or 3..12")
     if arguments.plant == NETWORK:
-        return _networks(arguments.tanks) if arguments.tanks else Networks()
+        return Networks(int(ends[0]), int(ends[-1])) if tanks else Networks()
     if not arguments.plant:
         return RIGS[arguments.rig or "three_tank"]()
     plant = chosen_plant(arguments.plant)
     return exercised(plant, scales_of(plant, time_scale(plant)))
-
-
-def _networks(tanks: str) -> Networks:
-    ends = tanks.split("..")
-    if not all(end.isdigit() for end in ends) or len(ends) > 2:
-        raise ValueError(f"--tanks: expected a number or a range, got '{tanks}'; write for example 6 or 3..12")
-    return Networks(int(ends[0]), int(ends[-1]))
 
 
 @contextmanager

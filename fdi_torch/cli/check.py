@@ -35,8 +35,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     guesses = [] if arguments.plant is None else placeholders(find_plant(arguments.plant, Path.cwd()))
     if guesses:
         screen.say(f"{arguments.plant}: these entries are still placeholders; correct each, and delete its !")
-        for place in guesses:
-            screen.say(f"- {place}")
+        screen.points(guesses)
         screen.say()
     _show_plant(plant, screen)
     if not recordings:
@@ -99,13 +98,8 @@ def _show_plant(plant: PlantDescription, screen: Screen) -> None:
     for tank in plant.tanks:
         sizes = (per_area * tank.area, per_height * tank.height, 1e3 * tank.area * tank.height)
         time = emptying_time(plant, tank)
-        rows.append(
-            [
-                tank.name,
-                *(significant(size, 4) for size in sizes),
-                significant(time, 3) if math.isfinite(time) else "never",
-            ]
-        )
+        empties = significant(time, 3) if math.isfinite(time) else "never"
+        rows.append([tank.name, *(significant(size, 4) for size in sizes), empties])
     header = ("tank", f"area, {area}", f"height, {height}", "volume, l", "empties from full in, s")
     screen.table("", header, rows)
     if closed := _without_outlet(plant):

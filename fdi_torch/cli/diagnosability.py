@@ -26,8 +26,7 @@ from fdi_torch.recording import Recording
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     plant = chosen_plant(arguments.plant)
-    named = [full_name(name.strip(), plant) for name in (arguments.faults or "").split(",") if name.strip()]
-    faults = named or usual_faults(plant)
+    faults = [full_name(name, plant) for name in arguments.faults] or usual_faults(plant)
     recording, constant = _inputs(arguments, plant)
     uncertain = uncertain_constants(plant, faults)
     report = diagnosability(
@@ -94,8 +93,7 @@ def _show(report: Diagnosability, screen: Screen) -> None:
              enumerate(zip(report.faults, report.apart, strict=True))]  # fmt: skip
     numbers = tuple(str(i + 1) for i in range(len(report.faults)))
     screen.table("sine of the angle between signatures (0: not distinguishable)", ("", "fault", *numbers), apart, 2)
-    for sentence in (*report.groups, *report.remarks):
-        screen.say(f"- {sentence}")
+    screen.points((*report.groups, *report.remarks))
 
 
 def _number(value: float) -> str:

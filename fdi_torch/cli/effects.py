@@ -6,7 +6,6 @@ Path: cli.effects.run → effects.catalogue.effects
 from __future__ import annotations
 
 import argparse
-import math
 from typing import Any
 
 from fdi_torch.cli import DONE
@@ -35,7 +34,7 @@ def _show(entry: Entry, of_plant: bool, screen: Screen) -> None:
     screen.say(f"{entry.name}: {entry.meaning}")
     screen.say(f"  location: {entry.where}" + (f": {', '.join(entry.at)}" if of_plant else ""))
     screen.say(f"  acts {entry.begins}")
-    screen.table("", ("parameter", "unit", "nominal", "range", "meaning"), [_row(*row) for row in entry.rows()], left=5)
+    screen.show(entry.table(), left=6)
     screen.say(f"  in simulate.faults:     {entry.in_a_run_file}")
     screen.say(f"  in estimate.parameters: {entry.at[0]}.{entry.name}")
     screen.say(f"  in a plant's effects:   {entry.in_a_plant_file}")
@@ -44,12 +43,6 @@ def _show(entry: Entry, of_plant: bool, screen: Screen) -> None:
     for line in entry.law.splitlines():
         screen.say(f"  | {line}".rstrip())
     screen.say()
-
-
-def _row(name: str, unit: str, nominal: float, low: float, high: float, meaning: str) -> list[str]:
-    first, last = (f"{v:.4g}" if math.isfinite(v) else "" for v in (low, high))
-    ends = f"{first} to {last}" if first and last else f"from {first}" if first else f"to {last}" if last else "any"
-    return [name, unit, f"{nominal:.4g}", ends, meaning]
 
 
 def _as_json(entry: Entry) -> dict[str, Any]:

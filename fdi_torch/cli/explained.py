@@ -13,14 +13,12 @@ def say_first(misfit: Misfit, screen: Screen, *hints: str, about: Sequence[str] 
     """Print the warning, what it is about and what to do next if the model does not explain the recording."""
     if misfit.warning:
         screen.say(f"{misfit.warning}.")
-        for sentence in about:
-            screen.say(f"- {sentence}")
+        screen.points(about)
         gap = (
             "next: fdi gap distinguishes random disturbances of the flows from an error of the plant file, and names "
             "its place and cause"
         )
-        for hint in (gap, *hints):
-            screen.say(f"- {hint}")
+        screen.points((gap, *hints))
         screen.say()
 
 
@@ -28,8 +26,7 @@ def say_doubts(doubts: Sequence[str], screen: Screen) -> None:
     """Print what limits the trust in the recordings, if anything does."""
     if doubts:
         screen.say("Doubts about the recording:")
-        for doubt in doubts:
-            screen.say(f"- {doubt}")
+        screen.points(doubts)
         screen.say()
 
 

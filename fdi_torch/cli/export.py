@@ -11,17 +11,15 @@ from collections import Counter
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.jobs.fmu_export import export_fmu
+from fdi_torch.names import counted
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
-    columns = export_fmu(arguments.plant, arguments.fmu, effects=arguments.effect).columns
-    counts = Counter(columns["causality"])
-    kinds = ("input", "output", "parameter")
-    numbers = ", ".join(f"{counts[kind]} {kind}{'' if counts[kind] == 1 else 's'}" for kind in kinds)
+    table = export_fmu(arguments.plant, arguments.fmu, effects=arguments.effect)
+    counts = Counter(table.columns["causality"])
+    numbers = ", ".join(counted(counts[kind], kind) for kind in ("input", "output", "parameter"))
     screen.say(f"{arguments.fmu}: FMU for co-simulation (FMI 2.0) with {numbers}")
-    rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-    starts = ["" if row["start"] is None else f"{row['start']:.6g}" for row in rows]
-    shown = [[row["name"], row["causality"], row["unit"], start] for row, start in zip(rows, starts, strict=True)]
-    screen.table("", ("variable", "causality", "unit", "start"), shown, left=3)
+    screen.show(table, left=4)
+    rows = [dict(zip(table.columns, row, strict=True)) for row in zip(*table.columns.values(), strict=True)]
     screen.result({"format": "fdi_torch.export/1", "fmu": str(arguments.fmu), "variables": rows})
     return DONE

@@ -18,7 +18,6 @@ from pathlib import Path
 from fdi_torch.cli import DONE
 from fdi_torch.cli.adoption import expect_adoptable, write_adopted
 from fdi_torch.cli.gap_text import next_steps, show
-from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.clock import show_clock
 from fdi_torch.config.loaded_recordings import named_recordings
@@ -49,15 +48,15 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     for note in dict.fromkeys(note for r in (*recordings, *holdouts) for note in r.notes):
         screen.note(note)
     show_clock(r.clock_zero for r in recordings)
-    library = library_entries(names(arguments.library)) or None
-    settings = Settings(library, names(arguments.leave_out), arguments.step, arguments.most, arguments.named_only)
+    library = library_entries(arguments.library) or None
+    settings = Settings(library, arguments.leave_out, arguments.step, arguments.most, arguments.named_only)
     expect_adoptable(arguments.adopt, arguments.replace)
     arguments.with_constants |= arguments.narrow
     folder = Path(arguments.out)
     log = free_path(folder, "gap")
     with screen.progress("gap") as advance:
 
-        def next_stage(share: float, text: str) -> None:
+        def next_stage(share: float | None, text: str) -> None:
             release_memory()
             advance(share, text)
 

@@ -36,8 +36,7 @@ def show(answer: Answer, plant: PlantDescription, steps: Sequence[str], screen: 
     """Print the verdict, doubts, what to do next, and the tables."""
     as_json = answer.to_dict()
     screen.say(verdict_sentence(as_json))
-    for sentence in [*answer.remarks, *(f"next: {step}" for step in steps)]:
-        screen.say(f"- {sentence}")
+    screen.points([*answer.remarks, *(f"next: {step}" for step in steps)])
     _causes(answer, screen)
     _explanations(as_json, screen)
     rows = [[place, probability_words(p)] for place, p in answer.where[:MOST_ROWS] if p >= SMALLEST_SHOWN]
@@ -47,8 +46,7 @@ def show(answer: Answer, plant: PlantDescription, steps: Sequence[str], screen: 
     if answer.closure:
         _closure(as_json, screen)
     _constants(answer.constants, has_causes(answer.to_dict()), screen)
-    for remark in [*_confusability(answer.impostors), *_limits(answer)]:
-        screen.say(f"- {remark}")
+    screen.points([*_confusability(answer.impostors), *_limits(answer)])
 
 
 def next_steps(

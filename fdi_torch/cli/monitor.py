@@ -14,7 +14,7 @@ from typing import Any, get_args
 
 import orjson
 
-from fdi_torch.cli.options import access_text, host_and_port, live
+from fdi_torch.cli.options import access_text, host_and_port, live, overrides
 from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.clock import clock_text
 from fdi_torch.config.monitor_file import load_monitor
@@ -26,19 +26,14 @@ from fdi_torch.monitor.events import FORMAT, Event, Kind
 from fdi_torch.monitor.monitor_setup import PreparedMonitor
 from fdi_torch.quantities import quantity_text
 
-Publish = Callable[[dict[str, Any]], None]
+Publish = Callable[[dict[str, Any]], None] | None
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
-    folder = [f"output.folder={arguments.out}"] if arguments.out else []
-    url = [f"source.url={arguments.source}"] if arguments.source else []
-    monitor_run = load_monitor(arguments.config, [*arguments.set, *folder, *url])
+    monitor_run = load_monitor(arguments.config, overrides(arguments))
     with (
         screen.progress("monitor") as advance,
-        outlets(arguments, monitor_run.name, screen) as (
-            listener,
-            publish,
-        ),
+        outlets(arguments, monitor_run.name, screen) as (listener, publish),
     ):
         callbacks = MonitorCallbacks(
             advance, lambda e: _show_event(e, screen, publish), lambda p: _show_setup(p, screen), listener
@@ -58,7 +53,8 @@ def _show_event(event: Event, screen: Screen, publish: Publish) -> None:
     data = {"format": FORMAT, **event.to_dict()}
     data |= {"clock": moment, "onset_clock": onset or None} if moment else {}
     screen.line(orjson.dumps(data).decode())
-    publish(data)
+    if publish is not None:
+        publish(data)
 
 
 def _show_setup(prepared: PreparedMonitor, screen: Screen) -> None:
@@ -86,8 +82,13 @@ def outlets(arguments: argparse.Namespace, name: str, screen: Screen) -> Iterato
             listeners.append(viewer)
         if arguments.metrics is not None:
             listeners.append(stack.enter_context(_metrics(arguments.metrics, screen)))
-        publish: Publish = stack.enter_context(_publisher(arguments.publish)) if arguments.publish else _nowhere
-        yield (_to_all(listeners) if listeners else None), publish
+        publish = stack.enter_context(_publisher(arguments.publish)) if arguments.publish else None
+
+        def listen(channel: Channel, log_time: int, data: bytes) -> None:
+            for listener in listeners:
+                listener(channel, log_time, data)
+
+        yield (listen if listeners else None), publish
 
 
 @contextmanager
@@ -111,15 +112,3 @@ def _publisher(url: str) -> Iterator[Publish]:
         raise ValueError(f"--publish: {error}") from None
     with publisher:
         yield publisher.publish
-
-
-def _nowhere(event: dict[str, Any]) -> None:
-    """Publish nothing."""
-
-
-def _to_all(listeners: list[Listener]) -> Listener:
-    def listen(channel: Channel, log_time: int, data: bytes) -> None:
-        for listener in listeners:
-            listener(channel, log_time, data)
-
-    return listen

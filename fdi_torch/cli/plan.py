@@ -10,7 +10,6 @@ from pathlib import Path
 
 from fdi_torch.amounts import effect_words
 from fdi_torch.cli import DONE
-from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import planned_recordings
 from fdi_torch.config.plant_file import chosen_plant
@@ -27,7 +26,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     for note in planned.notes:
         screen.note(note)
     with one_thread():
-        limits = planned_identifiability(plant, planned, noise, library_entries(names(arguments.library)) or None)
+        limits = planned_identifiability(plant, planned, noise, library_entries(arguments.library) or None)
     _show(limits, arguments.noise, screen)
     shown = {f"{place}.{name}": residual for (name, place), residual in limits.shown.items()}
     screen.result(

@@ -7,6 +7,7 @@ estimate.misfit.misfit_of → recordings.check.doubts_about → cli.explained.sa
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -54,36 +55,29 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     doubts = doubts_about(recordings, plant)
     say_doubts(doubts, screen)
     say_first(worst, screen, *(calibrate if plant.tolerances else []), about=which)
-    first = (
-        f"the first {arguments.start_samples} samples"
-        if arguments.settle is None
-        else f"the first {arguments.settle:g} s"
-    )
-    if arguments.settle is None and max(map(len, recordings)) <= arguments.start_samples:
+    settle = arguments.settle
+    first = f"the first {arguments.start_samples} samples" if settle is None else f"the first {settle:g} s"
+    if settle is None and max(map(len, recordings)) <= arguments.start_samples:
         first = "all samples: a longer recording would test the prediction"
     screen.say(f"free run of {plant.name}, initial levels from {first}")
-    before = [_predict(other, recording, arguments, vary="") for recording in recordings] if other else []
+    before = [_predict(other, recording, arguments, vary=()) for recording in recordings] if other else []
     own_name, other_name = _names(plant, other, arguments)
     rows = [[own_name, *_row(plant, recording, prediction)] for recording, prediction in predictions]
     rows += [[other_name, *_row(plant, *each)] for each in zip(recordings, before, strict=bool(other))]
     units = (f"{s.name}, {display_unit(s.unit, s.column)[0] or 'share'}" for s in plant.sensors)
     header = ("plant", "recording", "from, s", "to, s", *units, "start at")
     alone = 0 if other else 1  # without the column of plants
-    screen.table(
-        "root mean square error" + ("" if arguments.settle is None else f" after the first {arguments.settle:g} s"),
-        header[alone:],
-        [row[alone:] for row in rows],
-        left=2 - alone,
-    )
+    title = "root mean square error" + ("" if settle is None else f" after the first {settle:g} s")
+    screen.table(title, header[alone:], [row[alone:] for row in rows], left=2 - alone)
     for recording, prediction in predictions:
         _own_constants(plant, recording, prediction, screen)
     if arguments.picture:
         recording, prediction = predictions[-1]
         runs = {other_name: before[-1].readings} if before else {}
         runs[own_name] = prediction.readings
-        columns = [sensor.column for sensor in plant.sensors]
         title = misfits[-1].headline(f"free run along {Path(recording.source).name}")
-        screen.note(f"picture: {save(fit_figure(recording, runs, title, plant, columns), Path(arguments.picture))}")
+        figure = fit_figure(recording, runs, title, plant, plant.outputs())
+        screen.note(f"picture: {save(figure, Path(arguments.picture))}")
     results = [_result(plant, *run, misfit, arguments) for run, misfit in zip(predictions, misfits, strict=True)]
     several = {"format": "fdi_torch.predictions/1", "runs": results}
     screen.result((results[0] if len(results) == 1 else several) | {"doubts": doubts})
@@ -91,9 +85,9 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 
 def _predict(
-    plant: PlantDescription, recording: Recording, arguments: argparse.Namespace, vary: str | None = None
+    plant: PlantDescription, recording: Recording, arguments: argparse.Namespace, vary: Sequence[str] | None = None
 ) -> Prediction:
-    patterns = [name for name in (arguments.vary if vary is None else vary).split(",") if name]
+    patterns = arguments.vary if vary is None else vary
     return predict(plant, recording, arguments.start_samples, settle=arguments.settle, vary=patterns)
 
 

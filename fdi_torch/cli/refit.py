@@ -17,7 +17,6 @@ from fdi_torch.amounts import rounded
 from fdi_torch.cli.adoption import expect_adoptable, write_adopted
 from fdi_torch.cli.explained import exit_code, say_doubts, say_first
 from fdi_torch.cli.gap_text import MOVED
-from fdi_torch.cli.options import names
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import named_recordings
 from fdi_torch.config.plant_file import chosen_plant
@@ -46,9 +45,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     recordings = named_recordings(arguments.recording, plant, Path.cwd())
     holdouts = [r for name in arguments.holdout for r in named_recordings(name, plant, Path.cwd())]
     white = parse_level_deviation(arguments.white, "--white") if arguments.white else None
-    hold, vary, leave_out = (names(text) for text in (arguments.hold, arguments.vary, arguments.leave_out))
-
-    fitted_to = partial(refit, plant, leave_out=leave_out, step=arguments.step, hold=hold, white=white, vary=vary)
+    a = arguments
+    fitted_to = partial(refit, plant, leave_out=a.leave_out, step=a.step, hold=a.hold, white=white, vary=a.vary)
 
     trials: list[LeftOutRun] = []
     with one_thread():
@@ -125,8 +123,7 @@ def _show(result: Refit, before: PlantDescription, screen: Screen) -> None:
     screen.say(f"{counted(result.parameters, 'value')} fitted, including initial levels")
     values = torch.tensor([value for value, _ in result.fitted.values()], dtype=torch.float64)
     ends = parameters_at_bounds(ParameterSpace([constants[name] for name in result.fitted]), values)
-    for remark in [*remarks, *(f"{name} lies at the {end} end of its range" for name, end in ends.items())]:
-        screen.say(f"- {remark}")
+    screen.points([*remarks, *(f"{name} lies at the {end} end of its range" for name, end in ends.items())])
 
 
 def _show_run_specific(result: Refit, screen: Screen) -> None:

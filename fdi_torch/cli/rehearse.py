@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import live
+from fdi_torch.cli.options import live, overrides
 from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.config.rehearsal_file import load_rehearsal
 from fdi_torch.jobs.study import RehearsalResult, rehearse
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
-    folder = [f"output.folder={arguments.out}"] if arguments.out else []
-    rehearsal = load_rehearsal(arguments.config, [*arguments.set, *folder])
+    rehearsal = load_rehearsal(arguments.config, overrides(arguments))
     with live(arguments, rehearsal.name, screen) as listener, screen.progress(rehearsal.name) as advance:
         done = rehearse(rehearsal, arguments.resume, advance, listener)
     for table in done.tables:

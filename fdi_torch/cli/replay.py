@@ -33,7 +33,7 @@ def faithful(arguments: argparse.Namespace, screen: Screen) -> int:
             lambda log: repeat_run(log, target, (), arguments.trial, advance),
             select=comparable(arguments.trial),
         )
-        advance(1.0)
+        advance(1.0, "done")
     for line in in_words(done):
         screen.say(line)
     screen.result({"format": "fdi_torch.replay/1", "replay": done})
@@ -49,7 +49,7 @@ def what_if(arguments: argparse.Namespace, screen: Screen) -> int:
     target = Path(arguments.out or source.with_name(f"{source.name.removesuffix('.mcap')}.what_if.mcap"))
     with screen.progress("replay") as advance:
         repeat_run(read_run(source), target, arguments.set, arguments.trial, advance)
-        advance(1.0)
+        advance(1.0, "done")
     compared = compare([source, target])
     comparing.show(compared, screen)
     screen.say(f"log: {target}")

@@ -12,10 +12,10 @@ import os
 import sys
 import textwrap
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import orjson
 from rich.console import Console
@@ -24,16 +24,14 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from fdi_torch.disk import named_errors
+from fdi_torch.progress import Tell, silent
 from fdi_torch.untrusted_input import printable, printable_json
+
+if TYPE_CHECKING:
+    from fdi_torch.tables import Table as Shown  # loads the library of units, for which quick commands do not wait
 
 SECONDS_BETWEEN_LINES = 2.0
 ENDLESS = 1 << 16  # characters per line of a pipe or a file
-
-
-class Advance(Protocol):
-    """Reports the progress of a stage (0 to 1; None if it has no known end) and one line about it."""
-
-    def __call__(self, share: float | None, text: str = "") -> None: ...
 
 
 def log_words(log: Path) -> str:
@@ -82,6 +80,11 @@ class Screen:
         for line in folded:
             self._out.print(_shown(line))
 
+    def points(self, sentences: Iterable[str]) -> None:
+        """Print each sentence as a point of a list; not with JSON."""
+        for sentence in sentences:
+            self.say(f"- {sentence}")
+
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> None:
         """Print a table whose first `left` columns are left-aligned; not with JSON.
 
@@ -100,6 +103,10 @@ class Screen:
         for row in rows:
             table.add_row(*(_shown(row[i]) for i in filled))
         self._out.print(table, soft_wrap=False)
+
+    def show(self, table: Shown, left: int, title: str = "") -> None:
+        """Print a table of results, as it shows itself in a session; not with JSON."""
+        self.table(title, list(table.columns), table.rows(len(table)), left)
 
     def result(self, data: Any) -> None:
         """Print the result as JSON if requested; dataclasses are allowed, and non-finite numbers become null."""
@@ -146,14 +153,14 @@ class Screen:
         self._err.print(_shown(text))
 
     @contextmanager
-    def progress(self, title: str) -> Iterator[Advance]:
+    def progress(self, title: str) -> Iterator[Tell]:
         """A progress bar on a terminal; elsewhere a line at the start and then every few seconds."""
         if self.quiet:
-            yield lambda share, text="": None
+            yield silent
         elif self._err.is_terminal:
             with self._bar() as bar:
                 task = bar.add_task(printable(title), total=1.0, text="")
-                yield lambda share, text="": bar.update(
+                yield lambda share, text: bar.update(
                     task, total=None if share is None else 1.0, completed=share, text=printable(text)
                 )
         else:
@@ -169,11 +176,11 @@ class Screen:
         )
         return Progress(*columns, console=self._err, transient=True, expand=True)
 
-    def _lines(self, title: str) -> Advance:
+    def _lines(self, title: str) -> Tell:
         self.note(f"{title} ...")
         last = -math.inf  # the first step of a job is shown at once
 
-        def advance(share: float | None, text: str = "") -> None:
+        def advance(share: float | None, text: str) -> None:
             nonlocal last
             if share == 1.0 or time.monotonic() - last >= SECONDS_BETWEEN_LINES:
                 last = time.monotonic()

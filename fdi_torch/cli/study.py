@@ -16,8 +16,7 @@ from fdi_torch.jobs.study import StudyResult, run_study
 from fdi_torch.names import counted
 from fdi_torch.quantities import significant
 from fdi_torch.study.estimators import ESTIMATORS
-from fdi_torch.study.mode_isolation import Isolation
-from fdi_torch.study.summary import Ratio, Score, Summary
+from fdi_torch.study.summary import Isolation, Ratio, Score, Summary
 from fdi_torch.tables import in_display_unit
 
 

@@ -102,29 +102,13 @@ def _plain(name: str, si_unit: str, value: float) -> str:
 
 
 def show_uncertainty(done: TrainResult, screen: Screen) -> None:
-    """Print the intervals of the profiles and of the draws, those that cannot be relied on with the reason first."""
-    draws = done.result.estimate.draws
-    for line in [line for profile in done.profiles for line in profile.warnings]:
-        screen.say(f"- {line}")
-    rows = []
+    """Print the intervals of the profiles and of the draws, with what makes them unreliable."""
     for profile in done.profiles:
-        unit, scale = display_unit(profile.unit, profile.name)
-        limits = f"{scale * profile.low:.5g} … {scale * profile.high:.5g}"
-        note = " and ".join(f"{end} end is not determined" for end in profile.ends)
-        rows.append([profile.name, unit or "1", f"{100 * profile.confidence:g} %", limits, note])
-    if rows:
-        header = ("parameter", "unit", "confidence", "interval", "remark")
-        screen.table("intervals from profile likelihoods", header, rows, left=2)
-        screen.say()
-    if draws is not None:
-        rows = []
-        for p, median, low, high in zip(done.fitting.space, draws.median(), *draws.interval(0.95), strict=True):
-            unit, scale = display_unit(p.unit, p.name)
-            limits = f"{scale * float(low):.5g} … {scale * float(high):.5g}"
-            rows.append([p.name, unit or "1", f"{scale * float(median):.6g}", limits])
-        screen.table("draws from the posterior", ("parameter", "unit", "median", "95 % interval"), rows, left=2)
-        screen.say()
+        screen.say(f"- profile likelihood of {profile.headline}")
+    if (draws := done.result.estimate.draws) is not None:
+        screen.show(draws.table(), 2, "draws from the posterior")
         screen.say(draws.headline)
+        screen.say()
 
 
 def in_words(done: TrainResult) -> list[str]:

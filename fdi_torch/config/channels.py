@@ -26,7 +26,10 @@ KINDS = {
     "1": "a share or %",
 }
 """SI unit of a channel -> its units in words."""
-ONLY_CLOCK = ("stamps", "zone", "shift", "sort", "period")  # keys that time alone may have
+ONLY_CLOCK = ("stamps", "zone", "shift", "sort", "period")
+ONLY_FOR = dict.fromkeys(ONLY_CLOCK, "t") | {"held": "an input"}
+ONLY_FOR |= dict.fromkeys(("constant", "recorded", "words", "quality", "good", "plus"), "a channel")
+"""Keys that not every column may have, and of which it is expected."""
 
 
 def channel_mapping(config: FileConfig, plant: PlantDescription) -> dict[str, ChannelSource]:
@@ -50,14 +53,9 @@ def channel_mapping(config: FileConfig, plant: PlantDescription) -> dict[str, Ch
 
 def _expect_keys_that_fit(place: str, name: str, column: ColumnConfig, plant: PlantDescription) -> None:
     """Raises ValueError for a key that does not apply to that channel."""
-    only_input = ("held",)
-    only_channel = ("constant", "recorded", "held", "words", "quality", "good", "plus")
-    not_allowed = only_channel if name == "t" else ONLY_CLOCK
-    if name != "t" and name not in plant.channels():
-        not_allowed = (*not_allowed, *only_input)
-    for key in not_allowed:
-        if key in column.model_fields_set:
-            kind = "a channel" if name == "t" else "an input" if key in only_input else "t"
+    kinds = ("t",) if name == "t" else ("a channel", "an input") if name in plant.channels() else ("a channel",)
+    for key, kind in ONLY_FOR.items():
+        if key in column.model_fields_set and kind not in kinds:
             raise ValueError(f"{place}.{key}: expected this key of {kind} only; leave it out")
 
 

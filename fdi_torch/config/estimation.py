@@ -7,14 +7,14 @@ from dataclasses import fields
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from fdi_torch.config.problems import ConfigError, naming, shown
 from fdi_torch.config.strict import Amount, Seconds, Share, Strict, quantity, quantity_at, with_known_keys
 from fdi_torch.effects import all_placements, build_network, full_name, placements_for, unknown_parameter
 from fdi_torch.estimate.evolution_settings import STRATEGIES, EvolutionSettings
 from fdi_torch.estimate.objectives import Objective
-from fdi_torch.names import shortened
+from fdi_torch.names import matching, shortened
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
@@ -28,9 +28,10 @@ class ParameterConfig(Strict):
     high: Amount | None = Field(None, description="upper bound")
     std: Amount | None = Field(None, description="standard deviation of the prior")
 
-
-def _parameter(value: Any) -> Any:
-    return {"name": value} if isinstance(value, str) else value
+    @model_validator(mode="before")
+    @classmethod
+    def _a_name_alone(cls, data: Any) -> Any:
+        return {"name": data} if isinstance(data, str) else data
 
 
 def _auto_or_names(value: Any) -> Any:
@@ -48,8 +49,7 @@ def _auto_or_seconds(value: Any) -> Any:
     return seconds
 
 
-def _known_settings(value: Any) -> Any:
-    return with_known_keys(value, [field.name for field in fields(EvolutionSettings)])
+_SEARCH_KEYS = tuple(field.name for field in fields(EvolutionSettings))
 
 
 class ObjectiveConfig(Strict):
@@ -70,7 +70,7 @@ class StepConfig(Strict):
 
 
 class EstimationConfig(Strict):
-    parameters: list[Annotated[ParameterConfig, BeforeValidator(_parameter)]] = Field(
+    parameters: list[ParameterConfig] = Field(
         default_factory=list,
         description="names, patterns such as '*.leak', or mappings with name, low, high, nominal, std",
     )
@@ -78,7 +78,7 @@ class EstimationConfig(Strict):
         "auto", description="constants estimated too, with their tolerance as prior; auto: all for real data"
     )
     objective: ObjectiveConfig = Field(default_factory=ObjectiveConfig)
-    search: Annotated[EvolutionSettings, BeforeValidator(_known_settings)] = Field(
+    search: Annotated[EvolutionSettings, BeforeValidator(lambda value: with_known_keys(value, _SEARCH_KEYS))] = Field(
         default_factory=EvolutionSettings, description=f"search of the basin; strategy: {', '.join(STRATEGIES)}"
     )
     refine: RefineConfig = Field(default_factory=RefineConfig)
@@ -165,13 +165,8 @@ def _calibrated(
 ) -> list[str]:
     if config.calibrate == "auto":
         return list(plant.tolerances) if real_data else []
-    names: dict[str, None] = {}
-    for pattern in config.calibrate:
-        matched = [name for name in constants.names if fnmatchcase(name, pattern)]
-        if not matched:
-            raise ConfigError([unknown_parameter(pattern, constants, plant)], "estimate.calibrate")
-        names |= dict.fromkeys(matched)
-    return list(names)
+    with naming("estimate.calibrate"):
+        return matching("a constant", config.calibrate, constants.names)
 
 
 def parameter_values(values: dict[str, Amount], constants: ParameterSpace, plant: PlantDescription) -> dict[str, float]:

@@ -20,8 +20,9 @@ from fdi_torch.recordings.database import is_query
 
 FALSE_ALARMS_EVERY, LEARNING = 20000.0, 1000.0
 """Mean time between false alarms, and length of a fault-free part of unknown sampling; s, for three_tank."""
-FEWEST, TRIALS, MARGIN = 200, 4, 1.1
-"""A fault-free part has at least as many samples, and is lengthened this often, to as many times what is asked for."""
+FEWEST, MARGIN = 200, 1.5
+"""Samples of a fault-free part at least, and its length as a multiple of what the monitor asks for after too few: from
+another part it learns another noise, and asks for up to a third more."""
 
 
 def template(kind: str, plant: PlantDescription, plant_file: str, name: str, recording: str | None = None) -> str:
@@ -120,8 +121,8 @@ def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
 def _learning_time(
     plant: PlantDescription, recording: Recording, false_alarms_every: float, longest: float
 ) -> tuple[float, float]:
-    """Length of a fault-free part at the beginning of the recording, at most `longest`, and the length that the monitor
-    then asks for, s.
+    """Length of a fault-free part at the beginning of the recording, at most `longest`, and the length that a monitor
+    which learns from its first samples asks for, s.
 
     false_alarms_every: mean time between false alarms, s. Raises ValueError for a recording that cannot be monitored.
     """
@@ -131,15 +132,12 @@ def _learning_time(
 
     first, usual = float(recording.time[0]), 2.0 * LEARNING * time_scale(plant)
     length = min(rounded_up(max(usual, FEWEST * recording.interval)), longest)
-    for _ in range(TRIALS):
-        part = fault_free_part(recording, first, first + length)
-        monitor = prepare_monitor(plant, part, time_between_false_alarms=false_alarms_every).monitor
-        learnt, asked = learning_times(monitor.noise, monitor.detector)
-        needed = rounded_up(asked + length - learnt)
-        if learnt >= asked or length >= longest:
-            break
-        length = min(rounded_up(MARGIN * needed), longest)
-    return length, needed
+    part = fault_free_part(recording, first, first + length)
+    monitor = prepare_monitor(plant, part, time_between_false_alarms=false_alarms_every).monitor
+    learnt, asked = learning_times(monitor.noise, monitor.detector)
+    needed = asked + length - learnt
+    wanted = rounded_up(MARGIN * needed) if asked > learnt else length
+    return min(wanted, longest), rounded_up(needed)
 
 
 def _inputs(plant: PlantDescription, sampling: float) -> str:

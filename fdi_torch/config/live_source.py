@@ -13,7 +13,7 @@ from fdi_torch.config.channels import expect_units
 from fdi_torch.config.problems import naming
 from fdi_torch.config.recording_config import StartLevels
 from fdi_torch.config.strict import Amount, HeldFor, Seconds, Strict, quantity
-from fdi_torch.live.row_buffer import LiveChannel, Row, RowBuffer
+from fdi_torch.live.row_buffer import LiveChannel, Row, RowBuffer, RowSource
 from fdi_torch.live.values import Address, Connection, address_of
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
@@ -73,58 +73,48 @@ class SourceConfig(Strict):
         return value
 
 
-class LiveRows(Iterator["Row | str"]):
+def live_rows(
+    config: SourceConfig,
+    plant: PlantDescription,
+    idle: float = math.inf,
+    origin: float | None = None,
+    earlier: Iterable[Row] = (),
+) -> RowSource:
     """Rows of a live source, and a sentence for each event of the connection.
 
     Ends when no new row has arrived for `idle` s. earlier: rows of an earlier run that is resumed; origin: the time
     origin of that run.
     Raises ConfigError for an unusable mapping, and if the source cannot be reached at first.
     """
+    with naming("source"):
+        address = address_of(config.url)
+        inputs, outputs = _channels(config, plant, address)
+        tags = list(dict.fromkeys(c.tag for c in (*inputs, *outputs) if c.tag is not None))
+        connection = _connection(config, address, tags)
+    own_stamps = address.scheme == "opcua" or (config.clock is None and address.scheme.startswith("mqtt"))
+    align = config.align if config.align is not None else config.period if own_stamps else 0.0
+    seen = [row[0] for row in earlier]
+    buffer = RowBuffer(inputs, outputs, config.reorder, align, connection.dated, origin, seen)
+    return RowSource(_until_idle(connection, buffer, idle), lambda: buffer.origin if connection.dated else None)
 
-    def __init__(
-        self,
-        config: SourceConfig,
-        plant: PlantDescription,
-        idle: float = math.inf,
-        origin: float | None = None,
-        earlier: Iterable[Row] = (),
-    ) -> None:
-        with naming("source"):
-            address = address_of(config.url)
-            inputs, outputs = _channels(config, plant, address)
-            tags = list(dict.fromkeys(c.tag for c in (*inputs, *outputs) if c.tag is not None))
-            self._connection = _connection(config, address, tags)
-        own_stamps = address.scheme == "opcua" or (config.clock is None and address.scheme.startswith("mqtt"))
-        align = config.align if config.align is not None else config.period if own_stamps else 0.0
-        seen = [row[0] for row in earlier]
-        self._buffer = RowBuffer(inputs, outputs, config.reorder, align, self._connection.dated, origin, seen)
-        self._rows = self._until_idle(idle)
 
-    @property
-    def origin(self) -> float | None:
-        """Time 0 of the rows, s since 1970; None before the first row, and if the clock has no date."""
-        return self._buffer.origin if self._connection.dated else None
-
-    def __next__(self) -> Row | str:
-        return next(self._rows)
-
-    def _until_idle(self, idle: float) -> Iterator[Row | str]:
-        quiet_since = time.monotonic()
-        try:
-            while time.monotonic() - quiet_since <= idle:
-                for item in self._connection.read(POLL):
-                    now = time.monotonic()
-                    if isinstance(item, str):
-                        yield item
-                    else:
-                        self._buffer.put(item, now)
-                rows = self._buffer.rows(time.monotonic())
-                if any(not isinstance(row, str) for row in rows):  # values that are repeated make no row
-                    quiet_since = time.monotonic()
-                yield from rows
-            yield from self._buffer.rows(time.monotonic(), all_of_them=True)
-        finally:
-            self._connection.close()
+def _until_idle(connection: Connection, buffer: RowBuffer, idle: float) -> Iterator[Row | str]:
+    quiet_since = time.monotonic()
+    try:
+        while time.monotonic() - quiet_since <= idle:
+            for item in connection.read(POLL):
+                now = time.monotonic()
+                if isinstance(item, str):
+                    yield item
+                else:
+                    buffer.put(item, now)
+            rows = buffer.rows(time.monotonic())
+            if any(not isinstance(row, str) for row in rows):  # values that are repeated make no row
+                quiet_since = time.monotonic()
+            yield from rows
+        yield from buffer.rows(time.monotonic(), all_of_them=True)
+    finally:
+        connection.close()
 
 
 def _channels(

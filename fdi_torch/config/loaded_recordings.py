@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import torch
-from pydantic import ValidationError
 
 from fdi_torch.config.channels import (
     channel_mapping,
@@ -21,7 +21,7 @@ from fdi_torch.config.channels import (
     without_column,
 )
 from fdi_torch.config.plant_file import AnyPlant, chosen_plant
-from fdi_torch.config.problems import ConfigError, Source, explain
+from fdi_torch.config.problems import ConfigError, Source, naming, validated
 from fdi_torch.config.recording_config import (
     ColumnConfig,
     FileConfig,
@@ -34,7 +34,7 @@ from fdi_torch.config.yaml_files import YAML_ENDINGS, expect_kind, find_data, fi
 from fdi_torch.logbook import LogError
 from fdi_torch.names import nearest, unknown
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.quantities import display_also_in
+from fdi_torch.quantities import display_in, displayed_units
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_csv_files
 from fdi_torch.recordings.database import is_query, write_query
@@ -56,14 +56,21 @@ def load_recordings(
     configs: Sequence[RecordingConfig],
     plant: PlantDescription,
     base: Path | None = None,
-    given: Mapping[str, Recording] | None = None,
 ) -> list[LoadedRecording]:
-    """All recordings, cut into segments with known inputs. given: as for `read_recording`."""
+    """All recordings, cut into segments with known inputs."""
     segments = []
-    for config in configs:
-        whole = read_recording(config, plant, base, given)
+    for k, config in enumerate(configs):
+        expect_file(config, f"recordings.{k}", base)
+        whole = read_recording(config, plant, base)
         segments += known_segments_of(whole, config, plant)
     return segments
+
+
+def expect_file(config: RecordingConfig, place: str, base: Path | None = None) -> None:
+    """Raises ConfigError, naming the place of the entry, if its file is missing."""
+    if config.in_memory is None and not is_query(config.file):
+        with naming(f"{place}.file"):
+            find_data(config.file, base or Path.cwd())
 
 
 def known_segments_of(whole: Recording, config: RecordingConfig, plant: PlantDescription) -> list[LoadedRecording]:
@@ -73,7 +80,10 @@ def known_segments_of(whole: Recording, config: RecordingConfig, plant: PlantDes
         raise ConfigError([f"{whole.source}: expected a segment with all inputs known, got none: {_unknown(whole)}"])
     first = float(whole.time[0])
     levels = [config.start_levels if float(part.time[0]) == first else "free" for part in segments]
-    return [LoadedRecording(part, _levels(level, plant, config)) for part, level in zip(segments, levels, strict=True)]
+    return [
+        LoadedRecording(part, start_levels_of(level, plant, config))
+        for part, level in zip(segments, levels, strict=True)
+    ]
 
 
 def _unknown(whole: Recording) -> str:
@@ -127,60 +137,39 @@ def listed_recordings(
         expect_kind(data, "run", path, "a recording or a file with the key recordings")
         near = nearest("recordings", [key for key in data if key != "recordings"])
         raise ConfigError([f"{path}: recordings: expected at least one, got none; list files under it{near}"])
-    try:
-        return [RecordingConfig.model_validate(entry) for entry in listed], path.parent
-    except ValidationError as error:
-        raise explain(error, Source(f"{path}: recordings")) from None
-
-
-def separate_recordings(recordings: Sequence[Any]) -> tuple[list[Any], dict[str, Recording]]:
-    """The recordings of a run file with each `Recording` object replaced by a name, and these objects by name."""
-    given: dict[str, Recording] = {}
-    listed = []
-    for entry in recordings:
-        if isinstance(entry, Recording):
-            name = entry.source if entry.source not in given else f"{entry.source} ({len(given) + 1})"
-            given[name] = entry
-            entry = {"file": name}
-        listed.append(entry)
-    return listed, given
+    return [validated(RecordingConfig, entry, Source(f"{path}: recordings")) for entry in listed], path.parent
 
 
 def read_recording(
-    config: RecordingConfig | Mapping[str, Any] | str | Path,
-    plant: AnyPlant,
-    base: Path | None = None,
-    given: Mapping[str, Recording] | None = None,
+    config: RecordingConfig | Recording | Mapping[str, Any] | str | Path, plant: AnyPlant, base: Path | None = None
 ) -> Recording:
     """The plant's inputs and outputs in a recording, cropped, masked and decimated; unknown inputs are NaN.
 
     From now on quantities are displayed in the units of the plant, and the channels in those of the file.
     config: the name of the file, or the recording's entry in a run file: {"file": "run.xlsx", "columns": {"h1":
-    {"column": "LT-101", "unit": "mm"}}}. plant: or the name of its file. base: folder of relative paths. given:
-    recordings in memory, by the name that `file` gives them; the result is on the CPU. Raises ConfigError naming file,
-    row and column.
+    {"column": "LT-101", "unit": "mm"}}}; or a recording in memory. plant: or the name of its file. base: folder of
+    relative paths. The result is on the CPU. Raises ConfigError naming file, row and column.
     """
     if not isinstance(config, RecordingConfig):
         config = config_of(config)
     plant = chosen_plant(plant)
-    channels, columns = plant.channels(), plant.outputs()
-    in_memory = (given or {}).get(config.file)
     folder = base or Path.cwd()
     try:
-        if in_memory is None and is_query(config.file):
-            recording = _read_query(config, folder, plant, channels, columns)
-        elif in_memory is None:
-            path = find_data(config.file, folder)
-            recording = _read(config, path, folder, plant, channels, columns)
+        if config.in_memory is not None:
+            recording = config.in_memory.to(torch.device("cpu")).selected(plant.channels(), plant.outputs())
+        elif is_query(config.file):
+            with _as_file(config.file) as path:  # its hash is that of the table
+                write_query(config.file, path, lambda name: find_data(name, folder))
+                recording = replace(_read(config, path, folder, plant), source=config.file)
         else:
-            recording = in_memory.to(torch.device("cpu")).selected(channels, columns)
+            recording = _read(config, find_data(config.file, folder), folder, plant)
         names = (*recording.input_names, *recording.output_names)
         expect_units(recording.source, names, (*recording.input_units, *recording.output_units), plant)
         start = -math.inf if config.start is None else in_seconds(config.start, recording, config)
         stop = math.inf if config.stop is None else in_seconds(config.stop, recording, config)
         masks = [(in_seconds(a, recording, config), in_seconds(b, recording, config)) for a, b in config.mask]
         selected = recording.window(start, stop).masked(masks).every(config.every)
-        display_also_in(recording.written)
+        display_in({**displayed_units(), **recording.written})
         return replace(selected, trusted=config.trusted or selected.trusted)
     except (ValueError, LogError) as error:
         raise ConfigError([str(error)]) from None
@@ -207,43 +196,28 @@ def read_frame(frame: Any, plant: AnyPlant, **keys: Any) -> Recording:
     timed = frame.index.name is not None
     named = frame.rename(columns=header)
     named = named.rename_axis(index=header(frame.index.name)) if timed else named
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "frame.csv"
+    with _as_file("data frame") as path:
         named.to_csv(path, index=timed)
-        try:
-            config = RecordingConfig.model_validate({"file": str(path), **keys})
-            return replace(read_recording(config, plant), source="data frame", sha256="")
-        except ValidationError as error:
-            raise explain(error, Source("data frame")) from None
-        except ConfigError as error:
-            raise ConfigError([problem.replace(str(path), "data frame") for problem in error.problems]) from None
+        config = validated(RecordingConfig, {"file": str(path), **keys}, Source("data frame"))
+        return replace(read_recording(config, plant), source="data frame", sha256="")
 
 
-def _read_query(
-    config: RecordingConfig, base: Path, plant: PlantDescription, inputs: Sequence[str], outputs: Sequence[str]
-) -> Recording:
-    """Read the table of a database query as a CSV file; its hash is that of the table."""
+@contextmanager
+def _as_file(name: str) -> Iterator[Path]:
+    """A path for a table that is not a file; errors call it by its name."""
     with TemporaryDirectory() as folder:
-        path = Path(folder) / "query"
+        path = Path(folder) / "table.csv"
         try:
-            write_query(config.file, path, lambda name: find_data(name, base))
-            return replace(_read(config, path, base, plant, inputs, outputs), source=config.file)
+            yield path
         except ConfigError as error:
-            raise ConfigError([problem.replace(str(path), config.file) for problem in error.problems]) from None
+            raise ConfigError([problem.replace(str(path), name) for problem in error.problems]) from None
         except (ValueError, ImportError) as error:
-            raise ValueError(str(error).replace(str(path), config.file)) from None
+            raise ValueError(str(error).replace(str(path), name)) from None
 
 
-def _read(
-    config: RecordingConfig,
-    path: Path,
-    base: Path,
-    plant: PlantDescription,
-    inputs: Sequence[str],
-    outputs: Sequence[str],
-) -> Recording:
+def _read(config: RecordingConfig, path: Path, base: Path, plant: PlantDescription) -> Recording:
     """Read by the file's ending: an MCAP log (also an incomplete one), else CSV or another table."""
-    mapping = channel_mapping(config, plant)
+    mapping, inputs, outputs = channel_mapping(config, plant), plant.channels(), plant.outputs()
     if is_log(path):
         if config.also or config.tags or config.sheet or not config.header:
             raise ValueError(
@@ -268,7 +242,7 @@ def _source(config: FileConfig, path: Path, mapping: Mapping[str, ChannelSource]
     return FileSource(path, mapping, rows, config.header, config.sheet)
 
 
-def _levels(start_levels: Any, plant: PlantDescription, config: RecordingConfig) -> dict[str, StartLevel]:
+def start_levels_of(start_levels: Any, plant: PlantDescription, config: RecordingConfig) -> dict[str, StartLevel]:
     """The start level of each tank; tanks that are not mentioned are free."""
     tanks = [tank.name for tank in plant.tanks]
     if not isinstance(start_levels, dict):

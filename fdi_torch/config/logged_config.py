@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from typing import Any
+from dataclasses import fields
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import PositiveFloat, PositiveInt, ValidationError
+from pydantic import BeforeValidator, TypeAdapter, ValidationError
 
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.problems import ConfigError, Source, explain
-from fdi_torch.config.strict import Strict
+from fdi_torch.config.strict import with_known_keys
 from fdi_torch.config.yaml_files import parse_yaml, shipped_plants
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
+
+if TYPE_CHECKING:
+    from fdi_torch.gap.problem import Settings
 
 
 def logged_mapping(log: LoggedRun) -> dict[str, Any]:
@@ -40,33 +44,24 @@ def logged_plant(log: LoggedRun) -> PlantDescription:
     return build_plant({"name": "plant", **plant}, f"{log.path}: config.yaml")
 
 
-class GapSettings(Strict):
-    """The settings of a gap diagnosis as its log has them; older logs lack some."""
-
-    library: tuple[str, ...] | None
-    leave_out: tuple[str, ...] = ()
-    step: PositiveFloat | None = None
-    most: PositiveInt = 1
-    named_only: bool = False
-    trusted: bool = False
-
-
-def logged_gap_settings(log: LoggedRun, overrides: Iterable[str]) -> dict[str, Any]:
-    """The logged settings of a gap diagnosis with overrides KEY=VALUE, without those that the log lacks.
+def logged_gap_settings(log: LoggedRun, overrides: Iterable[str] = ()) -> Settings:
+    """The logged settings of a gap diagnosis, of which older logs lack some, with overrides KEY=VALUE.
 
     Raises ConfigError for an unknown key or a wrong value, and if the log has no settings.
     """
-    logged = log.about("config")
-    values: dict[str, Any] = {
-        key: json.loads(text) for key in GapSettings.model_fields if (text := logged.get(f"settings.{key}")) is not None
-    }
+    from fdi_torch.gap.problem import Settings  # loads torch, for which a list of logs does not wait
+
+    logged, keys = log.about("config"), [field.name for field in fields(Settings)]
+    values = {key: json.loads(text) for key in keys if (text := logged.get(f"settings.{key}")) is not None}
     if not values:
         raise ConfigError([f"{log.path}: expected the settings of a gap diagnosis, got none; run fdi gap again"])
     for override in overrides:
         key, _, text = override.partition("=")
         listed = key in ("library", "leave_out")
         values[key] = [name for name in text.split(",") if name] if listed else None if text == "null" else text
+    values["library"] = values["library"] or None
+    known = BeforeValidator(lambda given: with_known_keys(given, keys))
     try:
-        return GapSettings(**values).model_dump(exclude_unset=True)
+        return TypeAdapter(Annotated[Settings, known]).validate_python(values)
     except ValidationError as error:
         raise explain(error, Source("--set")) from None

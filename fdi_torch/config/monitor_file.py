@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,14 +11,12 @@ from pydantic import Field, model_validator
 
 from fdi_torch.config.estimation import matching_names, names_in_full
 from fdi_torch.config.live_source import SourceConfig
-from fdi_torch.config.loaded_recordings import separate_recordings
 from fdi_torch.config.problems import Source, naming, naming_source
 from fdi_torch.config.recording_config import RecordingConfig
-from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
+from fdi_torch.config.resolved_config import JobConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.strict import ScaledSeconds, Seconds, Strict
 from fdi_torch.monitor.monitor_settings import CONFIRM, LONGEST, LOOKBACK, MonitorSettings
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.recording import Recording
 
 
 class WindowConfig(Strict):
@@ -38,8 +35,7 @@ class WindowConfig(Strict):
         return MonitorSettings(**self.model_dump(exclude={"stride"}))
 
 
-class MonitorConfig(Strict):
-    plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
+class MonitorConfig(JobConfig):
     recording: RecordingConfig = Field(description="the recording to follow; leave it out with `source`")
     source: SourceConfig | None = Field(None, description="a live source in place of a recording")
     fault_free: tuple[Seconds, Seconds] = Field(
@@ -65,8 +61,6 @@ class MonitorConfig(Strict):
     step: Seconds | None = Field(
         None, description="longest integration step, s; by default about a hundredth of the tanks' emptying time"
     )
-    output: OutputConfig = Field(default_factory=OutputConfig)
-    seed: int = Field(0, ge=0, description="seed of the draws of the noise that set the threshold")
 
     @model_validator(mode="before")
     @classmethod
@@ -81,11 +75,8 @@ class MonitorConfig(Strict):
         return {**data, "recording": {"file": without_credentials, **shared}}
 
 
-@dataclass(frozen=True)
 class MonitorRun(ResolvedFile[MonitorConfig]):
-    """A resolved monitor file. given: recordings in memory, by the name that `file` gives them."""
-
-    given: Mapping[str, Recording] = field(default_factory=dict)
+    """A resolved monitor file."""
 
 
 def load_monitor(path: str | Path, overrides: Iterable[str] = ()) -> MonitorRun:
@@ -98,11 +89,10 @@ def build_monitor(data: Mapping[str, Any], base: Path, source: Source) -> Monito
 
     A `Plant` or a `Recording` object may replace the name of the plant or of the recording's file.
     """
-    (listed, *_), given = separate_recordings([data.get("recording")])
-    config, plant, text = resolve(MonitorConfig, {**data, "recording": listed} if given else data, base, source)
+    config, plant, text = resolve(MonitorConfig, data, base, source)
     with naming_source(source):
         config = _in_full(config, plant)
-    return MonitorRun(config, plant, base, source, text, given)
+    return MonitorRun(config, plant, base, source, text)
 
 
 def _in_full(config: MonitorConfig, plant: PlantDescription) -> MonitorConfig:

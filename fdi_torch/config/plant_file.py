@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Sized
+from collections.abc import Sized
 from dataclasses import MISSING, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 import pydantic
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from fdi_torch.config.plant_in_code import Plant, effect_in_si, effect_parameters, si_value, tolerances_in_si
-from fdi_torch.config.problems import Source, explain, naming
+from fdi_torch.config.problems import Source, naming, validated
 from fdi_torch.config.strict import Acceleration, Amount, Strict, quantity, quantity_of
 from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import expect_kind, find_plant, read_yaml
@@ -30,7 +30,6 @@ from fdi_torch.plant.description import (
     Sensor,
     Tank,
 )
-from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.quantities import SI_UNITS, display_in, unit_factor
 from fdi_torch.untrusted_input import MOST_COMPONENTS
 
@@ -162,10 +161,7 @@ def placeholders(path: Path) -> list[str]:
 
 def build_plant(data: dict[str, Any], source: str) -> Plant:
     """The plant in a mapping. Raises ConfigError, naming `source` and the field."""
-    try:
-        config = PlantConfig.model_validate(data)
-    except ValidationError as error:
-        raise explain(error, Source(source)) from None
+    config = validated(PlantConfig, data, Source(source))
     with naming(source):
         plant = _plant(config)
         return replace(plant, units=written_units(data) | _valid_units(config.units, plant))
@@ -184,14 +180,13 @@ def _valid_units(units: dict[str, str], plant: Plant) -> dict[str, str]:
 
 
 def _plant(config: PlantConfig) -> Plant:
-    flows = {kind: getattr(config, kind.part()) for kind in FLOW_KINDS}
+    flows: dict[Any, dict[str, Strict]] = {kind: getattr(config, kind.part()) for kind in FLOW_KINDS}
     kinds: tuple[Sized, ...] = (config.tanks, *flows.values(), config.sensors, config.effects)
     parts = sum(len(kind) for kind in kinds)
     if parts > MOST_COMPONENTS:
         raise ValueError(f"expected at most {MOST_COMPONENTS} components and effects, got {parts}; split the plant")
     components: dict[str, Any] = {
-        kind.part(): [_flow_component(kind, name, keys) for name, keys in given.items()]
-        for kind, given in flows.items()
+        kind.part(): [kind(name, **dict(keys)) for name, keys in given.items()] for kind, given in flows.items()
     }
     tanks = [Tank(name, **dict(tank)) for name, tank in config.tanks.items()]
     for tank in tanks:
@@ -222,10 +217,6 @@ def _matter(name: str, matter: MatterConfig, plant: Plant) -> FaultPriority:
     if smallest < 0.0:
         raise ValueError(f"matters.{name}.smallest: expected no negative size, got {matter.smallest}")
     return FaultPriority(str(at.sibling(size.name)), smallest, matter.urgency)
-
-
-def _flow_component(kind: Callable[..., FlowComponent], name: str, keys: Strict) -> FlowComponent:
-    return kind(name, **dict(keys))
 
 
 def _sensor(name: str, config: SensorConfig) -> Sensor:

@@ -91,12 +91,14 @@ class Plant(PlantDescription):
         placed = tuple(effect_in_si(i, each, without_effects) for i, each in enumerate(effects))
         with_effects = PlantDescription(name, *parts, placed, gravity=without_effects.gravity, **flows)
         absolute_tolerances = tolerances_in_si(tolerances or {}, with_effects)
+        with naming("varying"):
+            varying = tuple(matching("a constant with a tolerance", varying, absolute_tolerances))
         super().__init__(
             name,
             *parts,
             placed,
             absolute_tolerances,
-            _varying(varying, absolute_tolerances),
+            varying,
             tuple(matters),
             without_effects.gravity,
             **flows,
@@ -115,15 +117,12 @@ class Plant(PlantDescription):
         self,
         inputs: Inputs,
         theta: Mapping[str, float | torch.Tensor] | None = None,
-        *,
-        resolution: float | None = None,
     ) -> PlantOde:
         """dh/dt = f(t, h) of this plant, for `torchdiffeq.odeint`; `.start` holds the start levels.
 
         inputs: a `Recording`, constant inputs (channels,) in SI, or a function of t in s to these. theta: parameters
         that differ from their nominal values, by name in SI, each a number or a tensor (*batch), through which
         gradients flow: {"A.leak.size": size}; on their device, else on that of the inputs, the plant is computed.
-        resolution: time scale of the smoothing of square roots and rims, s.
         Raises ValueError for an unknown parameter, and for actuators with memory or dead time.
         """
         named = {full_name(name, self): value for name, value in (theta or {}).items()}
@@ -134,7 +133,7 @@ class Plant(PlantDescription):
         device = next((v.device for v in named.values() if isinstance(v, torch.Tensor)), None)
         values = (torch.as_tensor(v, dtype=torch.float64, device=device) for v in named.values())
         columns = torch.broadcast_tensors(*values)
-        return PlantOde(network, inputs, space, torch.stack(columns, -1) if columns else None, resolution=resolution)
+        return PlantOde(network, inputs, space, torch.stack(columns, -1) if columns else None)
 
     def __str__(self) -> str:
         """The plant as a plant file."""
@@ -223,12 +222,6 @@ def tolerances_in_si(
             if name not in units and tolerances[name] > 1.0:
                 raise ValueError(f"{place}: expected a share of {name} up to 100 %, such as 3 %, got {value}")
     return tolerances
-
-
-def _varying(patterns: Iterable[str], tolerances: dict[str, float]) -> tuple[str, ...]:
-    """The matching constants. Raises ValueError for a pattern without any constant that has a tolerance."""
-    with naming("varying"):
-        return tuple(matching("a constant with a tolerance", patterns, tolerances))
 
 
 def absolute_units(plant: PlantDescription) -> dict[str, str]:

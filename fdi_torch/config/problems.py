@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from fdi_torch.quantities import NO_COMMAS
+
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class ConfigError(ValueError):
@@ -19,17 +21,21 @@ class ConfigError(ValueError):
     """
 
     def __init__(self, problems: Sequence[str], place: str = "") -> None:
-        self.place = place
+        self.place, self.sentences = place, tuple(problems)
         self.problems = tuple(f"{place}: {problem}" if place else problem for problem in problems)
         super().__init__("\n".join(self.problems))
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where a configuration comes from: its file, or other words for it, and overrides 'KEY=VALUE' of its values."""
+    """Where a configuration comes from: its file, or other words for it, and overrides 'KEY=VALUE' of its values.
+
+    within: a key around all that was given, which messages leave out.
+    """
 
     file: str
     overrides: tuple[str, ...] = ()
+    within: str = ""
 
     def __str__(self) -> str:
         return self.file
@@ -45,7 +51,8 @@ class Source:
 
     def at(self, place: str) -> str:
         """The beginning of a message about a key."""
-        return f"{self.of(place)}: {place}" if place else self.file
+        inside = place.removeprefix(self.within).removeprefix(".")
+        return f"{self.of(place)}: {inside}" if inside else self.of(place)
 
 
 class UnknownKeyError(ValueError):
@@ -54,6 +61,16 @@ class UnknownKeyError(ValueError):
     def __init__(self, sentence: str, key: str) -> None:
         super().__init__(sentence)
         self.key = key
+
+
+def validated(
+    model: type[Model], data: Any, source: Source, known: Mapping[str, str] | None = None, within: tuple[str, ...] = ()
+) -> Model:
+    """The model of the data. Raises ConfigError with a sentence per problem; arguments as of `explain`."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise explain(error, source, known, within) from None
 
 
 def explain(
@@ -71,7 +88,7 @@ def _explained(finding: Mapping[str, Any], source: Source, known: Mapping[str, s
     place = ".".join(map(str, finding["loc"]))
     unknown_key = getattr(finding.get("ctx", {}).get("error"), "key", "")
     origin = source.of(".".join(filter(None, (place, unknown_key))))
-    return ": ".join(filter(None, (origin, place, _sentence(finding, known))))
+    return f"{origin}{source.at(place).removeprefix(source.of(place))}: {_sentence(finding, known)}"
 
 
 @contextmanager
@@ -91,7 +108,7 @@ def naming_source(source: Source) -> Iterator[None]:
     except ConfigError as error:
         if not error.place:
             raise
-        raise ConfigError([f"{source.of(error.place)}: {problem}" for problem in error.problems]) from None
+        raise ConfigError([f"{source.at(error.place)}: {sentence}" for sentence in error.sentences]) from None
 
 
 def _sentence(finding: Any, known: Mapping[str, str]) -> str:

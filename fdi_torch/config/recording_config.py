@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import PurePath
 from typing import Annotated, Any, Literal
 from zoneinfo import ZoneInfo
 
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, model_validator
 
-from fdi_torch.config.problems import Source, explain, shown
+from fdi_torch.config.problems import Source, shown, validated
 from fdi_torch.config.strict import Amount, HeldFor, Seconds, Strict, quantity
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.database import expect_no_password, is_query
@@ -168,11 +168,23 @@ class RecordingConfig(FileConfig):
     hold: Literal["zero_order", "linear"] = Field("zero_order", description="course of inputs between samples")
     trusted: bool = Field(False, description="do not check for wrong units, swapped channels and clock errors")
     start_levels: StartLevels = Field("free", description="free, equilibrium, or a mapping such as {T1: 50 cm}")
+    _in_memory: Recording | None = PrivateAttr(None)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _of_a_recording(cls, data: Any, validated: Callable[[Any], RecordingConfig]) -> RecordingConfig:
+        """Accept a recording in memory in place of the name of its file."""
+        config = validated({"file": data.source} if isinstance(data, Recording) else data)
+        if isinstance(data, Recording):
+            config._in_memory = data
+        return config
+
+    @property
+    def in_memory(self) -> Recording | None:
+        """The recording itself, if it was given in place of a file."""
+        return self._in_memory
 
 
 def config_of(entry: Any) -> RecordingConfig:
     """The entry of a recording from its file name alone, or from its keys. Raises ConfigError naming the key."""
-    try:
-        return RecordingConfig.model_validate(str(entry) if isinstance(entry, PurePath) else entry)
-    except ValidationError as error:
-        raise explain(error, Source("recording")) from None
+    return validated(RecordingConfig, str(entry) if isinstance(entry, PurePath) else entry, Source("recording"))

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import torch
 from pydantic import BeforeValidator, Field
 
-from fdi_torch.capacity import expect_room
 from fdi_torch.config.monitor_file import WindowConfig
-from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
-from fdi_torch.config.simulation import reading_noise
+from fdi_torch.config.resolved_config import JobConfig, ResolvedFile, resolve, values_in
+from fdi_torch.config.simulation import expect_room_for_samples, reading_noise
 from fdi_torch.config.strict import ScaledSeconds, Share, Strict, quantity
 from fdi_torch.effects import build_network, full_name, placements_for
 from fdi_torch.monitor.monitor_setup import with_shapes
@@ -40,30 +39,28 @@ class FalseAlarmConfig(Strict):
     calibrations: int = Field(8, ge=1, description="number of runs from which the noise is estimated")
 
 
-class FaultsFoundConfig(Strict):
-    faults: list[str] = Field(min_length=1, description="faults, one per run")
-    sizes: list[Share] = Field([0.02, 0.05, 0.1, 0.2], min_length=1, description="shares of the fault's range")
-    runs: int = Field(500, ge=1, description="number of runs of each size")
-    named: int = Field(100, ge=0, description="number of these runs in which the monitor also isolates the fault")
+class _FaultyRuns(Strict):
+    faults: list[str] = Field(min_length=1, description="faults, one per run; under naming, abrupt and incipient")
     onset: ScaledSeconds = Field(300.0, description="onset of the fault, s")
     lasts: ScaledSeconds = Field(900.0, description="duration of each run, s")
     window: WindowConfig = Field(default_factory=WindowConfig)
 
 
-class NamingConfig(Strict):
-    faults: list[str] = Field(min_length=1, description="faults, abrupt and (if possible) incipient")
+class FaultsFoundConfig(_FaultyRuns):
+    sizes: list[Share] = Field([0.02, 0.05, 0.1, 0.2], min_length=1, description="shares of the fault's range")
+    runs: int = Field(500, ge=1, description="number of runs of each size")
+    named: int = Field(100, ge=0, description="number of these runs in which the monitor also isolates the fault")
+
+
+class NamingConfig(_FaultyRuns):
     loops: list[Literal["closed", "open"]] = Field(["closed", "open"], description="level control, or commands alone")
     swing: Metres = Field(0.03, description="change of the set points each minute")
     share: Share = Field(0.5, description="relative change of the commands each minute")
     runs: int = Field(200, ge=1, description="number of runs of each loop")
     times: float = Field(3.0, gt=0, description="size of the faults as a multiple of the smallest isolable size")
-    onset: ScaledSeconds = Field(300.0, description="onset of the fault, s")
-    lasts: ScaledSeconds = Field(900.0, description="duration of each run, s")
-    window: WindowConfig = Field(default_factory=WindowConfig)
 
 
-class RehearsalConfig(Strict):
-    plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
+class RehearsalConfig(JobConfig):
     inputs: list[str | float] = Field(
         description="list of constant commands, one per channel of the plant, in its order"
     )
@@ -74,8 +71,6 @@ class RehearsalConfig(Strict):
     false_alarms: FalseAlarmConfig | None = Field(None, description="measure the false alarm rate")
     faults_found: FaultsFoundConfig | None = Field(None, description="measure detection delay, power and isolation")
     naming: NamingConfig | None = Field(None, description="measure isolation of component, sensor and actuator faults")
-    output: OutputConfig = Field(default_factory=OutputConfig)
-    seed: int = Field(0, ge=0, description="seed of all random numbers")
 
 
 Plan = FalseAlarmPlan | DetectionPlan | IsolationPlan
@@ -102,10 +97,8 @@ def _plans(c: RehearsalConfig, plant: PlantDescription) -> Iterable[Plan]:
     every = c.false_alarms_every
 
     def count(seconds: float) -> int:
-        samples = seconds / c.sampling
-        what = f"{samples:.3g} samples, one every {c.sampling:g} s for {seconds:g} s"
-        expect_room(samples, what, "simulate a shorter time, or sample more slowly")
-        return int(samples) + 1
+        expect_room_for_samples(seconds, c.sampling)
+        return int(seconds / c.sampling) + 1
 
     if (f := c.false_alarms) is not None:
         rigs = {name: _rig(c, plant, (), noise) for name, noise in f.noises.items()}

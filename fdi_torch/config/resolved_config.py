@@ -5,20 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
 from fdi_torch.config.key_reference import meanings
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_writer import plant_mapping
-from fdi_torch.config.problems import ConfigError, Source, explain, naming_source, shown
+from fdi_torch.config.problems import ConfigError, Source, naming_source, shown, validated
 from fdi_torch.config.strict import Config, Strict, scaled_to_plant
 from fdi_torch.config.yaml_files import expect_kind, find_file, find_plant, read_extended, with_overrides, write_yaml
 from fdi_torch.effects import units_for_display
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.quantities import display_in
+from fdi_torch.recording import Recording
 
 LONGEST_NAME = 200
 
@@ -35,19 +36,15 @@ class OutputConfig(Strict):
         return name
 
 
-class _WithOutput(Protocol):
-    """What the models of run, monitor and rehearsal files share."""
+class JobConfig(Strict):
+    """What run, monitor and rehearsal files have in common."""
 
-    @property
-    def output(self) -> OutputConfig: ...
-
-    @property
-    def seed(self) -> int: ...
-
-    def model_dump(self, *, mode: str) -> dict[str, Any]: ...
+    plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
+    output: OutputConfig = Field(default_factory=OutputConfig)
+    seed: int = Field(0, ge=0, description="seed of all random numbers")
 
 
-AnyConfig = TypeVar("AnyConfig", bound=_WithOutput)
+AnyConfig = TypeVar("AnyConfig", bound=JobConfig)
 
 
 @dataclass(frozen=True)
@@ -96,14 +93,19 @@ def resolve(
     From now on quantities are displayed in the plant's units. base: folder of relative paths. Raises ConfigError with
     one sentence per problem.
     """
-    try:
-        config = model.model_validate(dict(data))
-    except ValidationError as error:
-        raise explain(error, source, meanings(model)) from None
+    config = validated(model, dict(data), source, meanings(model))
     plant = plant_of(data.get("plant", model.model_fields["plant"].default), base, source)
     config = scaled_to_plant(config, time_scale(plant))
     display_in(units_for_display(plant))
-    return config, plant, write_yaml({**data, "plant": plant_mapping(plant)})
+    written = {key: _written(value) for key, value in data.items()} | {"plant": plant_mapping(plant)}
+    return config, plant, write_yaml(written)
+
+
+def _written(value: Any) -> Any:
+    """A value as YAML holds it: a recording in memory by its name."""
+    if isinstance(value, Recording):
+        return {"file": value.source}
+    return [_written(each) for each in value] if isinstance(value, list | tuple) else value
 
 
 def plant_of(entry: Any, base: Path, source: Source) -> PlantDescription:

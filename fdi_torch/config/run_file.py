@@ -4,31 +4,25 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from pydantic import Field, field_validator, model_validator
 
 from fdi_torch.config.estimation import EstimationConfig
-from fdi_torch.config.loaded_recordings import separate_recordings
 from fdi_torch.config.problems import Source
 from fdi_torch.config.recording_config import RecordingConfig
-from fdi_torch.config.resolved_config import OutputConfig, ResolvedFile, resolve, values_in
+from fdi_torch.config.resolved_config import JobConfig, ResolvedFile, resolve, values_in
 from fdi_torch.config.simulation import SimulationConfig
-from fdi_torch.config.strict import Strict
 from fdi_torch.config.yaml_files import DEFAULT_RUN
 from fdi_torch.estimate.fitting import EngineKind
 from fdi_torch.recording import Recording
 
 
-class RunConfig(Strict):
-    plant: Any = Field("three_tank", description="a shipped plant, a plant file, or the plant itself")
+class RunConfig(JobConfig):
     recordings: list[RecordingConfig] = Field(default_factory=list, description="recordings of the rig")
     simulate: SimulationConfig | None = Field(None, description="or a run to be simulated")
     estimate: EstimationConfig = Field(default_factory=EstimationConfig)
-    output: OutputConfig = Field(default_factory=OutputConfig)
-    seed: int = Field(0, ge=0, description="seed of all random numbers")
     device: str = Field("cpu", description="of the search and the refinement: cpu or cuda")
     engine: EngineKind = Field("auto", description="simulation engine; compiled only on the CPU")
 
@@ -47,11 +41,8 @@ class RunConfig(Strict):
         return self
 
 
-@dataclass(frozen=True)
 class Run(ResolvedFile[RunConfig]):
-    """A resolved run file. given: recordings in memory, by the name that `file` gives them."""
-
-    given: Mapping[str, Recording] = field(default_factory=dict)
+    """A resolved run file."""
 
 
 def load_run(path: str | Path | None = None, overrides: Iterable[str] = ()) -> Run:
@@ -68,7 +59,6 @@ def build_run(data: Mapping[str, Any], base: Path, source: Source) -> Run:
     A `Plant` or a `Recording` object may replace the name of a plant or of a recording's file.
     """
     recordings = data.get("recordings")
-    recordings = [recordings] if isinstance(recordings, Recording) else recordings
-    listed, given = separate_recordings(recordings) if isinstance(recordings, list | tuple) else (recordings, {})
-    config, plant, text = resolve(RunConfig, {**data, "recordings": listed} if given else data, base, source)
-    return Run(config, plant, base, source, text, given)
+    listed = {"recordings": [recordings]} if isinstance(recordings, Recording) else {}
+    config, plant, text = resolve(RunConfig, {**data, **listed}, base, source)
+    return Run(config, plant, base, source, text)

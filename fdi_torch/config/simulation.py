@@ -127,16 +127,16 @@ def noise_std(config: NoiseConfig, plant: PlantDescription, clean: Tensor) -> Te
     return std
 
 
-def _expect_room_for_samples(config: SimulationConfig, plant: PlantDescription) -> None:
-    samples = config.duration / config.sample_time
-    what = f"{samples:.3g} samples, one every {config.sample_time:g} s for {config.duration:g} s"
-    columns = 1 + len(plant.channel_units()) + len(plant.sensors)
-    with naming("simulate"):
-        expect_room(columns * samples, what, "simulate a shorter time, or sample more slowly")
+def expect_room_for_samples(duration: float, interval: float, columns: int = 1) -> None:
+    """Raises ValueError if that many samples of so many columns exceed the memory. duration, interval: s."""
+    what = f"{duration / interval:.3g} samples, one every {interval:g} s for {duration:g} s"
+    expect_room(columns * duration / interval, what, "simulate a shorter time, or sample more slowly")
 
 
 def _clock(config: SimulationConfig, plant: PlantDescription) -> Tensor:
-    _expect_room_for_samples(config, plant)
+    with naming("simulate"):
+        columns = 1 + len(plant.channel_units()) + len(plant.sensors)
+        expect_room_for_samples(config.duration, config.sample_time, columns)
     intervals = round(config.duration / config.sample_time)
     if intervals < 1 or abs(intervals * config.sample_time - config.duration) > 1e-9 * config.duration:
         expected = f"a multiple of sample_time ({config.sample_time:g} s)"

@@ -63,10 +63,6 @@ def _held(value: Any) -> float:
     return math.inf if value == "always" else quantity(value, "s")
 
 
-def _each_in_seconds(value: Any) -> Any:
-    return [quantity(v, "s") for v in value] if isinstance(value, list) else value
-
-
 def quantity_of(unit: str) -> tuple[BeforeValidator, Any]:
     """The validators of a quantity in that unit, for `Annotated`."""
     return BeforeValidator(lambda value: quantity(value, unit)), Field(json_schema_extra={"unit": unit})
@@ -80,7 +76,7 @@ HeldFor = Annotated[float, AllowInfNan(True), BeforeValidator(_held)]
 Decibel = Annotated[float, Field(ge=-300, le=300)]
 _SCALED = "the default is for three_tank"
 ScaledSeconds = Annotated[Seconds, _SCALED]
-ScaledSteps = Annotated[list[float], BeforeValidator(_each_in_seconds), _SCALED]
+ScaledSteps = Annotated[list[Seconds], _SCALED]
 Acceleration = Annotated[float, *quantity_of("m/s^2")]
 
 Amount = float | str

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from fdi_torch.capacity import expect_room
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
 from fdi_torch.config.key_reference import meanings
-from fdi_torch.config.problems import ConfigError, Source, explain
+from fdi_torch.config.problems import ConfigError, Source, validated
 from fdi_torch.config.resolved_config import values_in
 from fdi_torch.config.run_file import Run, RunConfig, build_run
 from fdi_torch.config.simulation import planned_recording
@@ -28,15 +28,7 @@ from fdi_torch.names import unknown
 from fdi_torch.plant.operating_range import bounded_by_recording
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.study.estimators import ESTIMATORS, Estimator
-from fdi_torch.study.study_plan import (
-    Method,
-    Plan,
-    Setting,
-    fault_modes,
-    fixed_faults,
-    mode_faults,
-    uniform_faults,
-)
+from fdi_torch.study.study_plan import Method, Plan, Setting, fault_modes, fixed_faults, mode_faults, uniform_faults
 from fdi_torch.untrusted_input import MOST_SETTINGS, MOST_TRIALS
 
 
@@ -93,27 +85,22 @@ def build_study(data: Mapping[str, Any], base: Path, source: Source) -> Study:
         raise ConfigError([f"{source}: expected a block study, got none; fdi train estimates a single run"])
     block = data["study"]
     run = build_run({key: value for key, value in data.items() if key != "study"}, base, source)
-    try:
-        config = scaled_to_plant(StudyConfig.model_validate(block), time_scale(run.plant))
-    except ValidationError as error:
-        raise explain(error, source, meanings(StudyFile), within=("study",)) from None
+    config = validated(StudyConfig, block, source, meanings(StudyFile), within=("study",))
+    config = scaled_to_plant(config, time_scale(run.plant))
     text = run.text + write_yaml({"study": block})
     return Study(config, run, _plan(config, run), text)
 
 
 def _plan(config: StudyConfig, run: Run) -> Plan:
     fitting = _fitting(run)
+    as_configured = ("search_step", "search_every", "starts", "searches", "data_step")
     method = Method(
         estimators=tuple(config.estimators),
         objective=run.config.estimate.objective.search,
         search=EvolutionSettings(population=config.population, evaluations=config.evaluations),
-        search_step=config.search_step,
-        search_every=config.search_every,
-        starts=config.starts,
-        searches=config.searches,
         steps=tuple(config.steps),
         refine=RefineSettings(iterations=run.config.estimate.refine.iterations),
-        data_step=config.data_step,
+        **{name: getattr(config, name) for name in as_configured},
     )
     definition = run.config.simulate.noise.definition if run.config.simulate else "variance"
     with tensors_on(fitting.device):

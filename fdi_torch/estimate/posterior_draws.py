@@ -20,6 +20,7 @@ from torch import Tensor
 
 from fdi_torch.estimate.strategy import reflected
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.progress import Tell, silent
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
 
 # Rank-normalised split R-hat and effective sample size from which draws count as converged (Vehtari et al. 2021,
@@ -144,7 +145,7 @@ def draw_posterior(
     draws: int = 1000,
     seed: int = 0,
     most_steps: int = 16_000,
-    tell: Callable[[float, str], None] = lambda share, text: None,
+    tell: Tell = silent,
 ) -> Draws:
     """Draw from exp(-cost) within the bounds of the space until the draws have converged, or for `most_steps` steps.
 

@@ -26,11 +26,12 @@ from fdi_torch.gap.preprocess.outliers import sensor_with_outliers
 from fdi_torch.gap.preprocess.sensor_limits import noise_before_clipping, with_noise_limits
 from fdi_torch.gap.problem import PLAIN, DiagnosisProblem, Settings, problem_of
 from fdi_torch.gap.screening import options_of
-from fdi_torch.gap.stage_progress import ProgressCallback, StageProgress
+from fdi_torch.gap.stage_progress import StageProgress
 from fdi_torch.gap.structure_search import search
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of_all, with_simulated_levels
+from fdi_torch.progress import Tell, silent
 from fdi_torch.recording import Recording
 
 CONTENT = 0.95
@@ -41,7 +42,7 @@ def diagnose(
     recording: Recording | Sequence[Recording],
     holdout: Recording | Sequence[Recording] | None = None,
     settings: Settings = PLAIN,
-    progress: ProgressCallback = lambda share, text: None,
+    progress: Tell = silent,
 ) -> Answer:
     """Find out why the plant file does not explain one or several recordings, by causes that are common to all.
 
@@ -52,7 +53,7 @@ def diagnose(
     return solve_problem(problem_of(plant, recordings, holdouts, settings), progress)
 
 
-def solve_problem(problem: DiagnosisProblem, progress: ProgressCallback = lambda share, text: None) -> Answer:
+def solve_problem(problem: DiagnosisProblem, progress: Tell = silent) -> Answer:
     """Run the stages of the diagnosis. progress: receives the share done and the name of the stage."""
     data, library, plant = problem.data, problem.library, problem.data.plant
     progress(0.05, "noise and recalibration")

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.verdict_words import explanation_words
-
-ProgressCallback = Callable[[float, str], None]
-"""Receives the share done of a diagnosis, from 0 to 1, and a line about it."""
+from fdi_torch.progress import Tell, silent
 
 
 @dataclass
@@ -19,7 +17,7 @@ class StageProgress:
     The share is that of the steps done among those known so far, between begin and end, and never falls.
     """
 
-    progress: ProgressCallback = lambda share, text: None
+    progress: Tell = silent
     stage: str = ""
     begin: float = 0.0
     end: float = 1.0

@@ -15,12 +15,12 @@ from fdi_torch.config.plant_writer import dump_plant, plant_mapping
 from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.diagnose import solve_problem
 from fdi_torch.gap.problem import PLAIN, Settings, problem_of
-from fdi_torch.gap.stage_progress import ProgressCallback
 from fdi_torch.jobs.log_paths import STARTS_OVER
 from fdi_torch.jobs.logged_recordings import log_prediction, log_recording
 from fdi_torch.logbook import RunLog
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.progress import Tell, silent
 from fdi_torch.recording import Recording
 
 
@@ -30,7 +30,7 @@ def run_gap(
     recording: Recording | Sequence[Recording],
     holdouts: Sequence[Recording] = (),
     settings: Settings = PLAIN,
-    tell: ProgressCallback = lambda share, text: None,
+    tell: Tell = silent,
     parent_run_id: str | None = None,
 ) -> Answer:
     """Diagnose the gap, and write the log `path`: recordings, progress messages and the answer."""
@@ -57,7 +57,7 @@ def run_gap(
 
         said = ""
 
-        def say(share: float, text: str) -> None:
+        def say(share: float | None, text: str) -> None:
             nonlocal said
             if text != said:
                 log.say(text)

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import torch
 
-from fdi_torch.config.run_file import Run
 from fdi_torch.estimate.evolution import Search
 from fdi_torch.logbook import LogError, Message, last_state, read_run, set_aside, unfinished
 from fdi_torch.logbook.reader import Run as Log
@@ -73,12 +72,15 @@ def find_unfinished(folder: Path, name: str, text: str) -> tuple[Path, Log | Non
     return path, unfinished(path)
 
 
-def expect_unfinished(folder: Path, name: str, text: str) -> tuple[Path, Log | None]:
-    """As `find_unfinished`. Raises ValueError if there is no log of that name either."""
-    unfinished = find_unfinished(folder, name, text)
-    if unfinished is None:
+def log_to_write(folder: Path, name: str, text: str, resume: bool, begin: bool = False) -> tuple[Path, Log | None]:
+    """Path of the log to write, and with `resume` the unfinished log of a run of the same configuration, if it began.
+
+    begin: whether to start anew if there is no log of that name. Raises ValueError if there is none, or a finished one.
+    """
+    unfinished = find_unfinished(folder, name, text) if resume else None
+    if resume and not begin and unfinished is None:
         raise ValueError(f"{folder}: expected an unfinished log {name}.mcap, got none; start without --resume")
-    return unfinished
+    return unfinished or (free_path(folder, name), None)
 
 
 def _has_ended(path: Path, log: Log | None) -> bool:
@@ -97,16 +99,11 @@ def _read_log(path: Path) -> Log | None:
     return log if log.config_text else None
 
 
-def unfinished_search(folder: Path, run: Run) -> tuple[Path, tuple[Message, ...], Search | None]:
-    """Path of the log to write, and messages and search state of an unfinished run at its last complete generation."""
-    path, before = expect_unfinished(folder, run.name, run.text)
-    state = None if before is None else last_state(before)
-    if before is None or state is None:
-        return path, (), None
+def unfinished_search(log: Log | None, device: str) -> tuple[tuple[Message, ...], Search | None]:
+    """Messages and search state of an unfinished run at its last complete generation."""
+    state = None if log is None else last_state(log)
+    if log is None or state is None:
+        return (), None
     generation, arrays = state
-    copied = (m for m in before.messages() if m.topic in COPIED_TOPICS and m.payload.get("generation", 0) <= generation)
-    return (
-        path,
-        tuple(copied),
-        Search.from_dict({name: torch.tensor(array, device=run.config.device) for name, array in arrays.items()}),
-    )
+    copied = (m for m in log.messages() if m.topic in COPIED_TOPICS and m.payload.get("generation", 0) <= generation)
+    return tuple(copied), Search.from_dict({name: torch.tensor(each, device=device) for name, each in arrays.items()})

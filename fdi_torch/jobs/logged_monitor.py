@@ -18,11 +18,11 @@ import torch
 from torch import Tensor
 
 from fdi_torch.amounts import faults_in_words
-from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.config.problems import naming, naming_source
 from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.jobs.monitor_rows import CLOCK, FROM_SOURCE, event_fields, samples_of_rows
+from fdi_torch.live.row_buffer import Row
 from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.monitor.diagnosability import diagnosability
 from fdi_torch.monitor.events import Event
@@ -32,6 +32,7 @@ from fdi_torch.monitor.samples import Samples, samples_of_recording
 from fdi_torch.monitor.window_monitor import WindowMonitor
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.progress import Tell, silent
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import data_warnings
 
@@ -45,9 +46,9 @@ class MonitorCallbacks:
     log: receives every log message.
     """
 
-    tell: Callable[[float | None, str], None]
-    event: Callable[[Event], None]
-    ready: Callable[[PreparedMonitor], None]
+    tell: Tell = silent
+    event: Callable[[Event], None] = lambda event: None
+    ready: Callable[[PreparedMonitor], None] = lambda prepared: None
     log: Listener | None = None
 
 

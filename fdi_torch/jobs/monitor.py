@@ -19,15 +19,16 @@ from pathlib import Path
 from typing import TypeVar
 
 from fdi_torch.clock import clock_text, show_clock
-from fdi_torch.config.growing_recordings import Row, growing_rows
-from fdi_torch.config.live_source import LiveRows
-from fdi_torch.config.loaded_recordings import read_recording
+from fdi_torch.config.growing_recordings import growing_rows
+from fdi_torch.config.live_source import live_rows
+from fdi_torch.config.loaded_recordings import expect_file, read_recording
 from fdi_torch.config.monitor_file import MonitorRun
-from fdi_torch.jobs.learning_items import LearningItems
-from fdi_torch.jobs.log_paths import RESUMES, expect_unfinished, free_path, partial_path
+from fdi_torch.config.problems import naming_source
+from fdi_torch.jobs.log_paths import RESUMES, log_to_write, partial_path
 from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.monitor_rows import (
     ALARM,
+    LearningItems,
     event_key,
     fault_free_recording,
     logged_items,
@@ -36,6 +37,7 @@ from fdi_torch.jobs.monitor_rows import (
     rows_in,
     rows_until,
 )
+from fdi_torch.live.row_buffer import Row, RowSource
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook import RunLog
 from fdi_torch.names import counted
@@ -65,18 +67,20 @@ def run_monitor(
     run of the same file or source; the result is the same as without the interruption, and events in the earlier log
     are not reported again.
     """
-    path, unfinished = _log_to_write(run, resume)
+    path, unfinished = log_to_write(Path(run.config.output.folder), run.name, run.text, resume)
     follow = follow or run.config.source is not None
+    whole = None
     if not follow:
         callbacks.tell(0.0, "reading")
-    whole = None if follow else read_recording(run.config.recording, run.plant, run.base, run.given)
+        with naming_source(run.source):
+            expect_file(run.config.recording, "recording", run.base)
+        whole = read_recording(run.config.recording, run.plant, run.base)
     kept = LearningItems(path) if run.config.source is not None else None
     earlier, origin = _earlier(run, unfinished, kept, resume) if follow else ([], None)
     messages = unfinished.messages([ALARM]) if unfinished is not None else ()
     reported = Counter(event_key(message.payload) for message in messages)
-    zeros: list[float] = []
     try:  # before the log begins, so that a source that cannot be reached leaves none
-        source = _source(run, idle, origin, rows_in(earlier), zeros) if follow else iter(())
+        source = _source(run, idle, origin, rows_in(earlier)) if follow else None
     except BaseException:
         if unfinished is not None:
             os.replace(unfinished.path, partial_path(path))  # for the next attempt to resume
@@ -85,9 +89,9 @@ def run_monitor(
     with RunLog(path, "monitor", **records, listener=callbacks.log, after_interruption=RESUMES) as log:
         monitor = LoggedMonitor(run, log, callbacks, reported)
         try:
-            if whole is None:
-                _follow(monitor, callbacks, source, earlier, zeros, kept)
-            else:
+            if source is not None:
+                _follow(monitor, callbacks, source, earlier, kept)
+            elif whole is not None:
                 show_clock([whole.clock_zero])
                 if run.config.recording.every > 1:  # the inputs' mean until the next kept sample is known only then
                     whole = whole.stretch(0, len(whole) - 1)
@@ -96,12 +100,6 @@ def run_monitor(
         finally:
             log.result({"events": monitor.events, "faults": monitor.faults()})
     return MonitorSummary(monitor.alarms, monitor.lasted, monitor.spent, path)
-
-
-def _log_to_write(run: MonitorRun, resume: bool) -> tuple[Path, LoggedRun | None]:
-    """Path of the log to write, and with `resume` the unfinished log to continue."""
-    folder = Path(run.config.output.folder)
-    return expect_unfinished(folder, run.name, run.text) if resume else (free_path(folder, run.name), None)
 
 
 def _earlier(
@@ -119,21 +117,18 @@ def _earlier(
     return items, origin
 
 
-def _source(
-    run: MonitorRun, idle: float | None, origin: float | None, earlier_rows: Sequence[Row], zeros: list[float]
-) -> Iterator[Row | str]:
-    """The rows of the live source, or else of the growing file, whose time 0 is appended to `zeros`."""
+def _source(run: MonitorRun, idle: float | None, origin: float | None, earlier_rows: Sequence[Row]) -> RowSource:
+    """The rows of the live source, or else of the growing file."""
     if run.config.source is not None:
-        return LiveRows(run.config.source, run.plant, math.inf if idle is None else idle, origin, earlier_rows)
-    return growing_rows(run.config.recording, run.plant, run.base, IDLE if idle is None else idle, zeros.append)
+        return live_rows(run.config.source, run.plant, math.inf if idle is None else idle, origin, earlier_rows)
+    return growing_rows(run.config.recording, run.plant, run.base, IDLE if idle is None else idle)
 
 
 def _follow(
     monitor: LoggedMonitor,
     callbacks: MonitorCallbacks,
-    source: Iterator[Row | str],
+    source: RowSource,
     earlier: Sequence[Row | str],
-    zeros: list[float],
     kept: LearningItems | None,
 ) -> None:
     """Process samples as they come, after waiting for the end of the fault-free part.
@@ -143,9 +138,9 @@ def _follow(
     run = monitor.run
     batches = LiveBatches(resumed_items(earlier, source) if rows_in(earlier) else source)
     callbacks.tell(None, "waiting for samples")
-    received = batches if kept is None else kept.keeping(batches, lambda: getattr(source, "origin", None))
+    received = batches if kept is None else kept.keeping(batches, lambda: source.origin)
     first = _until_fault_free_part_ends(run, callbacks, received)
-    zero = source.origin if isinstance(source, LiveRows) else next(iter(zeros), None)
+    zero = source.origin
     show_clock([zero])
     monitor.learn(fault_free_recording(rows_in(first), run))
     if zero is not None:
@@ -194,10 +189,6 @@ LATE, SILENT = 5.0, 2.0  # s of delay and of silence that are never reported
 BURST_INTERVALS = 10.0  # a longer silence, in sampling intervals, followed by as many samples is a burst
 
 
-class _End:
-    """Marks the end of the source."""
-
-
 class LiveBatches(Iterator[list[T]]):
     """Iterator over batches: all items that a thread has read from the source since the previous batch.
 
@@ -205,7 +196,7 @@ class LiveBatches(Iterator[list[T]]):
     """
 
     def __init__(self, source: Iterator[T]) -> None:
-        self._queue: queue.Queue[T | BaseException | _End] = queue.Queue(LARGEST_BATCH)
+        self._queue: queue.Queue[T | BaseException] = queue.Queue(LARGEST_BATCH)
         self._end: BaseException | None = None
         threading.Thread(target=self._read, args=(source,), daemon=True, name="live-batches").start()
 
@@ -213,7 +204,7 @@ class LiveBatches(Iterator[list[T]]):
         try:
             for item in source:
                 self._queue.put(item)
-            self._queue.put(_End())
+            self._queue.put(StopIteration())
         except BaseException as error:
             self._queue.put(error)
 
@@ -224,9 +215,7 @@ class LiveBatches(Iterator[list[T]]):
                 item = self._queue.get_nowait() if batch else self._queue.get()
             except queue.Empty:
                 return batch
-            if isinstance(item, _End):
-                self._end = StopIteration()
-            elif isinstance(item, BaseException):
+            if isinstance(item, BaseException):
                 self._end = item
             else:
                 batch.append(item)

@@ -4,16 +4,20 @@ the samples and events in a monitor's log.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from itertools import chain, pairwise, takewhile
+from pathlib import Path
 from typing import Any
 
 import orjson
 import torch
 
-from fdi_torch.config.growing_recordings import Row
 from fdi_torch.config.monitor_file import MonitorRun
+from fdi_torch.disk import named_errors
+from fdi_torch.live.row_buffer import Row
 from fdi_torch.logbook import Run as Log
 from fdi_torch.logbook import series
 from fdi_torch.monitor.events import FORMAT, Event
@@ -21,6 +25,8 @@ from fdi_torch.monitor.samples import GAP, Samples
 from fdi_torch.recording import Recording
 
 ALARM, CLOCK = "/observer/alarm", "/source/clock"
+Items = list[Row | str]
+"""Rows and notices."""
 FROM_SOURCE = "from_source"
 """Field of an alarm message: whether it is a notice about the delivery of samples."""
 
@@ -172,3 +178,46 @@ def event_fields(event: Event) -> dict[str, Any]:
         "format": FORMAT,
         "details": orjson.dumps(event.to_dict()).decode(),
     }
+
+
+class LearningItems:
+    """What a live source has delivered while a monitor learns, in a file beside the log, which begins with what was
+    learnt: a run that is killed while it learns, which may take hours, can be resumed.
+
+    Each line is a batch: time 0 of the source, s since 1970 or null, and its items.
+    """
+
+    def __init__(self, log: Path) -> None:
+        self.path = log.with_name(f"{log.name}.learning")
+
+    def read(self) -> tuple[list[Row | str], float | None]:
+        """All items, and time 0; nothing without a file. A line that a killed run has not finished is left out."""
+        items, origin = list[Row | str](), None
+        if self.path.exists():
+            with suppress(orjson.JSONDecodeError):
+                for line in self.path.read_bytes().splitlines():
+                    zero, batch = orjson.loads(line)
+                    origin = zero if origin is None else origin
+                    items += [item if isinstance(item, str) else _without_null(*item) for item in batch]
+        return items, origin
+
+    def keeping(
+        self, batches: Iterator[list[Row | str]], origin: Callable[[], float | None]
+    ) -> Iterator[list[Row | str]]:
+        """The batches, each added to the file before it is passed on. origin: time 0 of the source."""
+        known = len(self.read()[0])  # a resumed run begins with them
+        for batch in batches:
+            with named_errors(self.path), self.path.open("ab") as file:
+                file.write(orjson.dumps([origin(), batch[known:]]) + b"\n")
+            known = max(known - len(batch), 0)
+            yield batch
+
+    def remove(self) -> None:
+        """Remove the file, once the log has its items."""
+        self.path.unlink(missing_ok=True)
+
+
+def _without_null(time: float, *values: list[float | None]) -> Row:
+    """A row with NaN for unknown values."""
+    inputs, readings = ([math.nan if x is None else x for x in each] for each in values)
+    return time, inputs, readings

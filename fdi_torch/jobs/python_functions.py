@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings, read_recording
 from fdi_torch.config.monitor_file import MonitorRun, build_monitor, load_monitor
 from fdi_torch.config.plant_file import AnyPlant, chosen_plant
-from fdi_torch.config.problems import ConfigError, Source
+from fdi_torch.config.problems import Source
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.study_file import Study, build_study, load_study
 from fdi_torch.effects.catalogue import Catalogue
@@ -30,16 +30,17 @@ from fdi_torch.jobs.gap import library_entries, one_thread, run_gap
 from fdi_torch.jobs.log_paths import free_path
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
-from fdi_torch.jobs.progress import Tell, TellEndless, rounded, silent
 from fdi_torch.jobs.python_results import FreeRun, GapResult, MonitorResult, RefitResult
 from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.monitor.events import Event
 from fdi_torch.names import unknown
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.progress import Tell, rounded, silent
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import doubts_about
 
 AnyRecording = Recording | Mapping[str, Any] | str | Path
+Resolved = TypeVar("Resolved")
 AnyRun = Run | Mapping[str, Any] | str | Path
 
 
@@ -54,11 +55,16 @@ def _keys(run: Any, advice: str = "name its recordings as the next argument; ") 
     return run
 
 
+def _resolved(given: Any, kind: type[Resolved], load: Any, build: Any, job: str, **advice: str) -> Resolved:
+    """What a file, its keys, or itself describe. job: named in messages about keys; advice: as of `_keys`."""
+    if isinstance(given, str | Path):
+        return load(given)
+    return given if isinstance(given, kind) else build(_keys(given, **advice), Path.cwd(), Source(job))
+
+
 def _run_of(run: Any, job: str) -> Run:
-    """The run of a file, of its keys, or the built-in example for None. job: named in messages about a mapping."""
-    if run is None or isinstance(run, str | Path):
-        return load_run(run)
-    return run if isinstance(run, Run) else build_run(_keys(run), Path.cwd(), Source(job))
+    """The run of a file, of its keys, or the built-in example for None."""
+    return load_run() if run is None else _resolved(run, Run, load_run, build_run, job)
 
 
 def _plant_and_recordings(plant: Any, recordings: Any, job: str) -> tuple[PlantDescription, list[Recording]]:
@@ -71,7 +77,7 @@ def _plant_and_recordings(plant: Any, recordings: Any, job: str) -> tuple[PlantD
     run = _run_of(plant, job)
     if run.config.simulate is not None:
         return run.plant, [simulate_recording(run)]
-    loaded = load_recordings(run.config.recordings, run.plant, run.base, run.given)
+    loaded = load_recordings(run.config.recordings, run.plant, run.base)
     return run.plant, [part.recording for part in loaded]
 
 
@@ -103,11 +109,8 @@ def simulate(
     if isinstance(plant, Run | Mapping):
         raise TypeError("simulate: expected either a run or a plant with the keys of simulate, got both; keep one")
     named = {} if plant is None else {"plant": plant}
-    try:
-        return simulate_recording(build_run({**named, "simulate": given}, Path.cwd(), Source("simulate")))
-    except ConfigError as error:  # in a run file, the arguments are the keys of simulate
-        problems = [problem.removeprefix("simulate: ").removeprefix("simulate.") for problem in error.problems]
-        raise ConfigError([f"simulate: {problem}" for problem in problems]) from None
+    source = Source("simulate", within="simulate")  # the arguments are keys of simulate in a run file
+    return simulate_recording(build_run({**named, "simulate": given}, Path.cwd(), source))
 
 
 def train(
@@ -176,7 +179,7 @@ def monitor(
     plant: AnyPlant | MonitorRun | Mapping[str, Any],
     recording: AnyRecording | None = None,
     *,
-    tell: TellEndless = silent,
+    tell: Tell = silent,
     **keys: Any,
 ) -> MonitorResult:
     """Run a monitor along a recording, as `fdi monitor` does.
@@ -191,12 +194,9 @@ def monitor(
         run = {"plant": plant, "recording": recording, **keys}
     elif keys:
         raise TypeError(f"monitor: expected a recording beside {', '.join(keys)}, got none; name it")
-    if isinstance(run, str | Path):
-        run = load_monitor(run)
-    elif not isinstance(run, MonitorRun):
-        run = build_monitor(_keys(run), Path.cwd(), Source("monitor"))
+    run = _resolved(run, MonitorRun, load_monitor, build_monitor, "monitor")
     events: list[Event] = []
-    summary = run_monitor(run, MonitorCallbacks(rounded(tell), events.append, lambda prepared: None))
+    summary = run_monitor(run, MonitorCallbacks(rounded(tell), events.append))
     return MonitorResult(tuple(events), summary.lasted, summary.spent, summary.log)
 
 
@@ -263,11 +263,8 @@ def study(
     or 'local'. tell(share, text): receives the progress, from 0 to 1, and a line about it; by default nothing is shown,
     and tell=print prints it.
     """
-    if isinstance(study, str | Path):
-        study = load_study(study)
-    elif not isinstance(study, Study):
-        study = build_study(_keys(study, advice=""), Path.cwd(), Source("study"))
-    return study_job.run_study(study, resume, cluster, rounded(tell))
+    given = _resolved(study, Study, load_study, build_study, "study", advice="")
+    return study_job.run_study(given, resume, cluster, rounded(tell))
 
 
 def effects(plant: AnyPlant | None = None) -> Catalogue:
@@ -289,7 +286,5 @@ def recordings_of(wanted: AnyRecording | Sequence[AnyRecording], plant: PlantDes
         if isinstance(each, str | Path):
             segments += named_recordings(str(each), plant, Path.cwd())
             continue
-        given = {each.source: each} if isinstance(each, Recording) else None
-        whole = read_recording(each.source if isinstance(each, Recording) else each, plant, given=given)
-        segments += [part for part in whole.known_segments() if len(part) > 1]
+        segments += [part for part in read_recording(each, plant).known_segments() if len(part) > 1]
     return segments

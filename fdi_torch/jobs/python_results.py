@@ -16,6 +16,7 @@ from fdi_torch.gap.free_runs.refit import Refit, narrowed
 from fdi_torch.gap.verdict_words import MEAN_FLOW, explanation_words, verdict_sentence
 from fdi_torch.logbook import read_run
 from fdi_torch.monitor.events import Event
+from fdi_torch.names import counted
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text
@@ -92,7 +93,7 @@ class MonitorResult(Shown):
     @property
     def headline(self) -> str:
         alarms = sum(event.kind == "alarm" for event in self.events)
-        count = "no alarm" if not alarms else "1 alarm" if alarms == 1 else f"{alarms} alarms"
+        count = counted(alarms, "alarm") if alarms else "no alarm"
         isolated = [event for event in self.events if event.kind in ("isolated", "revised")]
         return f"{count} in {self.lasted:g} s" + (f"; {isolated[-1].headline}" if isolated else "")
 

@@ -7,26 +7,25 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.config.loaded_recordings import LoadedRecording
+from fdi_torch.config.loaded_recordings import LoadedRecording, start_levels_of
 from fdi_torch.config.logged_config import logged_gap_settings, logged_mapping, logged_plant
 from fdi_torch.config.monitor_file import build_monitor
 from fdi_torch.config.problems import Source
 from fdi_torch.config.run_file import Run, build_run
 from fdi_torch.config.study_file import build_study
 from fdi_torch.config.yaml_files import with_overrides
-from fdi_torch.gap.diagnose import Settings
 from fdi_torch.jobs import study as study_job
 from fdi_torch.jobs.gap import groups, run_gap
 from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.logged_recordings import logged_recording
 from fdi_torch.jobs.monitor_rows import fault_free_recording, logged_items, rows_in
-from fdi_torch.jobs.progress import TellEndless, silent
 from fdi_torch.jobs.run_setup import fitting_of, requested_space
 from fdi_torch.jobs.study import TRIAL, log_summary, log_trials
 from fdi_torch.jobs.train import STATE, estimate_logged, log_recordings, state_is_due
 from fdi_torch.logbook import LogError, Message, RunLog, series
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook.replay import Select
+from fdi_torch.progress import Tell, silent
 from fdi_torch.study.monte_carlo import Trial, run_blocks
 
 # A replay uses the log's data, so configuration keys of the data cannot be changed.
@@ -38,7 +37,7 @@ def repeat_run(
     path: Path,
     overrides: Iterable[str] = (),
     trials: Sequence[int] = (),
-    tell: TellEndless = silent,
+    tell: Tell = silent,
 ) -> Path:
     """Repeat the run of a log of `fdi train`, `fdi study`, `fdi gap` or `fdi monitor`, and log it at `path`.
 
@@ -49,7 +48,7 @@ def repeat_run(
     kind, parent = about.get("kind", ""), about.get("run_id", "")
     if trials and kind != "study":
         raise ValueError(f"--trial: expected a study's log, got one of fdi {kind}: {log.path}; leave --trial out")
-    replays: dict[str, Callable[[LoggedRun, Path, Sequence[str], TellEndless, str], None]] = {
+    replays: dict[str, Callable[[LoggedRun, Path, Sequence[str], Tell, str], None]] = {
         "train": replay_estimate,
         "study": partial(replay_study, trials=trials),
         "gap": replay_gap,
@@ -62,7 +61,7 @@ def repeat_run(
     return path
 
 
-def replay_estimate(log: LoggedRun, path: Path, overrides: Sequence[str], tell: TellEndless, parent: str) -> None:
+def replay_estimate(log: LoggedRun, path: Path, overrides: Sequence[str], tell: Tell, parent: str) -> None:
     """Repeat an estimation from the recordings in the log."""
     run = logged_run(log, overrides)
     if run.config.estimate.windows is not None:
@@ -81,16 +80,15 @@ def replay_estimate(log: LoggedRun, path: Path, overrides: Sequence[str], tell: 
         estimate_logged(run, fitting, again, tell)
 
 
-def replay_monitor(log: LoggedRun, path: Path, overrides: Sequence[str], tell: TellEndless, parent: str) -> None:
+def replay_monitor(log: LoggedRun, path: Path, overrides: Sequence[str], tell: Tell, parent: str) -> None:
     """Repeat a monitor run along the samples in the log."""
     _expect_no_data(overrides, ("recording",))
     run = build_monitor(*_logged_values(log, overrides))
-    callbacks = MonitorCallbacks(tell, lambda event: None, lambda prepared: None)
     items = logged_items(log, run)
     about = log.about("data")
     data = [{"path": about["0.path"], "sha256": about.get("0.sha256", "")}] if "0.path" in about else []
     with RunLog(path, "monitor", **run.log_records(data), parent_run_id=parent) as again:
-        monitor = LoggedMonitor(run, again, callbacks)
+        monitor = LoggedMonitor(run, again, MonitorCallbacks(tell))
         monitor.learn(fault_free_recording(rows_in(items), run))
         monitor.process_items(items)
         monitor.close()
@@ -98,7 +96,7 @@ def replay_monitor(log: LoggedRun, path: Path, overrides: Sequence[str], tell: T
 
 
 def replay_study(
-    log: LoggedRun, path: Path, overrides: Sequence[str], tell: TellEndless, parent: str, *, trials: Sequence[int]
+    log: LoggedRun, path: Path, overrides: Sequence[str], tell: Tell, parent: str, *, trials: Sequence[int]
 ) -> None:
     """Repeat trials of a study, and its summary if all trials are repeated."""
     study = build_study(*_logged_values(log, overrides))
@@ -169,14 +167,14 @@ def logged_recordings(log: LoggedRun, run: Run) -> list[LoadedRecording]:
         for topic in topics
         if topic.endswith("/output")
     ]
-    levels = start_levels(run, len(groups), log.path)
+    levels = _start_levels(run, len(groups), log.path)
     return [
         LoadedRecording(logged_recording(log, group, k), level)
         for k, (group, level) in enumerate(zip(groups, levels, strict=True))
     ]
 
 
-def start_levels(run: Run, count: int, path: Path) -> list[Any]:
+def _start_levels(run: Run, count: int, path: Path) -> list[Any]:
     """Configured initial levels of each recording."""
     if run.config.simulate is not None:
         return [run.config.simulate.start_levels] * count
@@ -185,25 +183,17 @@ def start_levels(run: Run, count: int, path: Path) -> list[Any]:
             f"{path}: expected {len(run.config.recordings)} recordings, got {count}; "
             "the log is incomplete and cannot be replayed"
         )
-    tanks = [tank.name for tank in run.plant.tanks]
-    wanted = [recording.start_levels for recording in run.config.recordings]
-    return [{t: w.get(t, "free") if isinstance(w, dict) else w for t in tanks} for w in wanted]
+    return [start_levels_of(recording.start_levels, run.plant, recording) for recording in run.config.recordings]
 
 
-def replay_gap(log: LoggedRun, path: Path, overrides: Sequence[str], tell: TellEndless, parent: str) -> None:
+def replay_gap(log: LoggedRun, path: Path, overrides: Sequence[str], tell: Tell, parent: str) -> None:
     """Repeat a diagnosis into the log `path`.
 
     overrides: changed settings, such as library=pump_lag,leak@T1, leave_out=pump_lag, step=0.5, named_only=true.
     """
-    settings = settings_of(log, overrides)
+    settings = logged_gap_settings(log, overrides)
     sources = [name for name in log.about("data") if name.endswith(".path")]
     diagnosed = int(log.about("config").get("recordings", 1))
     names = groups(max(len(sources) - diagnosed, 0), diagnosed)
     recordings = [logged_recording(log, group, k) for k, group in enumerate(names)]
     run_gap(path, logged_plant(log), recordings[:diagnosed], recordings[diagnosed:], settings, tell, parent)
-
-
-def settings_of(log: LoggedRun, overrides: Iterable[str] = ()) -> Settings:
-    """The logged settings with overrides. Raises ConfigError for an unknown key or a wrong value."""
-    given = logged_gap_settings(log, overrides)
-    return Settings(**given | {"library": given["library"] or None})

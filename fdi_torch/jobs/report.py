@@ -11,9 +11,9 @@ from pathlib import Path
 from fdi_torch import logbook
 from fdi_torch.config.logged_config import logged_plant
 from fdi_torch.disk import write_text
-from fdi_torch.jobs.progress import Tell, rounded, silent
 from fdi_torch.logbook import Comparison, Run, read_run
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.progress import Tell, rounded, silent
 from fdi_torch.report.comparison import comparison_section, in_words, result_table
 from fdi_torch.report.comparison_headline import comparison_headline, setting_differences
 from fdi_torch.report.html import Markup

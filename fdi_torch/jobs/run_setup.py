@@ -28,7 +28,8 @@ from fdi_torch.simulate.simulated_recording import clean_readings, with_noise
 def recordings_of(run: Run) -> list[LoadedRecording]:
     """The recordings of a run file without unusable readings, or the simulated recording that it asks for."""
     if run.config.simulate is None:
-        loaded = load_recordings(run.config.recordings, run.plant, run.base, run.given)
+        with naming_source(run.source):
+            loaded = load_recordings(run.config.recordings, run.plant, run.base)
         parts = [replace(part, recording=_usable_readings(run, part.recording)) for part in loaded]
         for part in parts:
             if not bool(part.recording.mask.any()):

@@ -13,17 +13,16 @@ from typing import Any
 
 from fdi_torch.config.rehearsal_file import Rehearsal
 from fdi_torch.config.study_file import Study
-from fdi_torch.jobs.log_paths import RESUMES, find_unfinished, free_path
-from fdi_torch.jobs.progress import Tell, silent
+from fdi_torch.jobs.log_paths import RESUMES, log_to_write
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.logbook.reader import Run as LoggedRun
 from fdi_torch.monitor.monte_carlo.simulated_runs import ResultTable
 from fdi_torch.names import counted
+from fdi_torch.progress import Tell, silent
 from fdi_torch.study.cluster import run_on_cluster
-from fdi_torch.study.mode_isolation import Isolation, count_modes
 from fdi_torch.study.monte_carlo import Trial, run_blocks
 from fdi_torch.study.study_plan import Plan
-from fdi_torch.study.summary import Score, Summary, summarise
+from fdi_torch.study.summary import Isolation, Summary, count_modes, summarise
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
 
 TRIAL = "/study/trial"
@@ -49,32 +48,27 @@ class StudyResult(Shown):
     def table(self) -> Table:
         """One row per setting, estimator and parameter; bias and RMSE in the parameter's unit for display."""
         names = ("setting", "estimator", "parameter", "unit", "bias", "RMSE", "RMSE / bound", "coverage")
-        rows = [
-            (s.setting, e.estimator, e.parameter, *in_display_unit(e.parameter, e.unit, e.bias, e.rmse), *_ratios(e))
-            for s in self.summaries
-            for e in s.scores
-        ]
+        rows = []
+        for setting, e in ((summary.setting, score) for summary in self.summaries for score in summary.scores):
+            ratios = [None if ratio is None else ratio.value for ratio in (e.over_bound, e.coverage)]
+            bias = in_display_unit(e.parameter, e.unit, e.bias, e.rmse)
+            rows.append((setting, e.estimator, e.parameter, *bias, *ratios))
         return Table.of_rows(names, rows)
-
-
-def _ratios(score: Score) -> list[float | None]:
-    return [None if ratio is None else ratio.value for ratio in (score.over_bound, score.coverage)]
 
 
 def run_study(
     study: Study,
     resume: bool = False,
     cluster: str | None = None,
-    tell: Tell | None = None,
+    tell: Tell = silent,
     listener: Listener | None = None,
 ) -> StudyResult:
     """Compute every trial that the log does not have yet. tell(share, text): progress, called after each block.
 
     cluster: address of a Dask scheduler, or 'local'; None: this process. listener: receives every log message.
     """
-    tell = tell or silent
     output = study.run.config.output
-    path, before = new_and_unfinished_log(Path(output.folder), study.run.name, study.text, resume)
+    path, before = log_to_write(Path(output.folder), study.run.name, study.text, resume, begin=True)
     with RunLog(path, "study", **origin_of(study), listener=listener, after_interruption=RESUMES) as log:
         trials = copied_trials(log, before)
         copied = len(trials)
@@ -96,15 +90,6 @@ def origin_of(study: Study) -> dict[str, Any]:
     keys = study.config.model_dump(mode="json") | {"all_trials": study.plan.trials}
     resolved = study.run.resolved | {"study": keys}
     return {"config_text": study.text, "config": resolved, "seeds": {"seed": study.plan.seed}}
-
-
-def new_and_unfinished_log(folder: Path, name: str, text: str, resume: bool) -> tuple[Path, LoggedRun | None]:
-    """Path of the log to write, and with `resume` the log of an unfinished run of the same configuration, if any.
-
-    Raises ValueError if that run is complete or had another configuration.
-    """
-    unfinished = find_unfinished(folder, name, text) if resume else None
-    return unfinished or (free_path(folder, name), None)
 
 
 def copied_trials(log: RunLog, before: LoggedRun | None) -> dict[int, Trial]:
@@ -173,7 +158,7 @@ def rehearse(
 ) -> RehearsalResult:
     """Compute every task that the log does not have yet. tell(share, text): progress, called before each task."""
     folder = Path(rehearsal.config.output.folder)
-    path, before = new_and_unfinished_log(folder, rehearsal.name, rehearsal.text, resume)
+    path, before = log_to_write(folder, rehearsal.name, rehearsal.text, resume, begin=True)
     tasks = [task for plan in rehearsal.plans for task in plan.tasks()]
     records = rehearsal.log_records()
     with RunLog(path, "rehearsal", **records, listener=listener, after_interruption=RESUMES) as log:

@@ -22,9 +22,8 @@ from fdi_torch.estimate.profile import Profile
 from fdi_torch.estimate.refinement import HybridSettings
 from fdi_torch.estimate.uncertainty import Estimate
 from fdi_torch.jobs.estimate_uncertainty import profiled_names, profiles_of, with_draws
-from fdi_torch.jobs.log_paths import RESUMES, free_path, unfinished_search
+from fdi_torch.jobs.log_paths import RESUMES, log_to_write, unfinished_search
 from fdi_torch.jobs.logged_recordings import log_prediction, log_recording
-from fdi_torch.jobs.progress import Tell, rounded, silent
 from fdi_torch.jobs.run_setup import (
     fitting_of,
     hybrid_settings,
@@ -34,6 +33,7 @@ from fdi_torch.jobs.run_setup import (
 )
 from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
+from fdi_torch.progress import Tell, rounded, silent
 from fdi_torch.recordings.check import doubts_about
 from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import notebook_svg, save
@@ -111,14 +111,13 @@ class TrainResult(Shown):
         return self.fitting.recordings[recording].compared(self.result.predicted[recording])
 
 
-def train(run: Run, tell: Tell | None = None, resume: bool = False, listener: Listener | None = None) -> TrainResult:
+def train(run: Run, tell: Tell = silent, resume: bool = False, listener: Listener | None = None) -> TrainResult:
     """Carry out a run file: load or simulate the recordings, estimate, diagnose, log and draw.
 
     tell(share, text): progress. Results before an error or Ctrl-C stay readable in the log. resume: continue from the
     last generation in the log of a killed or interrupted run of the same file; the result is the same as without the
     interruption. listener: receives every log message.
     """
-    tell = tell or silent
     if run.config.estimate.windows is not None:
         place = run.source.at("estimate.windows")
         raise ConfigError([f"{place}: expected none, got {run.config.estimate.windows:g} s; fdi train fits windows"])
@@ -127,8 +126,8 @@ def train(run: Run, tell: Tell | None = None, resume: bool = False, listener: Li
     loaded = recordings_of(run)
     fitting = fitting_of(run, space, loaded)
     truth = simulated_truth(run)
-    folder = Path(run.config.output.folder)
-    path, before, search = unfinished_search(folder, run) if resume else (free_path(folder, run.name), (), None)
+    path, unfinished = log_to_write(Path(run.config.output.folder), run.name, run.text, resume)
+    before, search = unfinished_search(unfinished, run.config.device)
     records = run.log_records(part.recording.origin for part in loaded)
     with RunLog(path, "train", **records, listener=listener, after_interruption=RESUMES) as log:
         if not log.carry_over(before):

@@ -15,11 +15,11 @@ from fdi_torch.config.run_file import Run
 from fdi_torch.effects import without_startup_effects
 from fdi_torch.estimate.windows import Stretch, Window, cut_up, noise_of, stretches_of, window_of, window_step
 from fdi_torch.jobs.log_paths import STARTS_OVER, free_path
-from fdi_torch.jobs.progress import Tell, silent
 from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, requested_space
 from fdi_torch.jobs.train import log_recordings
 from fdi_torch.logbook import RunLog
 from fdi_torch.parameters import is_effect_parameter
+from fdi_torch.progress import Tell, silent
 from fdi_torch.recordings.check import doubts_about
 
 

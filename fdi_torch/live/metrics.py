@@ -11,8 +11,7 @@ import orjson
 from fdi_torch.logbook.topic_definitions import Channel
 from fdi_torch.tables import needed
 
-PORT = 9464
-"""Default port of the OpenTelemetry exporter for Prometheus."""
+TOPICS = ("/plant/input", "/plant/output", "/observer/residual", "/observer/alarm", "/diagnosis/fault")
 
 
 class Metrics:
@@ -47,43 +46,30 @@ class Metrics:
 
     def __call__(self, channel: Channel, log_time: int, data: bytes) -> None:
         """Take one message of the log."""
-        handler = _HANDLERS.get(channel.topic)
-        if handler is not None:
-            handler(self, orjson.loads(data))
-
-    def _input(self, payload: dict[str, Any]) -> None:
-        _set_all(self._inputs, payload)
-
-    def _output(self, payload: dict[str, Any]) -> None:
-        self._samples.inc()
-        self._time.set(payload["t"])
-        _set_all(self._readings, payload)
-
-    def _residual(self, payload: dict[str, Any]) -> None:
-        tests = {name: payload.pop(name) for name in list(payload) if name.endswith(("_statistic", "_threshold"))}
-        for name, value in tests.items():
-            if value is not None:
-                self._detector.labels(name.rpartition("_")[2]).set(value)
-        _set_all(self._residuals, payload)
-
-    def _event(self, payload: dict[str, Any]) -> None:
-        self._events.labels(payload["event"]).inc()
-
-    def _fault(self, payload: dict[str, Any]) -> None:
-        name = f"{payload['location']}.{payload['fault']}"
-        self._present.labels(name).set(bool(payload["present"]))
-        for gauge, key in ((self._probability, "probability"), (self._size, "size")):
-            if payload.get(key) is not None:
-                gauge.labels(name).set(payload[key])
-
-
-_HANDLERS = {
-    "/plant/input": Metrics._input,
-    "/plant/output": Metrics._output,
-    "/observer/residual": Metrics._residual,
-    "/observer/alarm": Metrics._event,
-    "/diagnosis/fault": Metrics._fault,
-}
+        if channel.topic not in TOPICS:
+            return
+        payload = orjson.loads(data)
+        match channel.topic:
+            case "/plant/input":
+                _set_all(self._inputs, payload)
+            case "/plant/output":
+                self._samples.inc()
+                self._time.set(payload["t"])
+                _set_all(self._readings, payload)
+            case "/observer/residual":
+                tests = [name for name in payload if name.endswith(("_statistic", "_threshold"))]
+                for name in tests:
+                    if (value := payload.pop(name)) is not None:
+                        self._detector.labels(name.rpartition("_")[2]).set(value)
+                _set_all(self._residuals, payload)
+            case "/observer/alarm":
+                self._events.labels(payload["event"]).inc()
+            case "/diagnosis/fault":
+                name = f"{payload['location']}.{payload['fault']}"
+                self._present.labels(name).set(bool(payload["present"]))
+                for gauge, key in ((self._probability, "probability"), (self._size, "size")):
+                    if payload.get(key) is not None:
+                        gauge.labels(name).set(payload[key])
 
 
 def _set_all(gauge: Any, payload: dict[str, Any]) -> None:
@@ -94,7 +80,7 @@ def _set_all(gauge: Any, payload: dict[str, Any]) -> None:
 
 
 @contextmanager
-def serve_metrics(host: str = "127.0.0.1", port: int = PORT, kinds: Iterable[str] = ()) -> Iterator[Metrics]:
+def serve_metrics(host: str, port: int, kinds: Iterable[str]) -> Iterator[Metrics]:
     """A server of /metrics during the block. port 0: any free port. kinds: as of `Metrics`.
 
     Raises ValueError for an address in use.

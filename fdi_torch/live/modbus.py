@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from fdi_torch.live.values import Address, BackOff, Item, Value
+from fdi_torch.live.values import Address, Item, Value
 from fdi_torch.names import unknown
 from fdi_torch.tables import needed
 
@@ -26,6 +26,8 @@ MOST_REGISTERS = 125
 """Registers of one request (Modbus application protocol, V1.1b3, 6.3)."""
 TIMEOUT = 1.0
 """Time within which a device must answer, s."""
+FIRST_RETRY, LONGEST_RETRY = 0.5, 30.0
+"""Waiting times between attempts to connect, s; doubled after each."""
 
 
 @dataclass(frozen=True, order=True)
@@ -100,7 +102,7 @@ class ModbusSource:
         self._blocks = list(blocks([*self._registers.values(), *([] if self._clock is None else [self._clock])]))
         self._period, self._second, self._device, self._word_order = period, second, device, word_order
         self._client = library.ModbusTcpClient(address.host, port=address.port, timeout=TIMEOUT, retries=1)
-        self._place, self._back_off, self._lost_at = address.place, BackOff(), -1.0
+        self._place, self._retry, self._lost_at = address.place, FIRST_RETRY, -1.0
         self._start, self._due = time.time() - time.monotonic(), time.monotonic()
         try:
             self._poll()  # a device that answers nothing useful is refused at once
@@ -121,8 +123,7 @@ class ModbusSource:
         items: list[Item] = []
         if self._lost_at >= 0.0:
             items.append(f"connected to {self._place} again after {time.monotonic() - self._lost_at:.1f} s")
-            self._lost_at = -1.0
-            self._back_off.succeeded()
+            self._lost_at, self._retry = -1.0, FIRST_RETRY
         # Planned times are evenly spaced; the answer comes some milliseconds later.
         stamp = self._start + planned if self._clock is None else numbers[self._clock] * self._second
         return [*items, *(Value(tag, stamp, numbers[register]) for tag, register in self._registers.items())]
@@ -132,7 +133,8 @@ class ModbusSource:
 
     def _failed(self, error: str) -> list[Item]:
         self._client.close()
-        self._due = time.monotonic() + self._back_off.failed()
+        self._due = time.monotonic() + self._retry
+        self._retry = min(2.0 * self._retry, LONGEST_RETRY)
         if self._lost_at >= 0.0:
             return []
         self._lost_at = time.monotonic()

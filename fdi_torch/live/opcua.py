@@ -10,7 +10,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC
 from typing import Any
 
 from fdi_torch.live.values import Address, Inbox, Item, Value, credentials
@@ -70,7 +70,9 @@ class OpcUaSource:
             self._lost_at = None
         value = data.monitored_item.Value
         stamp = value.SourceTimestamp or value.ServerTimestamp
-        at = time.time() if stamp is None else _utc(stamp).timestamp()
+        if stamp is not None and stamp.tzinfo is None:  # some versions of asyncua leave UTC out
+            stamp = stamp.replace(tzinfo=UTC)
+        at = time.time() if stamp is None else stamp.timestamp()
         is_number = value.StatusCode.is_good() and isinstance(number, bool | int | float)
         self._deliver(Value(self._names[node.nodeid], at, float(number) if is_number else math.nan))
 
@@ -164,11 +166,6 @@ class OpcUaSource:
     async def _lost(self, error: Exception) -> None:
         self._lost_at = time.monotonic()
         self._inbox.put([f"connection to {self._place} lost ({_text(error)}); trying again"])
-
-
-def _utc(stamp: datetime) -> datetime:
-    """OPC UA times are in UTC; some versions of asyncua leave the zone out."""
-    return stamp.replace(tzinfo=UTC) if stamp.tzinfo is None else stamp
 
 
 def _text(error: Exception) -> str:

@@ -7,7 +7,7 @@ earlier rows, so that rows leave in the order of their stamps.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from fdi_torch.live.values import Value
@@ -20,6 +20,21 @@ monitor likewise requires ten sampling intervals for a gap."""
 
 Row = tuple[float, list[float], list[float]]
 """Time, s, the plant's inputs and its readings, SI; NaN for missing values."""
+
+
+class RowSource(Iterator[Row | str]):
+    """Rows as they come, and a sentence for each event of their source."""
+
+    def __init__(self, rows: Iterator[Row | str], origin: Callable[[], float | None]) -> None:
+        self._rows, self._origin = rows, origin
+
+    @property
+    def origin(self) -> float | None:
+        """Time 0 of the rows, s since 1970; None before the first row, and if the clock has no date."""
+        return self._origin()
+
+    def __next__(self) -> Row | str:
+        return next(self._rows)
 
 
 @dataclass(frozen=True)

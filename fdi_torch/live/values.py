@@ -122,21 +122,3 @@ class Inbox:
                 items.insert(0, f"{self._dropped} values came faster than the monitor processes them and were dropped")
                 self._dropped = 0
         return items
-
-
-FIRST_RETRY, LONGEST_RETRY = 0.5, 30.0  # s
-
-
-class BackOff:
-    """Waiting times between attempts to connect, s: doubled after each failure up to LONGEST_RETRY."""
-
-    def __init__(self) -> None:
-        self._next = FIRST_RETRY
-
-    def failed(self) -> float:
-        """The time to wait before the next attempt."""
-        wait, self._next = self._next, min(2.0 * self._next, LONGEST_RETRY)
-        return wait
-
-    def succeeded(self) -> None:
-        self._next = FIRST_RETRY

@@ -5,6 +5,7 @@ A finding is a sentence with the numbers behind it, in SI. Nothing here judges a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from fdi_torch.names import counted
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.recording import Recording
+from fdi_torch.recording import Recording, runs_of
 from fdi_torch.recordings.input_sampling import undersampled_inputs
 from fdi_torch.recordings.plant_limits import ChannelFinding, plant_findings
 from fdi_torch.recordings.repeated_readings import resolution
@@ -93,21 +94,17 @@ def doubts_about(recordings: Sequence[Recording], plant: PlantDescription) -> tu
 
 
 def _summaries(recording: Recording) -> Iterator[ChannelSummary]:
-    for name, unit, values in zip(recording.input_names, recording.input_units, recording.inputs.T, strict=True):
-        yield _summary(name, "input", unit, values, 0)
-    readings = zip(recording.output_names, recording.output_units, recording.outputs.T, recording.mask.T, strict=True)
-    for name, unit, values, mask in readings:
-        yield _summary(name, "output", unit, values, int((torch.isfinite(values) & ~mask).sum()))
-
-
-def _summary(name: str, role: str, unit: str, values: Tensor, masked: int) -> ChannelSummary:
-    finite = values[torch.isfinite(values)]
-    missing = len(values) - len(finite)
-    if not len(finite):
-        nan = float("nan")
-        return ChannelSummary(name, role, unit, nan, nan, nan, 0.0, missing, masked)
-    low, high, mean = (float(f) for f in (finite.min(), finite.max(), finite.mean()))
-    return ChannelSummary(name, role, unit, low, high, mean, resolution(finite), missing, masked)
+    r, masked = recording, torch.isfinite(recording.outputs) & ~recording.mask
+    inputs = zip(r.input_names, r.input_units, r.inputs.T, [0] * len(r.input_names), strict=True)
+    outputs = zip(r.output_names, r.output_units, r.outputs.T, masked.sum(dim=0).tolist(), strict=True)
+    for role, channels in (("input", inputs), ("output", outputs)):
+        for name, unit, values, ignored in channels:
+            known = values[torch.isfinite(values)]
+            low, high, mean = (
+                float(f(known)) if len(known) else math.nan for f in (torch.amin, torch.amax, torch.mean)
+            )
+            step, missing = resolution(known), len(values) - len(known)
+            yield ChannelSummary(name, role, unit, low, high, mean, step, missing, ignored)
 
 
 def _clock_findings(time: Tensor, steps: Tensor, interval: float) -> Iterator[ChannelFinding]:
@@ -169,7 +166,7 @@ def _constant_inputs(recording: Recording) -> Iterator[ChannelFinding]:
 def _missing_inputs(recording: Recording) -> Iterator[ChannelFinding]:
     for name, values in zip(recording.input_names, recording.inputs.T, strict=True):
         unknown = torch.isnan(values)
-        runs = _runs(unknown)
+        runs = runs_of(unknown)
         if len(runs) > MANY_RUNS:
             text = (
                 f"unknown at {int(unknown.sum())} of {len(values)} samples, in {len(runs)} stretches: the recording is "
@@ -177,9 +174,9 @@ def _missing_inputs(recording: Recording) -> Iterator[ChannelFinding]:
             )
             yield ChannelFinding("unknown", name, text, {"count": int(unknown.sum()), "stretches": len(runs)})
             continue
-        for first, last in runs:
-            start, stop = float(recording.time[first]), float(recording.time[last])
-            samples = counted(last - first + 1, "sample")
+        for first, after in runs:
+            start, stop = float(recording.time[first]), float(recording.time[after - 1])
+            samples = counted(after - first, "sample")
             text = f"unknown from {start:g} s to {stop:g} s ({samples}): the recording is cut there"
             yield ChannelFinding("unknown", name, text, {"start": start, "stop": stop})
 
@@ -201,10 +198,3 @@ def _missing_readings(recording: Recording) -> Iterator[ChannelFinding]:
         if missing:
             text = f"{missing} of {len(values)} readings are missing: they do not count"
             yield ChannelFinding("missing", name, text, {"count": missing})
-
-
-def _runs(flags: Tensor) -> list[tuple[int, int]]:
-    """First and last index of each run of True."""
-    padded = flags.to(torch.int8)
-    edges = torch.diff(padded, prepend=padded.new_zeros(1), append=padded.new_zeros(1)).nonzero().flatten().tolist()
-    return [(first, after - 1) for first, after in zip(edges[::2], edges[1::2], strict=True)]

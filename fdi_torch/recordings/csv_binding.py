@@ -5,7 +5,7 @@ configuration.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isnan
 from pathlib import Path
@@ -14,7 +14,7 @@ from fdi_torch.names import nearest, shortened, similar
 from fdi_torch.quantities import si_unit_of, unit_factor
 from fdi_torch.recordings.csv_cells import BAD, GOOD_WORDS, Columns, Rule
 from fdi_torch.recordings.csv_text import Heading, header_unit
-from fdi_torch.recordings.source import ChannelSource, ClockSource
+from fdi_torch.recordings.source import ChannelSource, ClockSource, clock_in
 from fdi_torch.recordings.time_stamps import StampReader
 from fdi_torch.units import spelled
 
@@ -154,13 +154,17 @@ def _unit_in(path: Path, column: str, name: str) -> str:
     return name_and_unit[1]
 
 
-def columns_of(path: Path, heading: Heading, bounds: Sequence[Bound], clock: ClockSource, sparse: bool) -> Columns:
-    """The columns of the file to read, each once, in the order of their first use: time comes first.
-
-    clock: the format of its time stamps. sparse: whether empty cells differ from cells that report a bad value.
-    """
-    bounds = [each for bound in bounds for each in (bound, *bound.plus)]
+def bind_table(
+    path: Path, heading: Heading, names: Sequence[str], sources: Mapping[str, ChannelSource]
+) -> tuple[Bound, list[Bound], Columns]:
+    """The clock, the channels, and the columns to read: each once, in the order of first use, time first."""
+    source = clock_in(sources)
+    clock = bind_clock(path, heading.names, source)
+    channels = [bind(path, heading.names, name, sources.get(name)) for name in names]
+    sparse = any(sources[name].held > 0.0 for name in names if name in sources)
+    bounds = [clock, *(each for bound in channels for each in (bound, *bound.plus))]
     positions = list(dict.fromkeys(b.position for b in bounds if b.position is not None))
     rules = {b.position: b.rule for b in bounds if b.position is not None and b.rule is not None}
-    stamps = next((b.position for b in bounds if b.stamps), None)
-    return Columns(path, heading, positions, stamps, StampReader(clock.stamps, clock.zone), rules, sparse)
+    stamps = clock.position if clock.stamps else None
+    columns = Columns(path, heading, positions, stamps, StampReader(source.stamps, source.zone), rules, sparse)
+    return clock, channels, columns

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from fdi_torch.recording import Hold, Recording
-from fdi_torch.recordings.csv_binding import Bound, bind, bind_clock, columns_of, unit_notes
+from fdi_torch.recordings.csv_binding import Bound, bind, bind_table, unit_notes
 from fdi_torch.recordings.csv_cells import Columns, parse_carefully, parse_fast
 from fdi_torch.recordings.csv_tags import read_tags
 from fdi_torch.recordings.csv_text import heading_of, names_in, open_csv
@@ -69,11 +69,7 @@ def read_csv_files(
     A channel is taken from the first file whose `columns` name it, or else from the first with it in its header.
     """
     names_by_file = _assign_to_files(files, (*inputs, *outputs))
-    parts = [
-        _read_tagged(file, names) if file.tags else _read_rows(file, names)
-        for file, names in zip(files, names_by_file, strict=True)
-        if names
-    ]
+    parts = [_read(file, names) for file, names in zip(files, names_by_file, strict=True) if names]
     sources = {
         name: f.columns[name]
         for f, names in zip(files, names_by_file, strict=True)
@@ -117,57 +113,61 @@ def _assign_to_files(files: Sequence[FileSource], names: Sequence[str]) -> list[
     return names_by_file
 
 
-def _read_rows(file: FileSource, names: Sequence[str]) -> Read:
-    """A file with one row per instant: one sheet."""
-    path, clock_source = file.path, clock_in(file.columns)
+Rows = tuple[str, np.ndarray, np.ndarray, Sequence[Bound], np.ndarray]
+"""Rows of channels with common times: their tag for messages, row numbers, cells of the clock, channels, and values."""
+
+
+def _read(file: FileSource, names: Sequence[str]) -> Read:
+    """The channels of a file, in order of time: in one sheet, or in one for each tag."""
+    path, source = file.path, clock_in(file.columns)
+    clock, bounds, parts, notes, stamps = _tagged_rows(file, names) if file.tags else _table_rows(file, names)
+    sheets = []
+    for tag, numbers, cells, channels, values in parts:
+        place, of = f"{path}: row {{}}{tag}, column {clock.header}", tag[2:-1]
+        seconds = _clock(cells, clock, source, place, numbers)
+        order = in_order(seconds, values, source.sort, place, numbers, _summer_time_hint(clock, source))
+        sheets.append(Sheet(f"{path}{tag}", order.seconds, tuple(b.name for b in channels), order.values))
+        notes += [f"{of}: {note}" if of else note for note in order.notes]
+    first = float(sheets[0].seconds[0]) if sheets else 0.0
+    return Read(
+        sheets,
+        {b.name: b.si_unit for b in bounds},
+        {b.name: spelled(b.unit) for b in (clock, *bounds) if b.unit},
+        {b.name: b.constant for b in bounds if b.position is None},
+        clock.stamps,
+        offset_of_zone(first, source.zone) if sheets and source.zone else stamps.offset,
+        [f"{path.name}: {note}" for note in notes],
+    )
+
+
+def _table_rows(
+    file: FileSource, names: Sequence[str]
+) -> tuple[Bound, list[Bound], list[Rows], list[str], StampReader]:
+    """The clock, all channels, their rows, notes, and the reader of time stamps of a file with a row per instant."""
+    path = file.path
     with open_csv(path, file.sheet) as handle:
         heading, lines = heading_of(path, handle, file.header)
-        clock = bind_clock(path, heading.names, clock_source)
-        bounds = [bind(path, heading.names, name, file.columns.get(name)) for name in names]
-        sparse = any(file.columns[name].held > 0.0 for name in names if name in file.columns)
-        columns = columns_of(path, heading, [clock, *bounds], clock_source, sparse)
+        clock, bounds, columns = bind_table(path, heading, names, file.columns)
         table, notes = _read_table(lines, columns)
-    place, first = f"{path}: row {{}}, column {clock.header}", heading.lines + 1
-    cells = np.arange(len(table)) if clock.position is None else table[:, 0]
-    seconds = _clock(cells, clock, clock_source, place, first)
+    numbers = np.arange(len(table))
+    cells = numbers if clock.position is None else table[:, 0]
     in_file = [b for b in bounds if b.position is not None]
-    values = channels_in_si(table, columns, in_file)
-    order = in_order(seconds, values, clock_source.sort, place, first, _summer_time_hint(clock, clock_source))
-    sheet = Sheet(str(path), order.seconds, tuple(b.name for b in in_file), order.values)
-    notes = [f"{path.name}: {note}" for note in (*unit_notes(bounds), *notes, *order.notes)]
-    zone = _zone(clock_source, columns.read_stamp, order.seconds)
-    return Read([sheet], *_units_and_constants(clock, bounds), clock.stamps, zone, notes)
+    rows = ("", numbers + heading.lines + 1, cells, in_file, channels_in_si(table, columns, in_file))
+    return clock, bounds, [rows], [*unit_notes(bounds), *notes], columns.read_stamp
 
 
-def _read_tagged(file: FileSource, names: Sequence[str]) -> Read:
-    """A file with one row per value: one sheet per channel."""
-    path, clock_source = file.path, clock_in(file.columns)
+def _tagged_rows(
+    file: FileSource, names: Sequence[str]
+) -> tuple[Bound, list[Bound], list[Rows], list[str], StampReader]:
+    """As `_table_rows`, of a file with a row per value."""
     constant = [name for name in names if (source := file.columns.get(name)) and source.constant is not None]
     clock, tagged = read_tags(file, [name for name in names if name not in constant])
-    sheets, notes = [], []
-    for bound, rows, stamps, numbers in tagged:
-        place = f"{path}: row {{}} ({bound.header}), column {clock.header}"
-        seconds = _clock(stamps, clock, clock_source, place, 0, rows)
-        values = (numbers * np.float64(bound.factor))[:, None]
-        order = in_order(seconds, values, clock_source.sort, place, 0, _summer_time_hint(clock, clock_source), rows)
-        sheets.append(Sheet(f"{path} ({bound.header})", order.seconds, (bound.name,), order.values))
-        notes += [f"{path.name}: {bound.header}: {note}" for note in order.notes]
-    bounds = [bound for bound, *_ in tagged] + [bind(path, (), name, file.columns[name]) for name in constant]
-    zone = _zone(clock_source, StampReader(), sheets[0].seconds) if sheets else 0.0
-    return Read(sheets, *_units_and_constants(clock, bounds), clock.stamps, zone, notes)
-
-
-def _zone(source: ClockSource, read: StampReader, seconds: np.ndarray) -> float:
-    """How far the file's clock is ahead of UTC, s: by the zone of its column of time, or else by its stamps."""
-    return offset_of_zone(float(seconds[0]), source.zone) if source.zone else read.offset
-
-
-def _units_and_constants(
-    clock: Bound, bounds: Sequence[Bound]
-) -> tuple[dict[str, str], dict[str, str], dict[str, float]]:
-    """SI units of the channels, their units and that of time in the file, and the values of constant channels."""
-    written = {b.name: spelled(b.unit) for b in (clock, *bounds) if b.unit}
-    return {b.name: b.si_unit for b in bounds}, written, {b.name: b.constant for b in bounds if b.position is None}
+    rows: list[Rows] = [
+        (f" ({bound.header})", numbers, stamps, [bound], (values * np.float64(bound.factor))[:, None])
+        for bound, numbers, stamps, values in tagged
+    ]
+    bounds = [bound for bound, *_ in tagged] + [bind(file.path, (), name, file.columns[name]) for name in constant]
+    return clock, bounds, rows, [], StampReader()
 
 
 def _columns(whole: Sheet, names: Sequence[str], constants: Mapping[str, float]) -> np.ndarray:
@@ -235,22 +235,11 @@ def _blocks(path: Path, lines: Iterable[str]) -> Iterator[list[str]]:
         raise ValueError(f"{path}: expected a whole CSV file, got one that is cut off or damaged: {error}") from None
 
 
-def _clock(
-    cells: np.ndarray,
-    clock: Bound,
-    source: ClockSource,
-    place: str,
-    first: int,
-    rows: np.ndarray | None = None,
-) -> np.ndarray:
-    """Time of each row (R,), s, since 1970 for time stamps.
-
-    place: format of a row in messages; its number counts from `first`, or is listed in `rows`.
-    """
+def _clock(cells: np.ndarray, clock: Bound, source: ClockSource, place: str, rows: np.ndarray) -> np.ndarray:
+    """Time of each row (R,), s, since 1970 for time stamps. place: format of a row in messages; rows: their numbers."""
     seconds = cells * clock.factor
     if not np.isfinite(seconds).all():
-        row = int(np.flatnonzero(~np.isfinite(seconds))[0])
-        number = first + row if rows is None else int(rows[row])
+        number = rows[np.flatnonzero(~np.isfinite(seconds))[0]]
         raise ValueError(f"{place.format(number)}: expected a time in every row, got none")
     if source.zone:
         seconds = from_zone(seconds, source.zone)

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from fdi_torch.recordings.csv_binding import bind, bind_clock, columns_of
+from fdi_torch.recordings.csv_binding import bind_table
 from fdi_torch.recordings.csv_cells import parse_carefully
 from fdi_torch.recordings.csv_files import SINCE_1970, channels_in_si, from_first
 from fdi_torch.recordings.csv_text import heading_of, joined, open_csv
 from fdi_torch.recordings.sheets import fill_held
-from fdi_torch.recordings.source import ChannelSource, clock_in
+from fdi_torch.recordings.source import ChannelSource
 from fdi_torch.recordings.table_files import TableText
 
 
@@ -41,14 +41,10 @@ class GrowingCsv:
             raise ValueError(
                 f"{path}: expected UTF-8 in a file that is still being written, got UTF-16; write it in UTF-8"
             )
-        clock = clock_in(mapping)
-        self._clock = bind_clock(path, heading.names, clock)
-        self._inputs = [bind(path, heading.names, name, mapping.get(name)) for name in inputs]
-        self._outputs = [bind(path, heading.names, name, mapping.get(name)) for name in outputs]
+        self._clock, channels, self._columns = bind_table(path, heading, (*inputs, *outputs), mapping)
+        self._inputs, self._outputs = channels[: len(inputs)], channels[len(inputs) :]
         sources = [mapping.get(name, ChannelSource()) for name in inputs]
         self._held = {k: source.held for k, source in enumerate(sources) if source.held > 0.0}
-        bounds = [self._clock, *self._inputs, *self._outputs]
-        self._columns = columns_of(path, heading, bounds, clock, bool(self._held))
         self._logged = np.empty((0, 1 + len(inputs)))  # the last rows with a logged value of a held input
         self._line = heading.lines
         self._first: float | None = None

@@ -226,7 +226,8 @@ def _with_units(
         names = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, cells, strict=True)]
         number, first = number + 1, next(remaining, None)
         cells = [] if first is None else _cells(path, first, delimiter, number)
-    date = next((k for k, pair in enumerate(pairwise(cells)) if _is_date_and_time(*pair)), None)
+    dated = (k for k, (a, b) in enumerate(pairwise(cells)) if _DATE.fullmatch(a) and _TIME_OF_DAY.fullmatch(b))
+    date = next(dated, None)
     if date is not None and date + 1 < len(names):
         names[date : date + 2] = [f"{names[date]} {names[date + 1]}"]
     heading = Heading(tuple(names), delimiter, number, date)
@@ -236,10 +237,6 @@ def _with_units(
 # A workbook writes a date with the time of day 00:00:00.
 _DATE = re.compile(r"(\d{1,4}[./-]\d{1,2}[./-]\d{1,4})(?:[T ]00:00:00)?", re.ASCII)
 _TIME_OF_DAY = re.compile(r"\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d+)?)?(?: ?[AaPp][Mm])?", re.ASCII)
-
-
-def _is_date_and_time(date: str, time: str) -> bool:
-    return bool(_DATE.fullmatch(date) and _TIME_OF_DAY.fullmatch(time))
 
 
 def joined(lines: Iterable[str], heading: Heading) -> Iterator[str]:

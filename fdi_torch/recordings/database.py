@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, quote, unquote, urlsplit
 
-from fdi_torch.recordings.parquet import plain_values
+from fdi_torch.recordings.arrow import plain_values
 from fdi_torch.recordings.table_files import Row, tab_separated
 from fdi_torch.tables import needed
 

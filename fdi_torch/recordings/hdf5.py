@@ -37,4 +37,4 @@ def rows(path: Path, sheet: str | None) -> Iterator[Row]:
         arrays = {name: item[()] for name, item in datasets.items()}
         if "MATLAB_class" in {key for item in datasets.values() for key in item.attrs}:
             arrays = {name: array.T for name, array in arrays.items()}  # MATLAB stores columns as rows
-    return rows_of_arrays(path, arrays)
+    yield from rows_of_arrays(path, arrays)

@@ -20,4 +20,4 @@ def rows(path: Path, sheet: str | None) -> Iterator[Row]:
     variables = [(name, shape) for name, shape, kind in whosmat(str(path), appendmat=False) if kind in _NUMBERS]
     expect_cells(path, sum(prod(shape) for _, shape in variables))
     arrays = loadmat(str(path), appendmat=False, variable_names=[name for name, _ in variables], squeeze_me=False)
-    return rows_of_arrays(path, {name: arrays[name] for name, _ in variables})
+    yield from rows_of_arrays(path, {name: arrays[name] for name, _ in variables})

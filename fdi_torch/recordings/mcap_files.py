@@ -33,22 +33,36 @@ def read_mcap(
     run = read_run(path)
     channels = {name: mapping.get(name, ChannelSource()) for name in (*inputs, *outputs)}
     sources = {name: source for name, source in channels.items() if source.constant is None}
+    scale = 1.0
     if any(":" in (source.column or "") for source in sources.values()):
         places = {name: _place(path, name, source) for name, source in sources.items()}
-        time, scale = mapping.get("t", ChannelSource()), _seconds(path, mapping.get("t"))
-        signals = mapped_signals(
-            run,
-            {name: places[name] for name in inputs if name in places},
-            {name: places[name] for name in outputs if name in places},
-            time.column,
-        )
-        table = _by_name(signals)
+        of_inputs, of_outputs = ({n: places[n] for n in names if n in places} for names in (inputs, outputs))
+        signals = mapped_signals(run, of_inputs, of_outputs, mapping.get("t", ChannelSource()).column)
+        scale, table = _seconds(path, mapping.get("t")), _by_name(signals)
     else:
-        signals, scale = own_signals(run), 1.0
+        signals = own_signals(run)
         logged = _by_name(signals)
         table = {name: _find(path, name, source, logged) for name, source in sources.items()}
         hold = "linear" if signals.hold == "linear" else "zero_order"
-    return _recording(path, signals, scale, table, channels, tuple(inputs), tuple(outputs), hold)
+    columns = {name: _in_si(path, name, source, table, len(signals.time)) for name, source in channels.items()}
+
+    def stacked(names: Sequence[str], part: int) -> torch.Tensor:
+        arrays = [columns[name][part] for name in names]
+        return torch.from_numpy(np.stack(arrays, axis=1) if arrays else np.zeros((len(signals.time), 0)))
+
+    return Recording(
+        time=torch.from_numpy(signals.time * scale),
+        inputs=stacked(inputs, 0),
+        outputs=stacked(outputs, 0),
+        mask=stacked(outputs, 1).to(torch.bool),
+        input_names=tuple(inputs),
+        output_names=tuple(outputs),
+        input_units=tuple(columns[name][2] for name in inputs),
+        output_units=tuple(columns[name][2] for name in outputs),
+        hold=hold,
+        source=str(path),
+        sha256=file_sha256(path),
+    )
 
 
 def expect_keys_of_logs(path: Path, mapping: Mapping[str, ChannelSource]) -> None:
@@ -69,38 +83,6 @@ def _seconds(path: Path, time: ChannelSource | None) -> float:
 
 Column = tuple[np.ndarray, np.ndarray, str]
 """Values (T,), whether each is valid (T,), and their unit ('' if the log does not state it)."""
-
-
-def _recording(
-    path: Path,
-    signals: Signals,
-    scale: float,
-    table: Mapping[str, Column],
-    channels: Mapping[str, ChannelSource],
-    inputs: tuple[str, ...],
-    outputs: tuple[str, ...],
-    hold: Hold,
-) -> Recording:
-    samples = len(signals.time)
-    columns = {name: _in_si(path, name, source, table, samples) for name, source in channels.items()}
-
-    def stacked(names: Sequence[str], part: int) -> torch.Tensor:
-        arrays = [columns[name][part] for name in names]
-        return torch.from_numpy(np.stack(arrays, axis=1) if arrays else np.zeros((samples, 0)))
-
-    return Recording(
-        time=torch.from_numpy(signals.time * scale),
-        inputs=stacked(inputs, 0),
-        outputs=stacked(outputs, 0),
-        mask=stacked(outputs, 1).to(torch.bool),
-        input_names=inputs,
-        output_names=outputs,
-        input_units=tuple(columns[name][2] for name in inputs),
-        output_units=tuple(columns[name][2] for name in outputs),
-        hold=hold,
-        source=str(path),
-        sha256=file_sha256(path),
-    )
 
 
 def _in_si(path: Path, name: str, source: ChannelSource, table: Mapping[str, Column], samples: int) -> Column:

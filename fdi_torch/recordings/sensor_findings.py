@@ -72,11 +72,11 @@ def _clipped(name: str, values: Tensor, unit: str) -> Iterator[ChannelFinding]:
 
 def _frozen(name: str, values: Tensor, time: Tensor) -> Iterator[ChannelFinding]:
     """A value that is repeated much longer than is usual for these readings."""
-    lengths, ends = _repeats(values)
+    _, lengths = torch.unique_consecutive(values, return_counts=True)
     longest = int(lengths.argmax())
     usual = float(lengths.double().mean())
     if int(lengths[longest]) >= FROZEN_SAMPLES * usual:
-        count, last = int(lengths[longest]), int(ends[longest])
+        count, last = int(lengths[longest]), int(lengths[: longest + 1].sum()) - 1
         start, stop = float(time[last - count + 1]), float(time[last])
         text = f"did not change for {count} samples, from {start:g} s to {stop:g} s (usually for {usual:.2g})"
         yield ChannelFinding("frozen", name, text, {"start": start, "stop": stop, "count": count})
@@ -93,12 +93,6 @@ def _quantised(name: str, values: Tensor, unit: str) -> Iterator[ChannelFinding]
 
 def _shown(value: Tensor | float, unit: str) -> str:
     return f"{100 * float(value):.4g} %" if unit == "1" else quantity_text(float(value), unit)
-
-
-def _repeats(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Lengths of the runs of equal values, and the index at which each ends."""
-    _, lengths = torch.unique_consecutive(values, return_counts=True)
-    return lengths, torch.cumsum(lengths, 0) - 1
 
 
 def irregular(intervals: Tensor) -> bool:

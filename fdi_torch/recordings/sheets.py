@@ -44,22 +44,20 @@ def in_order(
     values: np.ndarray,
     sort: bool,
     place: str,
-    first: int,
-    summer: str = "",
-    rows: np.ndarray | None = None,
+    rows: np.ndarray,
+    summer: str,
 ) -> Ordered:
     """Drop rows that repeat the one before; with `sort`, sort the others and merge rows with equal times.
 
-    Of several values of a channel at one time the last one counts. place: format of a row in messages; its number
-    counts from `first`, or is listed in `rows`. summer: advice for a clock that was set back by an hour. Raises
-    ValueError if time does not increase.
+    Of several values of a channel at one time the last one counts. place: format of a row in messages; rows: their
+    numbers. summer: advice for a clock that was set back by an hour. Raises ValueError if time does not increase.
     """
     notes = []
     repeated = (np.diff(seconds) == 0.0) & _equal(values[1:], values[:-1]).all(axis=1)
     if repeated.any():
         notes.append(f"{counted(int(repeated.sum()), 'row')} repeating the one before left out")
-    numbers = (first + np.arange(len(seconds)) if rows is None else rows)[np.append(True, ~repeated)]
-    seconds, values = seconds[np.append(True, ~repeated)], values[np.append(True, ~repeated)]
+    kept = np.append(True, ~repeated)
+    rows, seconds, values = rows[kept], seconds[kept], values[kept]
     decreasing = np.flatnonzero(np.diff(seconds) <= 0)
     if not len(decreasing):
         return Ordered(seconds, values, notes)
@@ -71,7 +69,7 @@ def in_order(
             fix = "keep the last row of each time by columns: {t: {sort: true}}, or count rows: {t: {period: 50 ms}}"
         fix = summer if summer and abs(before - after - HOUR) < NEARLY else fix
         raise ValueError(
-            f"{place.format(numbers[drop + 1])}: expected time that increases, got {after:g} s after {before:g} s "
+            f"{place.format(rows[drop + 1])}: expected time that increases, got {after:g} s after {before:g} s "
             f"({counted(len(decreasing), 'such row')}); {fix}"
         )
     out_of_order = int((np.diff(seconds) < 0).sum())
@@ -118,11 +116,8 @@ def merge_sheets(sheets: Sequence[Sheet], hold_times: Mapping[str, float], hold:
             placed[rows] = np.where(np.isfinite(column), column, np.nan)
             columns.append(placed)
     values = np.stack(columns, axis=1) if columns else np.empty((len(times), 0))
-    return Sheet(sheets[0].source, times + (origin if len(sheets) > 1 else 0.0), _names(sheets), values)
-
-
-def _names(sheets: Sequence[Sheet]) -> tuple[str, ...]:
-    return tuple(name for sheet in sheets for name in sheet.names)
+    names = tuple(name for sheet in sheets for name in sheet.names)
+    return Sheet(sheets[0].source, times + (origin if len(sheets) > 1 else 0.0), names, values)
 
 
 def _resampled_input(

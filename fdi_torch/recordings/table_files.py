@@ -1,14 +1,14 @@
 """Tables in formats other than CSV, converted to the text of an equivalent CSV file.
 
 All rules and error messages for headers, units, time stamps and cells are thus those of CSV. A format is one entry of
-`FORMATS` and a module with `rows(path, sheet)`, which yields a header and then rows of plain values.
+`FORMATS` and a module with a generator `rows(path, sheet)` of a header and then rows of plain values.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import date, datetime
@@ -37,8 +37,8 @@ class Format:
 
 
 FORMATS = (
-    Format(b"PAR1", "a Parquet file", "parquet"),
-    Format(b"ARROW1", "a Feather file", "feather"),
+    Format(b"PAR1", "a Parquet file", "arrow"),
+    Format(b"ARROW1", "a Feather file", "arrow"),
     Format(b"PK\x03\x04", "an Excel workbook", "excel"),
     Format(b"MATLAB 5.0", "a MATLAB file", "matlab"),
     Format(b"\x89HDF", "an HDF5 file", "hdf5"),
@@ -56,7 +56,7 @@ def table_text(path: Path, known: Format, sheet: str | None) -> TableText:
     if sheet is not None and known.module != "excel":
         raise ValueError(f"{path}: sheet: expected this key of an Excel workbook only, got {known.name}; leave it out")
     reader = import_module(f"fdi_torch.recordings.{known.module}")
-    return TableText(path, known, _opened_lazily(lambda: reader.rows(path, sheet)))
+    return TableText(path, known, reader.rows(path, sheet))
 
 
 class TableText(io.TextIOBase):
@@ -104,11 +104,6 @@ class TableText(io.TextIOBase):
             reason = str(error).partition("\n")[0] or type(error).__name__
             what = f"{self._path}: expected {self._known.name} that is whole, got one that cannot be read"
             raise ValueError(f"{what}: {reason}") from error
-
-
-def _opened_lazily(rows: Callable[[], Iterator[Row]]) -> Iterator[Row]:
-    """The rows of a file, opened only when the first one is requested."""
-    yield from rows()
 
 
 def expect_cells(path: Path, cells: int) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
@@ -18,7 +18,6 @@ from fdi_torch.study.study_plan import Block, Plan
 if TYPE_CHECKING:
     from distributed import Client
 
-T = TypeVar("T")
 R = TypeVar("R")
 LOCAL = "local"
 LOOPBACK = "127.0.0.1"  # address of a local cluster, not reachable from other machines
@@ -33,25 +32,18 @@ def run_on_cluster(plan: Plan, blocks: Iterable[Block], address: str) -> Iterato
     Raises ValueError if Dask is not installed or no scheduler answers.
     """
     with connected(address) as client:
-        yield from run_with(client, plan, blocks)
+        yield from each_on(client, run_block, blocks, plan)
 
 
-def run_with(client: Client, plan: Plan, blocks: Iterable[Block]) -> Iterator[list[Trial]]:
-    """Yield the blocks as they are completed on a connected cluster."""
+def each_on(client: Client, work: Callable[..., R], items: Iterable[Any], *shared: Any) -> Iterator[R]:
+    """Yield work(*shared, item) of each item as it is completed. Exceptions of the work are raised.
+
+    shared: objects that are sent to each worker once.
+    """
     from distributed import as_completed
 
-    shared = client.scatter(plan, broadcast=True, hash=False)
-    tasks = [client.submit(_on_worker, shared, block, pure=False, key=_key(block)) for block in blocks]
-    for done in as_completed(tasks):
-        yield done.result()
-        done.release()
-
-
-def each_on(client: Client, work: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Yield work(item) of each item as it is completed. Exceptions of the work are raised."""
-    from distributed import as_completed
-
-    for done in as_completed([client.submit(_alone, work, item, pure=False) for item in items]):
+    sent = [client.scatter(each, broadcast=True, hash=False) for each in shared]
+    for done in as_completed([client.submit(_alone, work, *sent, item, pure=False) for item in items]):
         yield done.result()
         done.release()
 
@@ -85,16 +77,7 @@ def connected(address: str, workers: int | None = None) -> Iterator[Client]:
         yield client
 
 
-def _on_worker(plan: Plan, block: Block) -> list[Trial]:
+def _alone(work: Callable[..., R], *arguments: Any) -> R:
     """A worker uses one core, because its neighbours use the others."""
     torch.set_num_threads(1)
-    return run_block(plan, block)
-
-
-def _alone(work: Callable[[T], R], item: T) -> R:
-    torch.set_num_threads(1)
-    return work(item)
-
-
-def _key(block: Block) -> str:
-    return f"block-{block.setting}-{block.first}-{block.last}"
+    return work(*arguments)

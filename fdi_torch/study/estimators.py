@@ -1,4 +1,4 @@
-"""The estimators that a study compares, by name, with their meanings."""
+"""The estimators that a study compares, by name, with their meanings. Pages about studies load them without torch."""
 
 from __future__ import annotations
 

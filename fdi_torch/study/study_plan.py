@@ -7,7 +7,7 @@ process.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations, groupby
 from typing import Literal
 
@@ -21,7 +21,7 @@ from fdi_torch.estimate.fitting import Fitting
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings
 from fdi_torch.estimate.objectives import Objective
 from fdi_torch.parameters import ParameterSpace
-from fdi_torch.study.estimators import ESTIMATORS, Estimator
+from fdi_torch.study.estimators import Estimator
 
 SnrDefinition = Literal["variance", "power"]
 
@@ -70,16 +70,16 @@ class Method:
     the noise-free readings.
     """
 
-    estimators: tuple[Estimator, ...] = tuple(ESTIMATORS)
-    objective: Objective = "correlation"
-    search: EvolutionSettings = field(default_factory=lambda: EvolutionSettings(population=40, evaluations=2000))
-    search_step: float = 5.0
-    search_every: int = 5
-    starts: int = 2
-    searches: int = 3
-    steps: tuple[float, ...] = (1.0, 0.1)
-    refine: RefineSettings = field(default_factory=lambda: RefineSettings(iterations=60))
-    data_step: float = 0.01
+    estimators: tuple[Estimator, ...]
+    objective: Objective
+    search: EvolutionSettings
+    search_step: float
+    search_every: int
+    starts: int
+    searches: int
+    steps: tuple[float, ...]
+    refine: RefineSettings
+    data_step: float
 
 
 @dataclass(frozen=True)
@@ -89,9 +89,9 @@ class Plan:
     fitting: Fitting
     settings: tuple[Setting, ...]
     method: Method
-    seed: int = 0
-    snr_definition: SnrDefinition = "variance"
-    block: int = 200
+    seed: int
+    snr_definition: SnrDefinition
+    block: int
 
     @property
     def device(self) -> torch.device:

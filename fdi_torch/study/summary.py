@@ -1,4 +1,6 @@
-"""Summary of the trials of a setting for each estimator, with the Monte Carlo error of every number."""
+"""Summary of the trials of a setting for each estimator, with the Monte Carlo error of every number; and the
+isolation of fault modes: stated against true sets of faults.
+"""
 
 from __future__ import annotations
 
@@ -172,3 +174,51 @@ def share(count: int, trials: int) -> Ratio:
 
 def _ends(name: str, ratio: Ratio | None) -> dict[str, float]:
     return {} if ratio is None else {name: ratio.value, f"{name}.low": ratio.low, f"{name}.high": ratio.high}
+
+
+@dataclass(frozen=True)
+class Isolation:
+    """Counts of stated modes.
+
+    labels (M,): 'none', 'theta_1', 'theta_1 + theta_3' ... confusion (M, M): trials by true mode (row) and stated mode
+    (column). missed, false: parameters wrongly stated as fault-free, or as faulty. right: correctly stated modes.
+    """
+
+    labels: tuple[str, ...]
+    confusion: tuple[tuple[int, ...], ...]
+    trials: int
+    right: int
+    missed: int
+    false: int
+
+
+def count_modes(space: ParameterSpace, trials: Sequence[Trial], confidence: float = 0.95) -> Isolation:
+    """State a parameter as faulty if it differs from nominal significantly, and count the modes.
+
+    The confidence is divided among the parameters (Bonferroni).
+    """
+    truth, value, std = (column(trials, name) for name in ("truth", "free", "free_std"))
+    reach = NormalDist().inv_cdf(1.0 - (1.0 - confidence) / (2 * len(space)))
+    names = [name.removesuffix(".size") for name in space.names]
+    faulty = truth != space.nominal()
+    stated = (value - space.nominal()).abs() > reach * std
+    places = {
+        code: k
+        for k, code in enumerate(sorted({*_codes(faulty), *_codes(stated)}, key=lambda code: (code.bit_count(), code)))
+    }
+    confusion = [[0] * len(places) for _ in places]
+    for row, col in zip(_codes(faulty), _codes(stated), strict=True):
+        confusion[places[row]][places[col]] += 1
+    return Isolation(
+        labels=tuple(" + ".join(names[i] for i in range(len(names)) if code >> i & 1) or "none" for code in places),
+        confusion=tuple(tuple(row) for row in confusion),
+        trials=len(trials),
+        right=int((faulty == stated).all(-1).sum()),
+        missed=int((faulty & ~stated).sum()),
+        false=int((stated & ~faulty).sum()),
+    )
+
+
+def _codes(faulty: Tensor) -> list[int]:
+    """(trials, P) bool as one integer per trial, one bit per parameter."""
+    return (faulty.to(torch.int64) << torch.arange(faulty.shape[-1])).sum(-1).tolist()

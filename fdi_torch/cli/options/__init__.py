@@ -77,87 +77,83 @@ def seconds(text: str) -> float:
         raise argparse.ArgumentTypeError(f"expected a time such as 90 or '1.5 h', got '{text}'") from None
 
 
-def add_plant_and_recording(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
-    parser.add_argument("--recording", metavar="FILE", required=True, help=RECORDING)
-
-
-def add_holdout(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--holdout", metavar="FILE", nargs="+", default=[], help="other recordings of the same rig, for validation only"
-    )
-
-
-def add_library(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--library", metavar="EFFECT,...", help="effects to search (PLACE.EFFECT at one place), or all")
-
-
-def add_leave_out(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--leave-out", metavar="EFFECT,...", default="", help="effects to leave out of the library")
-
-
-def add_step(parser: argparse.ArgumentParser, default: str) -> None:
-    """default: the step that is taken without this option, in words."""
-    parser.add_argument("--step", metavar="TIME", type=seconds, help=f"integration step (default: {default})")
-
-
 def names(text: str | None) -> tuple[str, ...]:
     """The names in a list with commas."""
     return tuple(name.strip() for name in (text or "").split(",") if name.strip())
 
 
-START_SAMPLES = 50
-
-
-def add_start_samples(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--start-samples",
-        metavar="N",
-        type=int,
-        default=START_SAMPLES,
-        help=f"samples of each free run for its initial levels ({START_SAMPLES})",
-    )
-    parser.add_argument(
-        "--settle",
-        metavar="TIME",
-        type=seconds,
-        help="instead, estimate levels and what varies by run from the first part of each free run ('30 s'), and count "
-        "errors after it",
-    )
-
-
-def add_run(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--out",
-        metavar="DIR",
-        help="output folder (default: logs); a file that exists is kept, and the new one is NAME_2, NAME_3 ...",
-    )
-    parser.add_argument("--seed", metavar="N", type=int, help="seed of all random numbers")
-
-
-def add_device(parser: argparse.ArgumentParser) -> None:
-    help_text = (
-        "of the estimation (cpu; cuda gives the same results, and is faster only above 250,000 candidates at once)"
-    )
-    parser.add_argument("--device", metavar="cpu|cuda", help=help_text)
-
-
 def overrides(arguments: argparse.Namespace) -> list[str]:
     """--set and its short forms as overrides; later ones win."""
-    short = {"output.folder": "out", "device": "device", "seed": "seed"}
+    short = {"output.folder": "out", "device": "device", "seed": "seed", "source.url": "source"}
     given = [(key, getattr(arguments, name, None)) for key, name in short.items()]
     return [*arguments.set, *(f"{key}={value}" for key, value in given if value is not None)]
 
 
-def add_live(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--live",
-        metavar="[HOST:]PORT",
-        nargs="?",
-        const=LIVE,
-        help=f"stream the running job to Foxglove or Lichtblick (without a value: {LIVE}, reachable from this machine "
-        "only; 0.0.0.0:PORT opens it to the whole network without a password; needs the extra `live`)",
-    )
+START_SAMPLES = 50
+_NAMES = {"type": names, "default": ()}
+_SHARED: dict[str, dict[str, Any]] = {
+    "--plant": {"metavar": "NAME|FILE", "help": "a shipped plant, or a plant file"},
+    "--recording": {"metavar": "FILE", "help": RECORDING},
+    "--holdout": {
+        "metavar": "FILE",
+        "nargs": "+",
+        "default": [],
+        "help": "other recordings of the same rig, for validation only",
+    },
+    "--library": _NAMES | {"metavar": "EFFECT,...", "help": "effects to search (PLACE.EFFECT at one place), or all"},
+    "--leave-out": _NAMES | {"metavar": "EFFECT,...", "help": "effects to leave out of the library"},
+    "--vary": _NAMES | {"metavar": "NAME,..."},
+    "--step": {"metavar": "TIME", "type": seconds},
+    "--noise": {
+        "metavar": "AMOUNT",
+        "default": "1 mm",
+        "help": "standard deviation of the readings: as a level (1 mm), or 'h1 = 1 mm, p2 = 2 mV'",
+    },
+    "--start-samples": {
+        "metavar": "N",
+        "type": int,
+        "default": START_SAMPLES,
+        "help": f"samples of each free run for its initial levels ({START_SAMPLES})",
+    },
+    "--settle": {
+        "metavar": "TIME",
+        "type": seconds,
+        "help": "instead, estimate levels and what varies by run from the first part of each free run ('30 s'), and "
+        "count errors after it",
+    },
+    "--adopt": {"metavar": "FILE"},
+    "--replace": {"action": "store_true", "help": "--adopt overwrites a file that exists"},
+    "--narrow": {"action": "store_true"},
+    "--out": {
+        "metavar": "DIR",
+        "help": "output folder (default: logs); a file that exists is kept, and the new one is NAME_2, NAME_3 ...",
+    },
+    "--seed": {"metavar": "N", "type": int, "help": "seed of all random numbers"},
+    "--device": {
+        "metavar": "cpu|cuda",
+        "help": "of the estimation (cpu; cuda gives the same results, and is faster only above 250,000 candidates at "
+        "once)",
+    },
+    "--resume": {"action": "store_true", "help": "continue a stopped run of the same file from its log"},
+    "--cluster": {
+        "metavar": "local|ADDRESS",
+        "help": "run on Dask: local, or tcp://host:8786 or tls://host:8786; it must be trusted, for it runs code here",
+    },
+    "--live": {
+        "metavar": "[HOST:]PORT",
+        "nargs": "?",
+        "const": LIVE,
+        "help": f"stream the running job to Foxglove or Lichtblick (without a value: {LIVE}, reachable from this "
+        "machine only; 0.0.0.0:PORT opens it to the whole network without a password; needs the extra `live`)",
+    },
+}
+"""Options of several commands, as arguments of `add_argument`."""
+
+
+def add(parser: argparse.ArgumentParser, *options: str, **changes: Any) -> None:
+    """Add shared options. changes: arguments of `add_argument` in which they differ in this command."""
+    for option in options:
+        parser.add_argument(option, **_SHARED[option] | changes)
 
 
 def host_and_port(option: str, address: str, example: str) -> tuple[str, int]:

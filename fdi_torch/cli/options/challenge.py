@@ -11,6 +11,7 @@ import argparse
 import math
 
 from fdi_torch.blind.kind_meanings import KIND_MEANINGS
+from fdi_torch.cli.options import add, names
 
 RIGS = ("cascaded_tanks", "quadruple_tank", "three_tank")
 
@@ -37,21 +38,19 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cases", metavar="N", type=int, help="number of recordings over all kinds (22)")
-    parser.add_argument("--seed", metavar="S", type=int, help="seed of causes, places, noise and inputs (0)")
-    parser.add_argument("--out", metavar="DIR", default="logs/challenge", help="folder (logs/challenge)")
+    add(parser, "--seed", help="seed of causes, places, noise and inputs (0)")
+    add(parser, "--out", default="logs/challenge", help="folder (logs/challenge)")
     parser.add_argument("--rig", choices=RIGS, help="hidden rig (three_tank)")
-    parser.add_argument("--plant", metavar="NAME|FILE", help="instead of --rig: a rig like this plant file, or network")
+    add(parser, "--plant", help="instead of --rig: a rig like this plant file, or network")
     parser.add_argument("--tanks", metavar="N..M", help="number of tanks of random networks (3..12)")
     parser.add_argument(
-        "--kinds", metavar="KIND,...", help="kinds of cases (default: those of the first list; of networks, the second)"
+        "--kinds",
+        metavar="KIND,...",
+        type=names,
+        default=(),
+        help="kinds of cases (default: those of the first list; of networks, the second)",
     )
-    parser.add_argument(
-        "--leave-out", metavar="EFFECT,...", default="", help="effects to remove from the library, or all, one per case"
-    )
+    add(parser, "--leave-out", help="effects to remove from the library, or all, one per case")
     parser.add_argument("--minutes", metavar="M", type=float, default=math.inf, help="start no case after this time")
-    parser.add_argument(
-        "--cluster",
-        metavar="local|ADDRESS",
-        help="diagnose on Dask: local, tcp://host:8786 or tls://host:8786; the scheduler must be trusted",
-    )
+    add(parser, "--cluster")
     parser.add_argument("--join", metavar="DIR", nargs="+", help="no diagnosis: merge the answers of these folders")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import RECORDING, add_config, add_keys
+from fdi_torch.cli.options import add, add_config, add_keys
 
 STEP, SUMMARY = "describe", "examine a plant and a recording before any fit"
 QUICK = True
@@ -25,8 +25,7 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", nargs="?", help="a recording, as --recording FILE")
-    parser.add_argument("--recording", metavar="FILE", help=RECORDING)
-    parser.add_argument("--plant", metavar="NAME|FILE", help="a shipped plant such as three_tank, or a plant file")
+    add(parser, "--recording", "--plant")
     parser.add_argument("--picture", metavar="FILE", help="draw the rig (PNG or SVG)")
     add_config(parser)
     add_keys(parser, "a plant file", "fdi_torch.config.plant_file:PlantConfig")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import seconds
+from fdi_torch.cli.options import add, names, seconds
 
 STEP, SUMMARY = "plan", "which faults an experiment can detect and distinguish, and from which size"
 EXAMPLES = """
@@ -20,8 +20,10 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
-    parser.add_argument("--faults", metavar="NAME,NAME", help="such as T1.leak.size (default: the usual faults)")
+    add(parser, "--plant", required=True)
+    parser.add_argument(
+        "--faults", metavar="NAME,...", type=names, default=(), help="such as T1.leak.size (default: the usual faults)"
+    )
     parser.add_argument(
         "--input",
         "--recording",
@@ -36,9 +38,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=seconds,
         help="duration of constant inputs, such as '2 h' (default: 1000 s for three_tank, longer for slower plants)",
     )
-    parser.add_argument(
-        "--noise",
-        metavar="AMOUNT",
-        default="1 mm",
-        help="standard deviation of the readings: as a level ('1 mm', the default), or 'h1 = 1 mm, p2 = 2 mV'",
-    )
+    add(parser, "--noise")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from fdi_torch.cli.options import add
+
 STEP, SUMMARY = "describe", "show the catalogue of faults and unmodelled effects"
 QUICK = True
 EXAMPLES = """
@@ -16,4 +18,4 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("names", nargs="*", metavar="EFFECT", help="effects to show in full")
-    parser.add_argument("--plant", metavar="NAME|FILE", help="plant whose locations and ranges are shown")
+    add(parser, "--plant", help="plant whose locations and ranges are shown")

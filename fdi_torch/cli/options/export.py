@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import argparse
 
+from fdi_torch.cli.options import add
+
 STEP, SUMMARY = "use", "export a plant as an FMU for other simulation tools"
 EXAMPLES = """
 examples:
@@ -17,7 +19,7 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
+    add(parser, "--plant", required=True)
     parser.add_argument("--fmu", metavar="FILE", required=True, help="FMU to write")
     parser.add_argument(
         "--effect",

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import add_holdout, add_leave_out, add_library, add_plant_and_recording, add_step
+from fdi_torch.cli.options import add
 
 MOST_CAUSES = 4
 
@@ -31,23 +31,19 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_plant_and_recording(parser)
-    add_holdout(parser)
-    add_library(parser)
-    add_leave_out(parser)
-    add_step(parser, "for about 1500 steps, not below that of the samples; shorter where levels move fast")
+    add(parser, "--plant", "--recording", required=True)
+    add(parser, "--holdout", "--library", "--leave-out")
+    default = "for about 1500 steps, not below that of the samples; shorter where levels move fast"
+    add(parser, "--step", help=f"integration step (default: {default})")
     parser.add_argument(
         "--most", metavar="N", type=int, default=MOST_CAUSES, help=f"largest number of effects ({MOST_CAUSES})"
     )
     parser.add_argument("--named-only", action="store_true", help="report the best named effect instead of `unknown`")
-    parser.add_argument("--adopt", metavar="FILE", help="write the plant file with the causes added to its effects")
-    parser.add_argument("--replace", action="store_true", help="--adopt overwrites a file that exists")
+    add(parser, "--adopt", help="write the plant file with the causes added to its effects")
+    add(parser, "--replace")
     parser.add_argument(
         "--with-constants", action="store_true", help="--adopt also writes the constants fitted with the causes"
     )
-    parser.add_argument(
-        "--narrow",
-        action="store_true",
-        help="as --with-constants, with the constants' standard errors as tolerances where smaller",
-    )
-    parser.add_argument("--out", metavar="DIR", default="logs", help="folder for log, gap.json and next_input.csv")
+    standard_errors = "with the constants' standard errors as tolerances where smaller"
+    add(parser, "--narrow", help=f"as --with-constants, {standard_errors}")
+    add(parser, "--out", default="logs", help="folder for log, gap.json and next_input.csv")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import add_config, add_live, seconds
+from fdi_torch.cli.options import add, add_config, seconds
 
 STEP, SUMMARY = "monitor", "detect, isolate and size faults along a recording or live"
 LONG = True
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         kind="monitor",
         example="false_alarms_every='1 h'",
     )
-    parser.add_argument("--out", metavar="DIR", help="folder for the log (default: logs)")
+    add(parser, "--out", "--resume", "--live")
     parser.add_argument(
         "--follow", action="store_true", help="the file is still being written; process its samples as they come"
     )
@@ -42,7 +42,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=seconds,
         help="end after this time without samples (60 s with --follow, never with a live source)",
     )
-    parser.add_argument("--resume", action="store_true", help="continue a killed run of the same file or source")
     parser.add_argument(
         "--publish",
         metavar="URL",
@@ -57,4 +56,3 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="serve Prometheus metrics (without a value: 127.0.0.1:9464, reachable from this machine only; "
         "0.0.0.0:PORT opens them to the whole network without a password; needs the extra `prometheus`)",
     )
-    add_live(parser)

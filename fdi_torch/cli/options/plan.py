@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import add_library, add_plant_and_recording
-
-NOISE = "1 mm"
+from fdi_torch.cli.options import add
 
 STEP, SUMMARY = "plan", "list what planned inputs cannot show, before an experiment"
 EXAMPLES = """
@@ -21,11 +19,5 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_plant_and_recording(parser)
-    add_library(parser)
-    parser.add_argument(
-        "--noise",
-        metavar="AMOUNT",
-        default=NOISE,
-        help=f"standard deviation of the readings: as a level ({NOISE}), or 'h1 = 1 mm, p2 = 2 mV'",
-    )
+    add(parser, "--plant", "--recording", required=True)
+    add(parser, "--library", "--noise")

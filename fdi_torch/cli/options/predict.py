@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import RECORDING, add_start_samples, seconds
+from fdi_torch.cli.options import RECORDING, add, seconds
 
 STEP, SUMMARY = "diagnose", "run a plant freely along a recording and report the error"
 EXAMPLES = """
@@ -25,21 +25,10 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recordings", metavar="recording", nargs="*", help="recordings, as --recording FILE")
-    parser.add_argument(
-        "--recording",
-        metavar="FILE",
-        action="append",
-        default=[],
-        help=f"{RECORDING}; may be repeated",
-    )
-    parser.add_argument("--plant", metavar="NAME|FILE", required=True, help="a shipped plant, or a plant file")
-    add_start_samples(parser)
-    parser.add_argument(
-        "--vary",
-        metavar="NAME,...",
-        default="",
-        help="constants with a tolerance that are estimated there too (* matches any name)",
-    )
+    add(parser, "--recording", action="append", default=[], help=f"{RECORDING}; may be repeated")
+    add(parser, "--plant", required=True)
+    add(parser, "--start-samples", "--settle")
+    add(parser, "--vary", help="constants with a tolerance that are estimated there too (* matches any name)")
     parser.add_argument("--from", metavar="TIME", dest="start", type=seconds, help="first time used of each file")
     parser.add_argument("--to", metavar="TIME", dest="stop", type=seconds, help="last time used: 300, or '2 h'")
     parser.add_argument("--picture", metavar="FILE", help="draw the run (PNG or SVG); of several, the last")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import add_holdout, add_leave_out, add_plant_and_recording, add_start_samples, add_step
+from fdi_torch.cli.options import add, names
 
 STEP, SUMMARY = "diagnose", "fit all effects and constants of a plant file together, without a search"
 LONG = True
@@ -23,17 +23,13 @@ examples:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_plant_and_recording(parser)
-    add_holdout(parser)
-    add_leave_out(parser)
-    add_step(parser, "half the sampling interval")
-    parser.add_argument("--hold", metavar="NAME,...", default="", help="do not fit these (* matches any name)")
+    add(parser, "--plant", "--recording", required=True)
+    add(parser, "--holdout", "--leave-out")
+    add(parser, "--step", help="integration step (default: half the sampling interval)")
     parser.add_argument(
-        "--vary",
-        metavar="NAME,...",
-        default="",
-        help="values that may differ by recording; their variation is reported (* matches any name)",
+        "--hold", metavar="NAME,...", type=names, default=(), help="do not fit these (* matches any name)"
     )
+    add(parser, "--vary", help="values that may differ by recording; their variation is reported (* matches any name)")
     parser.add_argument(
         "--white", metavar="STD", help="treat errors as white, with this standard deviation of a level, such as '3 mm'"
     )
@@ -42,9 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="also predict every file (every --holdout, if any) freely by a fit to all others",
     )
-    add_start_samples(parser)
-    parser.add_argument("--adopt", metavar="FILE", help="write the plant file with the fitted values")
-    parser.add_argument("--replace", action="store_true", help="--adopt overwrites a file that exists")
-    parser.add_argument(
-        "--narrow", action="store_true", help="there, use the standard errors of the fit as tolerances where smaller"
-    )
+    add(parser, "--start-samples", "--settle")
+    add(parser, "--adopt", help="write the plant file with the fitted values")
+    add(parser, "--replace")
+    add(parser, "--narrow", help="there, use the standard errors of the fit as tolerances where smaller")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import add_config, add_live
+from fdi_torch.cli.options import add, add_config
 
 STEP, SUMMARY = "monitor", "validate a monitor on simulated runs: false alarms, delays, isolation"
 EXAMPLES = """
@@ -21,6 +21,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(
         parser, "fdi_torch.config.rehearsal_file:RehearsalConfig", required=True, kind="rehearsal", example="seed=2"
     )
-    parser.add_argument("--out", metavar="DIR", help="folder for the log (default: logs)")
-    parser.add_argument("--resume", action="store_true", help="continue from the log of a stopped run")
-    add_live(parser)
+    add(parser, "--out", "--resume", "--live")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import add_config, add_run
+from fdi_torch.cli.options import add, add_config
 
 STEP, SUMMARY = "describe", "generate a recording from a plant, inputs, faults and noise"
 EXAMPLES = """
@@ -17,5 +17,5 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(parser, "fdi_torch.config.run_file:RunConfig", example="simulate.faults.T1.leak=0.3")
-    add_run(parser)
-    parser.add_argument("--replace", action="store_true", help="replace a recording of the same name")
+    add(parser, "--out", "--seed")
+    add(parser, "--replace", help="replace a recording of the same name")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import add_config, add_device, add_live, add_run
+from fdi_torch.cli.options import add, add_config
 
 STEP, SUMMARY = "validate", "repeat an experiment many times: errors against their bounds, coverage, failures"
 LONG = True
@@ -21,12 +21,4 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(parser, "fdi_torch.config.study_file:StudyFile", required=True, kind="study", example="study.trials=100")
-    add_run(parser)
-    add_device(parser)
-    add_live(parser)
-    parser.add_argument("--resume", action="store_true", help="continue from the log of a killed run")
-    parser.add_argument(
-        "--cluster",
-        metavar="local|ADDRESS",
-        help="run on Dask: local, or tcp://host:8786 or tls://host:8786; it must be trusted, for it runs code here",
-    )
+    add(parser, "--out", "--seed", "--device", "--live", "--resume", "--cluster")

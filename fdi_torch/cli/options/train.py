@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 
-from fdi_torch.cli.options import add_config, add_device, add_live, add_run
+from fdi_torch.cli.options import add, add_config
 
 STEP, SUMMARY = "diagnose", "estimate the sizes of faults in a recording"
 LONG = True
@@ -23,7 +23,4 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config(parser, "fdi_torch.config.run_file:RunConfig")
-    add_run(parser)
-    add_device(parser)
-    add_live(parser)
-    parser.add_argument("--resume", action="store_true", help="continue a killed run of the same file")
+    add(parser, "--out", "--seed", "--device", "--live", "--resume")

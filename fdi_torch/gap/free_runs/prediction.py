@@ -29,6 +29,7 @@ from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.scales import length_scale
+from fdi_torch.progress import Tell, silent
 from fdi_torch.recording import Recording
 from fdi_torch.sample_noise import sample_noise
 from fdi_torch.simulate.collocation import Collocation
@@ -66,7 +67,7 @@ def predict(
     step: float | None = None,
     settle: float | None = None,
     vary: Collection[str] = (),
-    tell: Callable[[float, str], None] = lambda share, text: None,
+    tell: Tell = silent,
 ) -> Prediction:
     """Simulate the plant along the recording with the constants of its file, from estimated initial levels.
 
@@ -207,7 +208,7 @@ def leave_one_file_out(
     trials: Sequence[Recording],
     fit: Callable[[Sequence[Recording]], PlantDescription],
     start_samples: int,
-    progress: Callable[[float, str], None] = lambda share, text: None,
+    progress: Tell = silent,
     settle: float | None = None,
 ) -> list[LeftOutRun]:
     """Predict each trial by the plant file as given, and by the plant that `fit` returns for the recordings of

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -31,6 +31,7 @@ from fdi_torch.names import matching
 from fdi_torch.parameters import ParameterName, by_prefix, common_name, name_in_recording
 from fdi_torch.plant.description import PlacedEffect, PlantDescription, with_tolerances
 from fdi_torch.plant.operating_range import operating_range_of_all
+from fdi_torch.progress import Tell, silent
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.plant_limits import expect_no_denied_rim
 from fdi_torch.recordings.plant_units import expect_right_units
@@ -77,7 +78,7 @@ def refit(
     hold: Collection[str] = (),
     white: float | None = None,
     vary: Collection[str] = (),
-    tell: Callable[[float, str], None] = lambda share, text: None,
+    tell: Tell = silent,
 ) -> Refit:
     """Fit all effects and constants of a plant to recordings.
 

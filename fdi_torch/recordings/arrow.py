@@ -1,4 +1,4 @@
-"""The rows of a Parquet file (pyarrow, extra `parquet`)."""
+"""The rows of a Parquet or Feather file, as Apache Arrow reads them (pyarrow, extra `parquet`)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from fdi_torch.recordings.table_files import Row, expect_cells
 from fdi_torch.tables import needed
 from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_UNPACKED, expect_unpacked
 
+FEATHER = b"ARROW1"
 ROWS_AT_ONCE = 1 << 14
 _TEXTS = ("string", "large_string")
 
@@ -22,6 +23,23 @@ def rows(path: Path, sheet: str | None) -> Iterator[Row]:
     as a number.
     """
     needed("pyarrow", "parquet")
+    with path.open("rb") as file:
+        yield from (_feather_rows if file.read(len(FEATHER)) == FEATHER else _parquet_rows)(path)
+
+
+def _feather_rows(path: Path) -> Iterator[Row]:
+    claimed = needed("pyarrow.dataset", "parquet").dataset(path, format="ipc").count_rows()
+    with needed("pyarrow.ipc", "parquet").open_file(path.read_bytes()) as file:
+        names = [str(name) for name in file.schema.names]
+        expect_cells(path, claimed * len(names))
+        yield names
+        for k in range(file.num_record_batches):
+            batch = file.get_batch(k)
+            batch.validate(full=True)  # a damaged file may point beyond its buffers
+            yield from zip(*(plain_values(column) for column in batch.columns), strict=True)
+
+
+def _parquet_rows(path: Path) -> Iterator[Row]:
     parquet = needed("pyarrow.parquet", "parquet")
     schema = parquet.ParquetFile(path).schema_arrow
     # Repeated texts are read as indices into a dictionary, which saves memory.
