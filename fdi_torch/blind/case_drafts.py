@@ -21,7 +21,7 @@ from fdi_torch.blind.conditions import (
 )
 from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.inputs import channel_to_rest
-from fdi_torch.blind.named_effects import NAMED, NominalRun
+from fdi_torch.blind.named_effects import NominalRun, draw_effect
 from fdi_torch.blind.networks import Networks, with_unmeasured
 from fdi_torch.blind.plants import Rig
 from fdi_torch.blind.random_flows import draw_disturbance
@@ -159,7 +159,7 @@ def _with_sizes(draft: CaseDraft, chosen: Chosen, seed: int, trial: int = 0) -> 
 
     strengths = [draft.kind.strength if i < chosen.full else FAINT for i in range(len(chosen.causes))]
     pairs = zip(chosen.causes, strengths, strict=True)
-    deviations = tuple(NAMED[effect](nominal_run(strength), place) for (effect, place), strength in pairs)
+    deviations = tuple(draw_effect(effect, nominal_run(strength), place) for (effect, place), strength in pairs)
     if chosen.unknown:
         deviations += (chosen.unknown.draw(nominal_run(draft.kind.strength), chosen.place),)
     return replace(draft, chosen=chosen, deviations=deviations)

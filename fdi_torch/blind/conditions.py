@@ -84,13 +84,11 @@ def as_built(plant: PlantDescription, rng: np.random.Generator) -> PlantDescript
         nominal = float(getattr(plant.component(name.place), name.field))
         value = nominal + tolerance * z if name.field == "offset" else nominal * max(1 + tolerance * z, _LEAST)
         drawn.setdefault(name.place, {})[name.field] = value
-    return replace(
-        plant,
-        tanks=tuple(replace(t, **drawn.get(t.name, {})) for t in plant.tanks),
-        pipes=tuple(replace(p, **drawn.get(p.name, {})) for p in plant.pipes),
-        pumps=tuple(replace(p, **drawn.get(p.name, {})) for p in plant.pumps),
-        sensors=tuple(replace(s, **drawn.get(s.name, {})) for s in plant.sensors),
-    )
+    parts: dict[str, Any] = {
+        part: tuple(replace(c, **drawn.get(c.name, {})) for c in getattr(plant, part))
+        for part in ("tanks", "pipes", "pumps", "sensors")
+    }
+    return replace(plant, **parts)
 
 
 def draw_conditions(

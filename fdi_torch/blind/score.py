@@ -10,7 +10,7 @@ from fdi_torch.blind.case_kinds import KINDS
 from fdi_torch.blind.conditions import HELD_OUT
 from fdi_torch.blind.places import Cause, canonical, effect_places
 from fdi_torch.blind.sizes import size_errors
-from fdi_torch.blind.statistics import clopper_pearson, mean_interval, median_interval
+from fdi_torch.blind.statistics import mean_interval, median_interval, share_of
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
 from fdi_torch.quantities import unit_factor
 
@@ -187,16 +187,12 @@ def _stratum(rows: Sequence[Row]) -> dict[str, Any]:
     for name in SHARES:
         hits = [bool(r[name]) for r in rows if name in r]
         if hits:
-            low, high = clopper_pearson(sum(hits), len(hits))
-            out[name] = {"of": len(hits), "hits": sum(hits), "share": sum(hits) / len(hits), "ci95": [low, high]}
-    for name in MEANS:
-        values = [float(r[name]) for r in rows if r.get(name) is not None]
-        if values:
-            mean, low, high = mean_interval(values)
-            out[name] = {"of": len(values), "mean": mean, "ci95": [low, high]}
-    for name in MEDIANS:
-        values = [float(r[name]) for r in rows if r.get(name) is not None]
-        if values:
-            median, low, high = median_interval(values)
-            out[f"median_{name}"] = {"of": len(values), "median": median, "ci95": [low, high]}
+            out[name] = share_of(sum(hits), len(hits))
+    for names, kind, interval in ((MEANS, "mean", mean_interval), (MEDIANS, "median", median_interval)):
+        for name in names:
+            values = [float(r[name]) for r in rows if r.get(name) is not None]
+            if values:
+                middle, *ends = interval(values)
+                key = name if kind == "mean" else f"median_{name}"
+                out[key] = {"of": len(values), kind: middle, "ci95": ends}
     return out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from scipy import special
 
@@ -14,6 +15,11 @@ def clopper_pearson(k: int, n: int) -> tuple[float, float]:
         return 0.0, 1.0
     low = special.betaincinv(k, n - k + 1, 0.025) if k else 0.0
     return float(low), float(special.betaincinv(k + 1, n - k, 0.975)) if k < n else 1.0
+
+
+def share_of(hits: int, count: int) -> dict[str, Any]:
+    """A share with its exact 95 % interval, as in the tables of scores."""
+    return {"of": count, "hits": hits, "share": hits / count, "ci95": clopper_pearson(hits, count)}
 
 
 def median_interval(values: Sequence[float]) -> tuple[float, float, float]:

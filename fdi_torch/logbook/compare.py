@@ -166,17 +166,11 @@ def _hashes(run: Run) -> dict[str, str]:
 
 
 def _results(runs: Sequence[Run]) -> tuple[Result, ...]:
-    estimates = [_estimates(run) for run in runs]
-    names = dict.fromkeys(name for e in estimates for name in e)
-    return tuple(_result(name, [e.get(name, _NOTHING) for e in estimates]) for name in names)
-
-
-def _result(name: str, estimates: Sequence[tuple[float, float, str]]) -> Result:
-    values, std, units = zip(*estimates, strict=True)
-    return Result(name, next(filter(None, units), ""), values, std, chi2_p_value(values, std))
-
-
-_NOTHING = (float("nan"), float("nan"), "")
+    estimates, results = [_estimates(run) for run in runs], []
+    for name in dict.fromkeys(name for each in estimates for name in each):
+        values, std, units = zip(*(each.get(name, (math.nan, math.nan, "")) for each in estimates), strict=True)
+        results.append(Result(name, next(filter(None, units), ""), values, std, chi2_p_value(values, std)))
+    return tuple(results)
 
 
 def _estimates(run: Run) -> dict[str, tuple[float, float, str]]:

@@ -49,12 +49,10 @@ def export_attachment(run: Run, name: str, folder: str | Path) -> Path:
     target = Path(folder) / safe_name(name)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        if target.exists():
-            raise LogError(f"{target}: exists already; choose another folder, or delete it")
         with target.open("xb") as file:
             file.write(content)
-    except LogError:
-        raise
+    except FileExistsError:
+        raise LogError(f"{target}: exists already; choose another folder, or delete it") from None
     except OSError as error:
         raise log_error(target, error) from None
     return target
@@ -67,13 +65,11 @@ def safe_name(name: str) -> str:
 
 
 def _csv(_run: Run, messages: Sequence[Message], stream: BinaryIO) -> None:
-    columns, units = _columns(messages)
+    payloads, columns, units = _columns(messages)
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
     table = csv.writer(text)
     table.writerow([_header(name, units.get(name, "")) for name in columns])
-    for message in messages:
-        payload = message.payload
-        table.writerow([_cell(payload.get(name)) for name in columns])
+    table.writerows([_cell(payload.get(name)) for name in columns] for payload in payloads)
     text.detach()
 
 
@@ -83,24 +79,20 @@ def _ndjson(run: Run, messages: Sequence[Message], stream: BinaryIO) -> None:
 
 
 def _npz(_run: Run, messages: Sequence[Message], stream: BinaryIO) -> None:
-    columns, _ = _columns(messages)
-    payloads = [message.payload for message in messages]
+    payloads, columns, _ = _columns(messages)
     arrays = {name: _array([payload.get(name) for payload in payloads]) for name in columns}
-    usable = {name: array for name, array in arrays.items() if array is not None}
-    np.savez_compressed(stream, **usable)  # type: ignore[arg-type]
+    np.savez_compressed(stream, **{name: array for name, array in arrays.items() if array is not None})  # type: ignore[arg-type]
 
 
 FORMATS: dict[str, Callable[[Run, Sequence[Message], BinaryIO], None]] = {"csv": _csv, "ndjson": _ndjson, "npz": _npz}
 
 
-def _columns(messages: Sequence[Message]) -> tuple[list[str], dict[str, str]]:
-    """Fields of the messages, `t` first, and their units."""
-    names: dict[str, None] = {}
-    units: dict[str, str] = {}
-    for message in messages:
-        names.update(dict.fromkeys(message.payload))
-        units |= message.channel.units
-    return sorted(names, key=lambda name: name != "t"), units
+def _columns(messages: Sequence[Message]) -> tuple[list[dict[str, Any]], list[str], dict[str, str]]:
+    """Payloads of the messages, their fields with `t` first, and the units of these."""
+    payloads = [message.payload for message in messages]
+    names = dict.fromkeys(name for payload in payloads for name in payload)
+    units = {name: unit for message in messages for name, unit in message.channel.units.items()}
+    return payloads, sorted(names, key=lambda name: name != "t"), units
 
 
 def _loaded(run: Run, message: Message) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -89,9 +90,8 @@ def compare_events(
     streams = ((m for m in stream if m.topic != "/log") for stream in (logged, replayed))
     for events, (then, now) in enumerate(zip_longest(*streams), 1):
         for deviation in _deviations(then, now):
-            difference = Difference(
-                events, *_event(then, now), deviation.field, repr(deviation.then), repr(deviation.now)
-            )
+            event = _event(then or now)  # one of both is there
+            difference = Difference(events, *event, deviation.field, repr(deviation.then), repr(deviation.now))
             first_inexact = first_inexact or difference
             largest = max(largest, deviation.relative)
             if not deviation.within(relative):
@@ -103,8 +103,8 @@ def compare_events(
 def version_changes(run: Run, now: Mapping[str, str]) -> dict[str, tuple[str, str]]:
     """Differences of the environment since the log was written."""
     then = run.about("env")
-    names = dict.fromkeys([*then, *now])
-    return {name: (then.get(name, ""), now.get(name, "")) for name in names if then.get(name, "") != now.get(name, "")}
+    pairs = {name: (then.get(name, ""), now.get(name, "")) for name in dict.fromkeys([*then, *now])}
+    return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
 
 
 @dataclass(frozen=True)
@@ -163,12 +163,9 @@ def _unequal(name: str, then: Any, now: Any) -> Iterator[_Deviation]:
 
 def _parsed(text: str) -> Any:
     """The value of a JSON text that is a mapping or a list; other texts unchanged."""
-    if not text.startswith(("{", "[")):
-        return text
-    try:
-        return orjson.loads(text)
-    except ValueError:
-        return text
+    with suppress(ValueError):
+        return orjson.loads(text) if text.startswith(("{", "[")) else text
+    return text
 
 
 def _same(then: Any, now: Any) -> bool:
@@ -184,12 +181,8 @@ def _fields(message: Message) -> dict[str, Any]:
     return payload | arrays
 
 
-def _event(then: Message | None, now: Message | None) -> tuple[str, str]:
+def _event(message: Message) -> tuple[str, str]:
     """The topic of an event and its position."""
-    message = then or now
-    if message is None:
-        return "", ""
-    payload = message.payload
-    axis = AXES.get(message.topic, "t")
+    payload, axis = message.payload, AXES.get(message.topic, "t")
     problem = f", problem {payload['problem']}" if payload.get("problem") else ""
     return message.topic, f"{axis} {payload.get(axis, message.t)}{problem}"

@@ -112,7 +112,10 @@ class RunLog(Topics):
                 if error is None:
                     raise
             if self.status == "interrupted" and error is not None:
-                self._say_what_is_kept(error)
+                kept = self.path if self.path.exists() else self.partial_path
+                error.add_note(f"what was computed until now is in {kept}")
+                if self._after_interruption:
+                    error.add_note(self._after_interruption)
 
     def _end(self) -> None:
         """Complete the log under its final name."""
@@ -121,12 +124,6 @@ class RunLog(Topics):
             os.replace(self.partial_path, self.path)
         except OSError as error:
             raise log_error(self.path, error) from None
-
-    def _say_what_is_kept(self, error: BaseException) -> None:
-        kept = self.path if self.path.exists() else self.partial_path
-        error.add_note(f"what was computed until now is in {kept}")
-        if self._after_interruption:
-            error.add_note(self._after_interruption)
 
     def set_status(self, status: str, reason: str = "") -> None:
         """Set how the run ended, such as "not_converged"; the default is "completed"."""
@@ -155,8 +152,7 @@ class RunLog(Topics):
     def put(self, messages: Iterable[Timed]) -> None:
         """Write encoded messages; all methods of `Topics` call it."""
         with self._lock:
-            sink = self._open_sink()
-            sink.messages(messages if self._listener is None else self._forwarding(messages, self._listener))
+            self._open_sink().messages(self._forwarding(messages, self._listener) if self._listener else messages)
             self._note_progress()
 
     def carry_over(self, messages: Iterable[Message]) -> int:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from matplotlib.figure import Figure
 
-from fdi_torch.report.chart import Chart, chart_json, draw
+from fdi_torch.report.chart import TIME, Chart, Line, chart_json, draw
 from fdi_torch.report.html import Markup, clean, escape, join, tag
 from fdi_torch.report.material import Material
+from fdi_torch.report.numbers import axis, shown_unit
 from fdi_torch.report.style import inline_svg
 
 REM_PER_INCH = 7.6  # width of a wide picture; its text then has the size of the page's text
@@ -55,6 +57,22 @@ Maker = Callable[[Material], "Section | None"]
 def signals(name: str, chart: Chart, caption: str = "") -> Picture:
     """A picture of signals that is an interactive chart where scripts run."""
     return Picture(name, draw(chart), caption, chart=chart)
+
+
+def channel_signals(
+    name: str,
+    title: str,
+    label: str,
+    si_unit: str,
+    lines: Sequence[Line],
+    channel: str = "",
+    x_label: str = TIME,
+    **about: Any,
+) -> Picture:
+    """Signals of one quantity in its unit for display. lines: SI. channel: chooses the unit. about: of the `Chart`."""
+    unit, scale = shown_unit(si_unit, channel)
+    lines = [line._replace(y=scale * line.y) for line in lines]
+    return signals(name, Chart(title, x_label, axis(label, unit), lines, **about))
 
 
 def section_html(section: Section, prefix: str, own_id: str) -> Markup:

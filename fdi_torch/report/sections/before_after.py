@@ -12,7 +12,7 @@ from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, axis, shown_unit
 from fdi_torch.report.predictions import MODELS, compared_models, holdout_prefix
-from fdi_torch.report.section import Picture, Section, signals
+from fdi_torch.report.section import Picture, Section, channel_signals, signals
 from fdi_torch.report.sections.signals import clock_of
 from fdi_torch.sample_noise import sample_noise
 
@@ -36,21 +36,19 @@ def holdout_section(material: Material) -> Section | None:
 
 def _holdout_panels(material: Material, prefix: str) -> list[Picture]:
     arrays, recording, pictures = material.arrays, material.recordings[0], []
-    time, read, title = arrays[f"{prefix}_time"], arrays[f"{prefix}_read"], prefix.replace("holdout", "hold-out")
+    time, read = arrays[f"{prefix}_time"], arrays[f"{prefix}_read"]
+    title = prefix.replace("holdout", "hold-out").replace("_", " ")
     for i, name in enumerate(recording.output_names):
-        unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
         lines: list[Line] = []
         for model in compared_models(material):
             predicted = arrays.get(f"{prefix}_{model}")
             if predicted is not None:
                 words, colour = MODELS[model]
-                lines.append(Line(words, time, scale * (read[:, i] - predicted[:, i]), colour))
+                lines.append(Line(words, time, read[:, i] - predicted[:, i], colour))
         if lines:
-            title_here = f"{material.channel_words(name)}, {title.replace('_', ' ')}"
-            chart = Chart(
-                title_here, "time, s", axis("measured − model", unit), lines, level=0.0, clock=clock_of(prefix)
-            )
-            pictures.append(signals(f"{prefix}_{i + 1}", chart))
+            about = f"{prefix}_{i + 1}", f"{material.channel_words(name)}, {title}", "measured − model"
+            unit, clock = recording.output_units[i], clock_of(prefix)
+            pictures.append(channel_signals(*about, unit, lines, name, level=0.0, clock=clock))
     return pictures
 
 

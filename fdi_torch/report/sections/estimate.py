@@ -17,8 +17,8 @@ from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.html import bullets, table, tag
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import HEADER, amount, axis, correlation_table, estimate_cells, number, shown_unit, signed
-from fdi_torch.report.section import Picture, Section, signals
+from fdi_torch.report.numbers import HEADER, amount, correlation_table, estimate_cells, number, shown_unit, signed
+from fdi_torch.report.section import Picture, Section, channel_signals, signals
 from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT, ellipse_panel
 
 MOST_ELLIPSES = 6
@@ -195,12 +195,9 @@ def _best_members(material: Material, events: Sequence[Payload], steps: np.ndarr
     names = [str(name) for name in (final or {}).get("names", ()) if name in events[-1]][:MOST_PARAMETERS]
     pictures = []
     for k, name in enumerate(names):
-        unit, scale = shown_unit(material.unit(GENERATIONS, name))
-        lines = [Line("best member", steps, scale * column(events, name), MODEL)]
+        lines = [Line("best member", steps, column(events, name), MODEL)]
         if name in material.truth:
-            lines.append(
-                Line("simulated", steps, np.full(len(steps), scale * material.truth[name]), OTHER, dashed=True)
-            )
-        chart = Chart(name, "generation", axis("best member", unit), lines, clock="search")
-        pictures.append(signals(f"search_parameter_{k + 1}", chart))
+            lines.append(Line("simulated", steps, np.full(len(steps), material.truth[name]), OTHER, dashed=True))
+        about, unit = (f"search_parameter_{k + 1}", name, "best member"), material.unit(GENERATIONS, name)
+        pictures.append(channel_signals(*about, unit, lines, x_label="generation", clock="search"))
     return pictures

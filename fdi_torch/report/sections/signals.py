@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from fdi_torch.logbook import Signals
-from fdi_torch.report.chart import Chart, Line, corner_points
+from fdi_torch.report.chart import Line, corner_points
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import axis, number, shown_unit
+from fdi_torch.report.numbers import amount, number, shown_unit
 from fdi_torch.report.predictions import predicted
-from fdi_torch.report.section import Column, Picture, Section, signals
+from fdi_torch.report.section import Column, Picture, Section, channel_signals
 from fdi_torch.report.style import MODEL, SOFT
 
 
@@ -42,17 +43,18 @@ def inputs_section(material: Material) -> Section | None:
         suffix = f"_{k + 1}" if several else ""
         pictures, constant = [], []
         for i, name in enumerate(map(material.channel_words, recording.input_names)):
-            unit, scale = shown_unit(recording.input_units[i], recording.input_names[i])
-            values = scale * recording.inputs[:, i]
+            unit, channel, values = recording.input_units[i], recording.input_names[i], recording.inputs[:, i]
             if np.isfinite(values).any() and np.nanmin(values) == np.nanmax(values):
-                constant.append(f"{name} at {number(float(np.nanmax(values)))} {unit}".rstrip())
+                constant.append(f"{name} at {amount(float(np.nanmax(values)), unit, name=channel)}")
                 continue
             held = recording.hold == "zero_order"
             time, corners = corner_points(recording.time, values) if held else (recording.time, values)
             line = Line("command", time, corners, MODEL, steps=held)
             title = f"{name}, {recording_name(group).lower()}" if several else name
-            chart = Chart(title, "time, s", axis("command", unit), [line], clock=clock_of(group))
-            pictures.append(signals(f"input{suffix}_{i + 1}", chart))
+            clock = clock_of(group)
+            pictures.append(
+                channel_signals(f"input{suffix}_{i + 1}", title, "command", unit, [line], channel, clock=clock)
+            )
         of = f"{recording_name(group)}, constant" if several else "Constant"
         blocks += [f"{of}: {', '.join(constant)}."] if constant else []
         blocks += [pictures] if pictures else []
@@ -78,18 +80,19 @@ def _output_panels(
     readings = np.where(recording.mask, recording.outputs, np.nan)
     time = recording.time
     for i, name in enumerate(sensors):
-        unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
-        lines = [Line("measured", time, scale * readings[:, i], SOFT, wide=model is not None)]
+        unit, channel = recording.output_units[i], recording.output_names[i]
+        lines = [Line("measured", time, readings[:, i], SOFT, wide=model is not None)]
         if model is not None:
-            lines.append(Line("estimate", time, scale * model[:, i], MODEL))
-        chart = Chart(name, "time, s", axis("reading", unit), lines, clock=clock)
-        pictures = [signals(f"output{suffix}_{i + 1}", chart)]
+            lines.append(Line("estimate", time, model[:, i], MODEL))
+        column = [channel_signals(f"output{suffix}_{i + 1}", name, "reading", unit, lines, channel, clock=clock)]
         if model is not None:
-            residual = Line("measured − estimate", time, scale * (readings[:, i] - model[:, i]), MODEL)
-            label = axis("residual", unit)
-            chart = Chart(f"{name}: residual", "time, s", label, [residual], level=0.0, clock=clock, height=2.1)
-            pictures.append(signals(f"residual{suffix}_{i + 1}", chart))
-        columns.append(tuple(pictures))
+            lines = [Line("measured − estimate", time, readings[:, i] - model[:, i], MODEL)]
+            about: dict[str, Any] = {"level": 0.0, "clock": clock, "height": 2.1}
+            title = f"{name}: residual"
+            column.append(
+                channel_signals(f"residual{suffix}_{i + 1}", title, "residual", unit, lines, channel, **about)
+            )
+        columns.append(tuple(column))
     return columns
 
 
