@@ -124,41 +124,28 @@ def choose(
         return Chosen((_twin(plant, index, rng),), 1)
     if kind.name == "left_out":
         return _left_out(plant, seed, index, leave_out, rng)
+
+    def _chosen(names: Sequence[str]) -> str:
+        return in_turn(names, seed, kind.name, index) if trial < 2 else str(rng.choice(names))
+
     causes: list[Cause] = []
     full = kind.causes + (int(rng.integers(kind.perhaps + 1)) if kind.perhaps else 0)
     if full:
         present = [e for e in EFFECTS if places(plant, EFFECTS[e])]
-        effect = in_turn(present, seed, kind.name, index) if trial < 2 else str(rng.choice(present))
+        effect = _chosen(present)
         causes.append((effect, str(rng.choice(places(plant, EFFECTS[effect])))))
     while len(causes) < full + kind.faint:
-        causes.append(_another(plant, causes, rng))
+        others = [c for c in effect_places(plant) if all(c[0] != o[0] and not are_twins(c, o, plant) for o in causes)]
+        causes.append(others[int(rng.integers(len(others)))])
     if not kind.unseen:
         return Chosen(tuple(causes), full)
-    unknown = _unseen(kind, plant, seed, index, library, trial, rng)
+    laws = {u.law: u for u in unknown_to(library) if places(plant, u.at)}
+    # Laws that need reversing flow require inputs that are at rest for a while.
+    if kind.inputs != "rich" or all(p.is_outlet for p in plant.pipes):
+        laws = {name: u for name, u in laws.items() if not u.reversing}
+    unknown = laws[_chosen(sorted(laws))]
     free = [p for p in places(plant, unknown.at) if all(p not in place.split("-") for _, place in causes)]
     return Chosen(tuple(causes), full, unknown, str(rng.choice(free or places(plant, unknown.at))))
-
-
-def _another(plant: PlantDescription, causes: Sequence[Cause], rng: np.random.Generator) -> Cause:
-    """A further cause: another effect that is not collinear with those chosen."""
-    free = [c for c in effect_places(plant) if all(c[0] != o[0] and not are_twins(c, o, plant) for o in causes)]
-    return free[int(rng.integers(len(free)))]
-
-
-def _unseen(
-    kind: Kind,
-    plant: PlantDescription,
-    seed: int,
-    index: int,
-    library: Collection[str],
-    trial: int,
-    rng: np.random.Generator,
-) -> Unknown:
-    """A law outside the library. Laws that need reversing flow require inputs that are at rest for a while."""
-    laws = {u.law: u for u in unknown_to(library) if places(plant, u.at)}
-    if kind.inputs != "rich" or not any(not p.is_outlet for p in plant.pipes):
-        laws = {name: u for name, u in laws.items() if not u.reversing}
-    return laws[in_turn(sorted(laws), seed, kind.name, index) if trial < 2 else str(rng.choice(sorted(laws)))]
 
 
 def _twin(plant: PlantDescription, index: int, rng: np.random.Generator) -> Cause:

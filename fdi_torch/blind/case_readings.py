@@ -1,4 +1,4 @@
-"""Simulation of cases and of their sensors' readings, with the equations of deviations that sit at sensors.
+"""Readings of the sensors of cases, with the equations of deviations that sit at sensors.
 
 Such an equation, a law, maps a signal sampled at the times `time` (T,), s; each lane is a column. A sensor law acts on
 the true level (T, n), m, before noise; a readout law acts on the noisy reading. Inputs switch at samples only, so that
@@ -11,23 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from fdi_torch.blind.conditions import HELD_OUT, RECORDED, Conditions
+from fdi_torch.blind.conditions import HELD_OUT, RECORDED, Conditions, Deviations
 from fdi_torch.blind.deviation import Array, Deviation, Numbers
 from fdi_torch.blind.plants import Rig
-from fdi_torch.blind.simulator import HiddenRigs, SimulatedRun, grouped, simulate
+from fdi_torch.blind.simulator import SimulatedRun, grouped
 from fdi_torch.plant.description import PlantDescription
 
 PARTS = (("recording", RECORDED), ("holdout", HELD_OUT))
-Deviations = tuple[Deviation, ...]
-"""Differences of a rig from its plant file."""
-Lane = tuple[Conditions, int, Deviations, bool]
-"""One simulation: conditions, part (0 recording, 1 hold-out), deviations, whether random flows act."""
-
-
-def simulated(lanes: Sequence[Lane], step: float) -> list[SimulatedRun]:
-    """All simulations in one batch, with integration steps of `step` s."""
-    rigs = HiddenRigs([c.built for c, *_ in lanes], [off for _, _, off, _ in lanes])
-    return simulate(rigs, [c.drive(part, disturbed) for c, part, _, disturbed in lanes], step)
 
 
 def noisy_readings(c: Conditions, run: SimulatedRun, part: int, deviations: Deviations) -> tuple[Array, Array]:

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.blind.case_drafts import CaseDraft, CasePlan, draft_cases
-from fdi_torch.blind.case_readings import PARTS, Lane, noisy_readings, simulated
-from fdi_torch.blind.conditions import commands_of_pumps, moved_by
+from fdi_torch.blind.case_readings import PARTS, noisy_readings
+from fdi_torch.blind.conditions import Lane, commands_of_pumps, moved_by, simulated
 from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.inputs import DECIMALS, command_unit, pumps_of_channels
 from fdi_torch.blind.networks import Networks

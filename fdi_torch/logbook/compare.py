@@ -102,7 +102,8 @@ def compare(paths: Sequence[str | Path]) -> Comparison:
     if len(paths) < 2:
         raise ValueError(f"expected at least two logs to compare, got {len(paths)}; name more")
     runs = [read_run(path) for path in paths]
-    first, *others = map(_hashes, runs)
+    # Hashes of the recordings' files; "" for a recording that was in memory.
+    first, *others = ({k: text for k, text in run.about("data").items() if k.endswith("sha256")} for run in runs)
     return Comparison(
         labels_of([run.path for run in runs]),
         {section: entries for section in SECTIONS if (entries := _differing(runs, section))},
@@ -158,11 +159,6 @@ def _differing(runs: Sequence[Run], section: str) -> dict[str, tuple[str, ...]]:
     keys = dict.fromkeys(key for record in records for key in record if key not in _WALL.get(section, ()))
     table = {key: tuple(record.get(key, "") for record in records) for key in keys}
     return {key: texts for key, texts in table.items() if len(set(texts)) > 1}
-
-
-def _hashes(run: Run) -> dict[str, str]:
-    """Hashes of the recordings' files; "" for a recording that was in memory."""
-    return {key: text for key, text in run.about("data").items() if key.endswith("sha256")}
 
 
 def _results(runs: Sequence[Run]) -> tuple[Result, ...]:

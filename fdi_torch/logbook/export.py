@@ -11,7 +11,7 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -51,9 +51,9 @@ def export_attachment(run: Run, name: str, folder: str | Path) -> Path:
         target.parent.mkdir(parents=True, exist_ok=True)
         with target.open("xb") as file:
             file.write(content)
-    except FileExistsError:
-        raise LogError(f"{target}: exists already; choose another folder, or delete it") from None
     except OSError as error:
+        if isinstance(error, FileExistsError) and target.exists():
+            raise LogError(f"{target}: exists already; choose another folder, or delete it") from None
         raise log_error(target, error) from None
     return target
 
@@ -177,7 +177,7 @@ class Inspection:
     topics: dict[str, TopicInfo]
     attachments: dict[str, Attachment]
     health: Health
-    advice: str = field(default="")
+    advice: str = ""
 
     @property
     def messages(self) -> int:
@@ -187,35 +187,24 @@ class Inspection:
 def inspect_log(path: str | Path) -> Inspection:
     """Read and check a whole log of this or another program. Raises LogError if it is not an MCAP file."""
     run = read_run(path, salvage=True)
-    topics = _topics(run)
-    about = {name.removeprefix(PREFIX): values for name, values in run.metadata.items() if name.startswith(PREFIX)}
-    others = {name: values for name, values in run.metadata.items() if not name.startswith(PREFIX)}
-    health = check_health(run, topics)
-    advice = run.advice
-    if not health.sound and not advice:
-        advice = f"{run.path}: the file is damaged; `fdi recover {run.path}` saves what can be read"
-    return Inspection(
-        run.path, len(run.data), run.ours, run.library, about, others, topics, run.attachments, health, advice
-    )
-
-
-def check_health(run: Run, topics: dict[str, TopicInfo]) -> Health:
-    """Check CRCs, indices and completeness; `topics` counts what is actually in `run`, which was opened for salvage."""
-    problems = [*_ending(run), *(f"bytes {gap.start} to {gap.end}: {gap.reason}" for gap in run.damages)]
-    if run.ended:
-        problems += [*_data_crc(run), *_summary(run, sum(info.messages for info in topics.values()))]
-    chunks = sum(isinstance(part, Frame) and part.opcode == Opcode.CHUNK for part in run.parts)
-    return Health(run.ended, chunks, tuple(run.damages), tuple(problems))
-
-
-def _topics(run: Run) -> dict[str, TopicInfo]:
     topics: dict[str, TopicInfo] = {}
     for message in run.messages():
         if message.topic not in topics:
             channel = message.channel
             topics[message.topic] = TopicInfo(channel.topic, channel.schema_name, channel.encoding, channel.units)
         topics[message.topic].count(message)
-    return topics
+    about = {name.removeprefix(PREFIX): values for name, values in run.metadata.items() if name.startswith(PREFIX)}
+    others = {name: values for name, values in run.metadata.items() if not name.startswith(PREFIX)}
+    problems = [*_ending(run), *(f"bytes {gap.start} to {gap.end}: {gap.reason}" for gap in run.damages)]
+    if run.ended:
+        problems += _summary(run, sum(info.messages for info in topics.values()))
+    health = Health(run.ended, len(_frames(run, Opcode.CHUNK)), tuple(run.damages), tuple(problems))
+    advice = run.advice
+    if not health.sound and not advice:
+        advice = f"{run.path}: the file is damaged; `fdi recover {run.path}` saves what can be read"
+    return Inspection(
+        run.path, len(run.data), run.ours, run.library, about, others, topics, run.attachments, health, advice
+    )
 
 
 def _ending(run: Run) -> Iterator[str]:
@@ -225,16 +214,12 @@ def _ending(run: Run) -> Iterator[str]:
         yield "the run does not say how it ended"
 
 
-def _data_crc(run: Run) -> Iterator[str]:
-    """Check the CRC of all records before the end of data."""
+def _summary(run: Run, messages: int) -> Iterator[str]:
+    """Check the CRC of all records before the end of data, and the counts and positions in the summary."""
     for part in _frames(run, Opcode.DATA_END):
         (crc,) = struct.unpack("<I", body_of(run.data, part))
         if crc and zlib.crc32(run.data[: part.start]) != crc:
             yield "the CRC over the data differs"
-
-
-def _summary(run: Run, messages: int) -> Iterator[str]:
-    """Check the counts and positions in the summary against the file."""
     for part in _frames(run, Opcode.STATISTICS):
         counted = Statistics.read(stream_of(body_of(run.data, part))).message_count
         if counted != messages:
@@ -246,5 +231,5 @@ def _summary(run: Run, messages: int) -> Iterator[str]:
         yield f"the index names {len(places)} chunks, {len(places & chunks)} of the file's {len(chunks)} among them"
 
 
-def _frames(run: Run, opcode: Opcode) -> Iterator[Frame]:
-    return (part for part in run.parts if isinstance(part, Frame) and part.opcode == opcode)
+def _frames(run: Run, opcode: Opcode) -> list[Frame]:
+    return [part for part in run.parts if isinstance(part, Frame) and part.opcode == opcode]

@@ -171,8 +171,12 @@ class Run:
 
     def _summary_records(self) -> Iterator[Schema | ChannelRecord]:
         """Schemas and channels of the summary, if its CRC is valid; they replace those of a lost first chunk."""
-        start = _summary_start(self.data)
-        for part in self.parts if start else ():
+        if not self.ended:
+            return
+        start, _, crc = struct.unpack_from("<QQI", self.data, len(self.data) - 28)
+        if not 0 < start < len(self.data) - 37 or zlib.crc32(self.data[start : len(self.data) - 12]) != crc:
+            return
+        for part in self.parts:
             if isinstance(part, scan.Frame) and part.start >= start and part.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 kind = Schema if part.opcode == Opcode.SCHEMA else ChannelRecord
                 yield kind.read(scan.stream_of(scan.body_of(self.data, part)))
@@ -262,12 +266,3 @@ def map_file(path: Path) -> Any:
     except OSError as error:
         raise log_error(path, error) from None
     return data
-
-
-def _summary_start(data: Any) -> int:
-    """The start of the summary if there is one with a valid CRC, else 0."""
-    if not scan.ends_whole(data):
-        return 0
-    start, _, crc = struct.unpack_from("<QQI", data, len(data) - 28)
-    whole = 0 < start < len(data) - 37 and zlib.crc32(data[start : len(data) - 12]) == crc
-    return int(start) if whole else 0

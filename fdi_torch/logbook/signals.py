@@ -20,7 +20,7 @@ from fdi_torch.logbook.sink import EPOCH_NS
 from fdi_torch.logbook.topic_definitions import Channel, topic_definition
 from fdi_torch.untrusted_input import MOST_ARRAY_BYTES, MOST_ARRAY_EXPANSION, expect_unpacked
 
-_STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
+_STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")  # a name or an index of a path such as pose.x[2]
 
 Source = tuple[str, str]  # topic, field
 
@@ -130,11 +130,6 @@ def _array_in(content: bytes) -> np.ndarray:
     return np.load(file, allow_pickle=False)
 
 
-def field_path(text: str) -> list[str | int]:
-    """ "pose.x[2]" -> ["pose", "x", 2]."""
-    return [int(index) if index else name for name, index in _STEP.findall(text)]
-
-
 def _row(message: Message, payload: Mapping[str, Any], fields: Iterable[str]) -> list[float]:
     """Time and fields of a message."""
     t = payload.get("t")
@@ -144,7 +139,7 @@ def _row(message: Message, payload: Mapping[str, Any], fields: Iterable[str]) ->
 def number_at(payload: Any, field: str) -> float:
     """A field by its name, or else by its path; NaN if it is not a number."""
     value = payload
-    for step in [field] if field in payload else field_path(field):
+    for step in [field] if field in payload else (int(i) if i else name for name, i in _STEP.findall(field)):
         try:
             value = value[step]
         except (KeyError, IndexError, TypeError):

@@ -64,7 +64,8 @@ def in_words(compared: Comparison) -> list[str]:
     apart = [result.name for result in compared.results if result.agree is False]
     if any(result.agree is not None for result in compared.results):
         words.append(f"At 95 % these differ: {', '.join(apart)}." if apart else "At 95 % the results agree.")
-    shares = [name for name in apart if _is_capacity_share(ParameterName.parse(name))]
+    relative = {effect.name for effect in EFFECTS if effect.capacity_share}  # to the capacity of a pipe, as a leak
+    shares = [name for name in apart if (p := ParameterName.parse(name)).field == "size" and p.effect in relative]
     pipes = [key for key in compared.differences.get("config", {}) if PIPE_CAPACITY.fullmatch(key)]
     if shares and pipes:
         words.append(
@@ -73,11 +74,6 @@ def in_words(compared: Comparison) -> list[str]:
     if compared.same_data and words:
         words.append("All runs read the same data, so their errors are not independent.")
     return words
-
-
-def _is_capacity_share(name: ParameterName) -> bool:
-    """Whether a parameter is the size of an effect, such as a leak, that is relative to the capacity of a pipe."""
-    return name.field == "size" and any(e.capacity_share for e in EFFECTS if e.name == name.effect)
 
 
 def result_table(compared: Comparison) -> tuple[list[str], list[list[str]]]:

@@ -18,7 +18,7 @@ from fdi_torch.quantities import quantity_text
 from fdi_torch.report.html import short
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import percent
-from fdi_torch.report.predictions import SensorResidual, sensor_residuals
+from fdi_torch.report.predictions import sensor_residuals
 from fdi_torch.report.verdict import headline, kind_words
 from fdi_torch.units import UnitError, in_unit, number_and_unit
 
@@ -65,12 +65,14 @@ def _better(compared: Comparison, runs: Sequence[Material]) -> str:
     if smaller <= chance:
         by = percent(smaller) if smaller >= 1e-3 else "less than 0.1 %"
         return f"{best} and {next_best} explain the recording equally well: residuals differ by {by}."
-    errors = _first(
-        [_both(runs[0].channel_words(name), name, residuals[first][name], residuals[second][name]) for name in common]
-    )
+    errors = []
+    for name in common:
+        pair = residuals[first][name], residuals[second][name]
+        texts = [quantity_text(each.rms, each.unit, 3, name) for each in pair]
+        errors.append(f"{runs[0].channel_words(name)} {' against '.join(texts)}")
     return (
         f"{best} explains the recording best: its residuals are {percent(smaller)} smaller than those of {next_best} "
-        f"({errors})."
+        f"({_first(errors)})."
     )
 
 
@@ -87,11 +89,6 @@ def _same(runs: Sequence[Material], columns: str) -> bool:
         and all(np.array_equal(a, b, equal_nan=True) for a, b in zip(first, other, strict=True))
         for other in others
     )
-
-
-def _both(sensor: str, channel: str, one: SensorResidual, other: SensorResidual) -> str:
-    texts = (quantity_text(each.rms, each.unit, 3, channel) for each in (one, other))
-    return f"{sensor} " + " against ".join(texts)
 
 
 def _differences(compared: Comparison, runs: Sequence[Material]) -> str:

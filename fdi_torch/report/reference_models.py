@@ -12,7 +12,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import emptying_time
 from fdi_torch.report.numbers import as_float
 
-_NAMES = {
+MODEL_NAMES = {
     "nominal": "nominal model",
     "recalibrated": "recalibrated",
     "augmented": "with the causes",
@@ -29,10 +29,11 @@ def has_causes(answer: Mapping[str, Any]) -> bool:
 def reference_models(answer: Mapping[str, Any]) -> dict[str, str]:
     """Names of the compared models and of the noise, by their key in the closure of the answer."""
     if not has_causes(answer):
-        return {key: _NAMES[key] for key in ("nominal", "recalibrated", "noise_floor")}
+        return {key: MODEL_NAMES[key] for key in ("nominal", "recalibrated", "noise_floor")}
     if answer.get("verdict") == "unknown":
-        return {key: name for key, name in _NAMES.items() if key != "ceiling"} | {"augmented": "with the free form"}
-    return _NAMES
+        compared = MODEL_NAMES | {"augmented": "with the free form"}
+        return {key: name for key, name in compared.items() if key != "ceiling"}
+    return MODEL_NAMES
 
 
 SMALLEST_MOVE = 0.1

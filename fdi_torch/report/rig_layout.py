@@ -1,12 +1,8 @@
-"""Layout of a rig's drawing: flow directions set the rows, connections the columns; and the geometry of its lines."""
+"""Layout of a rig's drawing: flow directions set the rows, connections the columns."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Sequence
-from itertools import pairwise
-
-from matplotlib.patches import Polygon
+from collections.abc import Iterable
 
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
 
@@ -80,24 +76,3 @@ def _walk(plant: PlantDescription, neighbours: dict[str, list[str]]) -> list[str
                 order[name] = None
                 pending += [n for n in reversed(neighbours[name]) if n not in order]
     return list(order)
-
-
-Point = tuple[float, float]
-
-
-def longest_piece(points: Sequence[Point]) -> tuple[Point, Point]:
-    """Ends of the longest straight piece of a line."""
-    return max(pairwise(points), key=lambda piece: abs(piece[0][0] - piece[1][0]) + abs(piece[0][1] - piece[1][1]))
-
-
-def direction(start: Point, end: Point) -> Point:
-    """Unit vector from start to end."""
-    length = math.hypot(end[0] - start[0], end[1] - start[1])
-    return (end[0] - start[0]) / length, (end[1] - start[1]) / length
-
-
-def arrow_head(tip: Point, direction: Point, colour: str) -> Polygon:
-    """A triangle with its tip there that points in a direction."""
-    (x, y), (dx, dy) = tip, direction
-    base = [(x - 0.14 * dx + side * dy, y - 0.14 * dy - side * dx) for side in (-0.08, 0.08)]
-    return Polygon([*base, (x, y)], facecolor=colour, edgecolor="none", zorder=4)

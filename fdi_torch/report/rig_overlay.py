@@ -15,9 +15,9 @@ from matplotlib.textpath import TextPath
 
 from fdi_torch.report.html import short
 from fdi_torch.report.numbers import percent, shown_unit
-from fdi_torch.report.rig_layout import Point
 from fdi_torch.report.style import INK
 
+Point = tuple[float, float]
 POINTS, LINE = 9.0, 0.2  # size of the letters, points; height of a line in units of the drawing
 LetterStyle = tuple[str, str, str]  # text, colour, weight
 Box = tuple[float, float, float, float]  # left, bottom, right, top

@@ -60,19 +60,15 @@ def signals(name: str, chart: Chart, caption: str = "") -> Picture:
 
 
 def channel_signals(
-    name: str,
-    title: str,
-    label: str,
-    si_unit: str,
-    lines: Sequence[Line],
-    channel: str = "",
-    x_label: str = TIME,
-    **about: Any,
+    name: str, title: str, label: str, si_unit: str, lines: Sequence[Line], channel: str = "", **about: Any
 ) -> Picture:
-    """Signals of one quantity in its unit for display. lines: SI. channel: chooses the unit. about: of the `Chart`."""
+    """Signals of one quantity over time in its unit for display. lines: SI. channel: chooses the unit.
+
+    about: further fields of the `Chart`.
+    """
     unit, scale = shown_unit(si_unit, channel)
     lines = [line._replace(y=scale * line.y) for line in lines]
-    return signals(name, Chart(title, x_label, axis(label, unit), lines, **about))
+    return signals(name, Chart(title, y_label=axis(label, unit), lines=lines, **({"x_label": TIME} | about)))
 
 
 def section_html(section: Section, prefix: str, own_id: str) -> Markup:

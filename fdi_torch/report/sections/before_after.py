@@ -11,12 +11,20 @@ from fdi_torch.logbook import Signals
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, axis, shown_unit
-from fdi_torch.report.predictions import MODELS, compared_models, holdout_prefix
+from fdi_torch.report.predictions import holdout_prefix
+from fdi_torch.report.reference_models import MODEL_NAMES, has_causes
 from fdi_torch.report.section import Picture, Section, channel_signals, signals
 from fdi_torch.report.sections.signals import clock_of
+from fdi_torch.report.style import MODEL, OTHER
 from fdi_torch.sample_noise import sample_noise
 
 BINS = 24
+COLOURS = {"recalibrated": OTHER, "augmented": MODEL}
+
+
+def _compared_models(material: Material) -> list[str]:
+    """The models whose residuals the page compares: without the causes and, if there are any, with them."""
+    return list(COLOURS) if has_causes(material.answer) else ["recalibrated"]
 
 
 def holdout_section(material: Material) -> Section | None:
@@ -29,7 +37,7 @@ def holdout_section(material: Material) -> Section | None:
         pictures = _holdout_panels(material, holdout_prefix(count))
         blocks += [pictures] if pictures else []
         count += 1
-    causes = len(compared_models(material)) > 1
+    causes = len(_compared_models(material)) > 1
     words = f"Residuals{' of each model' if causes else ''} on readings that were not used for fitting."
     return Section("Before and after" if causes else "Hold-out", [words, *blocks]) if blocks else None
 
@@ -40,11 +48,10 @@ def _holdout_panels(material: Material, prefix: str) -> list[Picture]:
     title = prefix.replace("holdout", "hold-out").replace("_", " ")
     for i, name in enumerate(recording.output_names):
         lines: list[Line] = []
-        for model in compared_models(material):
+        for model in _compared_models(material):
             predicted = arrays.get(f"{prefix}_{model}")
             if predicted is not None:
-                words, colour = MODELS[model]
-                lines.append(Line(words, time, read[:, i] - predicted[:, i], colour))
+                lines.append(Line(MODEL_NAMES[model], time, read[:, i] - predicted[:, i], COLOURS[model]))
         if lines:
             about = f"{prefix}_{i + 1}", f"{material.channel_words(name)}, {title}", "measured − model"
             unit, clock = recording.output_units[i], clock_of(prefix)
@@ -57,14 +64,14 @@ def profile_section(material: Material) -> Section | None:
     if not material.recordings:
         return None
     recording = material.recordings[0]
-    each = {model: _excess(material, recording, model) for model in compared_models(material)}
+    each = {model: _excess(material, recording, model) for model in _compared_models(material)}
     excess = {model: residual for model, residual in each.items() if residual is not None}
     if not excess:
         return None
     pictures = []
     varied = (v for v in _variables(material, recording) if np.nanmin(v[2]) < np.nanmax(v[2]))
     for k, (title, label, variable) in enumerate(varied):
-        lines = [Line(MODELS[m][0], *_binned(variable, size), MODELS[m][1]) for m, size in excess.items()]
+        lines = [Line(MODEL_NAMES[m], *_binned(variable, size), COLOURS[m]) for m, size in excess.items()]
         chart = Chart(title, label, "residual, × noise", lines, log=True, level=1.0, from_zero=True)
         pictures.append(signals(f"gap_by_{k + 1}", chart))
     words = "Root mean square residual of all sensors, each divided by its noise; 1 means noise only."

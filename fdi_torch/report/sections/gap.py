@@ -39,7 +39,11 @@ def where_section(material: Material) -> Section | None:
     caption = f"Below {percent(LEAST_SHOWN)}: {len(ranked) - len(shown)} other places." if ranked[len(shown) :] else ""
     ranked = shown[:MOST_BARS]
     shares = [100.0 * float(place["share"]) for _, place in ranked]
-    texts = [probability_text(float(place["share"])) + _chance(place) for _, place in ranked]
+    texts = []
+    for _, place in ranked:
+        p = place.get("p_value")
+        chance = f"  (p {number(float(p), 2)})" if isinstance(p, int | float) else ""
+        texts.append(probability_text(float(place["share"])) + chance)
     likeliest = [cause for item in material.answer.get("posterior", [])[:1] for cause in causes_of(item)]
     guilty = {str(c["location"]) for c in apart_from_rounding([*material.answer.get("causes", []), *likeliest])}
     names = [name for name, _ in ranked]
@@ -75,7 +79,12 @@ def causes_section(material: Material) -> Section | None:
 
 def disturbances_section(material: Material) -> Section | None:
     """Random flows into the tanks that matter, estimated together with the likeliest explanation."""
-    rows = [_flow_row(tank, flow) for tank, flow in flows_that_matter(material.answer, material.plant).items()]
+    rows = []
+    for tank, flow in flows_that_matter(material.answer, material.plant).items():
+        unit, scale = shown_unit(str(flow.get("unit", "")))
+        time = as_float(flow.get("correlation_time"))
+        std = number(scale * as_float(flow.get("std")), 3)
+        rows.append([tank, std, unit, f"{number(time, 3)} s" if time else "none"])
     if not rows:
         return None
     words = (
@@ -84,12 +93,6 @@ def disturbances_section(material: Material) -> Section | None:
     )
     header = ("into", "standard deviation", "unit", "correlation time")
     return Section("Random flows", [words, table(header, rows)])
-
-
-def _flow_row(tank: str, flow: Mapping[str, Any]) -> list[str]:
-    unit, scale = shown_unit(str(flow.get("unit", "")))
-    time = as_float(flow.get("correlation_time"))
-    return [tank, number(scale * as_float(flow.get("std")), 3), unit, f"{number(time, 3)} s" if time else "none"]
 
 
 def _content(answer: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
@@ -136,11 +139,6 @@ def _up_to_all(figure: Figure) -> None:
     """Remove ticks beyond 100 %: that part of the axis only makes room for the numbers beside the bars."""
     axes = figure.axes[0]
     axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= 100.0])
-
-
-def _chance(place: Mapping[str, Any]) -> str:
-    p = place.get("p_value")
-    return f"  (p {number(float(p), 2)})" if isinstance(p, int | float) else ""
 
 
 def _cause_rows(cause: Mapping[str, Any]) -> list[list[str]]:

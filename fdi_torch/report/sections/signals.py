@@ -80,18 +80,19 @@ def _output_panels(
     readings = np.where(recording.mask, recording.outputs, np.nan)
     time = recording.time
     for i, name in enumerate(sensors):
-        unit, channel = recording.output_units[i], recording.output_names[i]
+        about: dict[str, Any] = {
+            "si_unit": recording.output_units[i],
+            "channel": recording.output_names[i],
+            "clock": clock,
+        }
         lines = [Line("measured", time, readings[:, i], SOFT, wide=model is not None)]
         if model is not None:
             lines.append(Line("estimate", time, model[:, i], MODEL))
-        column = [channel_signals(f"output{suffix}_{i + 1}", name, "reading", unit, lines, channel, clock=clock)]
+        column = [channel_signals(f"output{suffix}_{i + 1}", name, "reading", lines=lines, **about)]
         if model is not None:
             lines = [Line("measured − estimate", time, readings[:, i] - model[:, i], MODEL)]
-            about: dict[str, Any] = {"level": 0.0, "clock": clock, "height": 2.1}
-            title = f"{name}: residual"
-            column.append(
-                channel_signals(f"residual{suffix}_{i + 1}", title, "residual", unit, lines, channel, **about)
-            )
+            words = f"residual{suffix}_{i + 1}", f"{name}: residual", "residual"
+            column.append(channel_signals(*words, lines=lines, level=0.0, height=2.1, **about))
         columns.append(tuple(column))
     return columns
 
