@@ -28,7 +28,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import doubts_about
-from fdi_torch.report.fit_figure import fit_figure
+from fdi_torch.report.chart import fit_figure
 from fdi_torch.report.style import save
 
 

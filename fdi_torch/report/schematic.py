@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,8 +13,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent, Sketch
 from fdi_torch.report.html import short
-from fdi_torch.report.rig_layout import tank_places
-from fdi_torch.report.rig_overlay import (
+from fdi_torch.report.rig_layout import (
     GAP,
     LINE,
     POINTS,
@@ -25,8 +22,12 @@ from fdi_torch.report.rig_overlay import (
     Overlay,
     Point,
     TextBlock,
+    arrow_head,
+    direction,
     level_text,
+    longest_piece,
     separated,
+    tank_places,
     text_width,
 )
 from fdi_torch.report.style import INK, MARK, MODEL, PAPER, SOFT, styled
@@ -131,7 +132,7 @@ class _Drawing:
             self.axes.plot(x, y, color=MARK, lw=11, alpha=alpha, solid_capstyle="round")
         self.axes.plot(x, y, color=self.colour(name), lw=2.4 if name in self.overlay.marks else 1.6, zorder=2)
         if arrow:
-            self.axes.add_patch(_arrow_head(points[-1], _direction(points[-2], points[-1]), self.colour(name)))
+            self.axes.add_patch(arrow_head(points[-1], direction(points[-2], points[-1]), self.colour(name)))
 
     def tank(self, tank: Tank) -> None:
         x, y = self.corner(tank.name)
@@ -183,12 +184,12 @@ class _Drawing:
         points = self.route(component, sketch)
         self.ends += [points[0], points[-1]]
         self.line(component.name, points, arrow=sketch.arrow)
-        start, end = _longest_piece(points)
+        start, end = longest_piece(points)
         middle = (start[0] + end[0]) / 2, (start[1] + end[1]) / 2
         if sketch.route == "from_above":
             middle = points[0][0], points[0][1] + sketch.round
         if sketch.symbol:
-            self.symbol(component.name, sketch, middle, _direction(start, end))
+            self.symbol(component.name, sketch, middle, direction(start, end))
         if sketch.route == "from_above":
             top = middle[1] + sketch.round + 0.08
             if self.fed_from_above(component.target):  # beside the flow from above
@@ -298,21 +299,3 @@ class _Drawing:
 
     def fed_from_above(self, tank: str) -> bool:
         return any(c.falls and c.target == tank for c in self.plant.flow_components())
-
-
-def _longest_piece(points: Sequence[Point]) -> tuple[Point, Point]:
-    """Ends of the longest straight piece of a line."""
-    return max(pairwise(points), key=lambda piece: abs(piece[0][0] - piece[1][0]) + abs(piece[0][1] - piece[1][1]))
-
-
-def _direction(start: Point, end: Point) -> Point:
-    """Unit vector from start to end."""
-    length = math.dist(start, end)
-    return (end[0] - start[0]) / length, (end[1] - start[1]) / length
-
-
-def _arrow_head(tip: Point, direction: Point, colour: str) -> Polygon:
-    """A triangle with its tip there that points in a direction."""
-    (x, y), (dx, dy) = tip, direction
-    base = [(x - 0.14 * dx + side * dy, y - 0.14 * dy - side * dx) for side in (-0.08, 0.08)]
-    return Polygon([*base, (x, y)], facecolor=colour, edgecolor="none", zorder=4)

@@ -2,7 +2,6 @@
 
 from fdi_torch.report.section import Maker
 from fdi_torch.report.sections import (
-    before_after,
     blind_benchmark,
     estimate,
     gap,
@@ -23,9 +22,9 @@ SECTIONS: tuple[Maker, ...] = (
     gap.disturbances_section,
     gap_closure.curves_section,
     gap_closure.errors_section,
-    before_after.holdout_section,
+    signals.holdout_section,
     gap_closure.constants_section,
-    before_after.profile_section,
+    signals.profile_section,
     gap_closure.next_input_section,
     gap_closure.limits_section,
     estimate.estimate_section,

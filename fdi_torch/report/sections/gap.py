@@ -18,10 +18,10 @@ from fdi_torch.gap.verdict_words import (
     explanation_words,
     rounding_words,
 )
+from fdi_torch.report.diagnosed_effects import flows_that_matter, has_causes
 from fdi_torch.report.html import bullets, table
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, number, percent, probability_text, shown_unit, with_error
-from fdi_torch.report.reference_models import flows_that_matter, has_causes
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.style import BAR_NAME, bar_panel
 

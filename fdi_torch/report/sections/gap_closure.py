@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 
 from fdi_torch.gap.verdict_words import closed_sentence, explanation_words
 from fdi_torch.report.chart import PLANNED, Line
+from fdi_torch.report.diagnosed_effects import has_causes, reference_models
 from fdi_torch.report.html import bullets, folded, short, table
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, as_vector, axis, number, percent, shown_unit, with_error
-from fdi_torch.report.reference_models import has_causes, reference_models
 from fdi_torch.report.section import Picture, Section, channel_signals
 from fdi_torch.report.style import MARK, MODEL, SOFT, bar_panel, label_lines, panel
 
