@@ -58,32 +58,26 @@ def replay(
     path: str | Path,
     rerun: Rerun,
     *,
-    relative: float = RELATIVE,
     select: Select | None = None,
     env: Mapping[str, str] | None = None,
 ) -> Replay:
     """Repeat a run and compare it with its log.
 
     rerun: receives the opened log and returns the new log's path, or its messages. Numbers are within tolerance if |a -
-    b| <= ABSOLUTE + relative max(|a|, |b|). select: chooses and orders the messages to compare on each side; by default
+    b| <= ABSOLUTE + RELATIVE max(|a|, |b|). select: chooses and orders the messages to compare on each side; by default
     all as logged. Sentences on `/log` are not compared. Raises LogError for an unreadable log.
     """
     run = read_run(path)
     repeated = rerun(run)
     replayed = read_run(repeated).messages() if isinstance(repeated, str | Path) else repeated
-    return compare_events(
-        *((select(side) if select else side) for side in (run.messages(), replayed)),
-        relative=relative,
-        versions=version_changes(run, environment() if env is None else env),
-    )
+    logged, again = (select(side) if select else side for side in (run.messages(), replayed))
+    return compare_events(logged, again, version_changes(run, environment() if env is None else env))
 
 
 def compare_events(
     logged: Iterable[Message],
     replayed: Iterable[Message],
-    *,
-    relative: float,
-    versions: dict[str, tuple[str, str]] | None = None,
+    versions: dict[str, tuple[str, str]],
 ) -> Replay:
     """Compare two ordered streams of events, up to the first difference beyond the tolerance."""
     events, largest, first_inexact = 0, 0.0, None
@@ -94,10 +88,10 @@ def compare_events(
             difference = Difference(events, *event, deviation.field, repr(deviation.then), repr(deviation.now))
             first_inexact = first_inexact or difference
             largest = max(largest, deviation.relative)
-            if not deviation.within(relative):
-                return Replay("differs", events, difference, first_inexact, largest, versions or {})
+            if not deviation.within:
+                return Replay("differs", events, difference, first_inexact, largest, versions)
     outcome: Outcome = "bit-equal" if first_inexact is None else "within tolerance"
-    return Replay(outcome, events, None, first_inexact, largest, versions or {})
+    return Replay(outcome, events, None, first_inexact, largest, versions)
 
 
 def version_changes(run: Run, now: Mapping[str, str]) -> dict[str, tuple[str, str]]:
@@ -127,10 +121,11 @@ class _Deviation:
         scale = max(abs(self.then), abs(self.now))
         return abs(self.then - self.now) / scale if scale else 0.0
 
-    def within(self, relative: float) -> bool:
+    @property
+    def within(self) -> bool:
         if not self.numeric:
             return False
-        return bool(abs(self.then - self.now) <= ABSOLUTE + relative * max(abs(self.then), abs(self.now)))
+        return bool(abs(self.then - self.now) <= ABSOLUTE + RELATIVE * max(abs(self.then), abs(self.now)))
 
 
 def _deviations(then: Message | None, now: Message | None) -> Iterator[_Deviation]:

@@ -61,11 +61,6 @@ class Sink:
         """Bytes on disk."""
         return self._file.size
 
-    @property
-    def waiting(self) -> bool:
-        """Whether there is a message that is not on disk yet."""
-        return bool(self._indexes)
-
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         self.flush()
         data = _bytes(records.Metadata(name=name, metadata=dict(values)))

@@ -1,7 +1,7 @@
 """RunLog: the log of one run or study; a crash loses at most its last second.
 
-The run is written to `NAME.mcap.partial`, which becomes `NAME.mcap` at its end. Waiting messages go to disk after 0.75
-s at the latest, by a small thread, also while the run computes without logging. Equal configuration, data and seed give
+The run is written to `NAME.mcap.partial`, which becomes `NAME.mcap` at its end. Waiting messages go to disk after 0.7 s
+at the latest, by a small thread, also while the run computes without logging. Equal configuration, data and seed give
 equal messages; how these are divided into chunks depends on the clock.
 """
 
@@ -80,8 +80,6 @@ class RunLog(Topics):
         self._arrays: dict[str, np.ndarray] = {}
         self._sink: Sink | None = None
         self._stop = threading.Event()
-        self._waiting_since: float | None = None
-        self._size = 0
 
     def __enter__(self) -> RunLog:
         _expect_free(self.path)
@@ -141,19 +139,16 @@ class RunLog(Topics):
         """Attach a file to the log."""
         with self._lock:
             self._open_sink().attachment(name, media_type, data)
-            self._note_progress()
 
     def flush(self) -> None:
         """Write everything logged so far to disk."""
         with self._lock:
             self._open_sink().flush()
-            self._note_progress()
 
     def put(self, messages: Iterable[Timed]) -> None:
         """Write encoded messages; all methods of `Topics` call it."""
         with self._lock:
             self._open_sink().messages(self._forwarding(messages, self._listener) if self._listener else messages)
-            self._note_progress()
 
     def carry_over(self, messages: Iterable[Message]) -> int:
         """Copy messages of an earlier log of the same run, to be continued; returns their number."""
@@ -175,25 +170,12 @@ class RunLog(Topics):
             raise ValueError(f"{self.path}: expected an open log, got one outside its `with` block; write inside it")
         return self._sink
 
-    def _note_progress(self) -> None:
-        """Update the time since when messages have been waiting in memory."""
-        sink = self._open_sink()
-        if not sink.waiting:
-            self._waiting_since = None
-        elif self._waiting_since is None or sink.written != self._size:
-            self._waiting_since = time.monotonic()
-        self._size = sink.written
-
     def _flush_by_clock(self) -> None:
-        """Flush messages that have waited."""
-        while not self._stop.wait(self._flush_seconds / 2):
-            with self._lock:
-                since = self._waiting_since
-                if since is not None and time.monotonic() - since >= self._flush_seconds / 2:
-                    try:
-                        self.flush()
-                    except LogError:
-                        return  # the sink is dead; the next write says so
+        while not self._stop.wait(self._flush_seconds):
+            try:
+                self.flush()
+            except LogError:
+                return  # the sink is dead; the next write says so
 
     def _write_start(self, sink: Sink) -> None:
         sink.metadata("fdi_torch.run", self._run)

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.estimate.combinations import Combination
 from fdi_torch.estimate.misfit import NOT_ESTABLISHED
 from fdi_torch.names import counted
 from fdi_torch.report.chart import Chart, Line
@@ -29,16 +28,20 @@ def estimate_section(material: Material) -> Section | None:
     final = last_estimate(material)
     if final is None:
         return None
-    rows = [_row(material, final, i) for i in range(len(final["names"]))]
-    rows += [_combination_row(material, combination) for combination in combinations_of(material, "combinations")]
-    header = ["parameter", "finding"] if material.of("/diagnosis/fault") else ["parameter"]
-    header += HEADER
-    header += ["simulated"] if material.truth else []
+    names, units = [str(name) for name in final["names"]], final.get("units") or [""] * len(final["names"])
+    rows = []
+    for name, unit, value, std in zip(names, units, final["values"], final["std"], strict=True):
+        cells = estimate_cells(name, str(unit), float(value), float(std))
+        rows.append([name, _finding(material, name), *cells, _simulated(material, str(unit), (name,), (1.0,))])
+    for c in combinations_of(material, "combinations"):
+        deviates = c in combinations_of(material, "not_isolated") and not material.unexplained
+        found = tag("span", "present", class_="bad") if deviates else ""
+        cells = estimate_cells(c.parameters[0], c.unit, c.value, c.std)
+        rows.append([c.formula, found, *cells, _simulated(material, c.unit, c.parameters, c.coefficients)])
+    header = ("parameter", "finding", *HEADER, "simulated")  # without the columns that are empty
     notes = [str(note) for note in final.get("unidentifiable") or ()]
     notes += [f"{name} lies at an end of its range" for name in final.get("at_bound") or ()]
-    return Section(
-        "Estimate", [table(header, rows, left=header.index("unit") + 1), *_water(material), *bullets(notes)], lead=True
-    )
+    return Section("Estimate", [table(header, rows, left=3), *_water(material), *bullets(notes)], lead=True)
 
 
 def posterior_section(material: Material) -> Section | None:
@@ -73,34 +76,10 @@ def covariance_of(final: Payload) -> np.ndarray | None:
     return flat.reshape(count, count) if flat.size == count * count else None
 
 
-def _row(material: Material, final: Payload, i: int) -> list[Any]:
-    name = str(final["names"][i])
-    unit = str(final["units"][i]) if final.get("units") else ""
-    cells: list[Any] = [name, _finding(material, name)] if material.of("/diagnosis/fault") else [name]
-    cells += estimate_cells(name, unit, float(final["values"][i]), float(final["std"][i]))
-    return [*cells, *_simulated(material, unit, (name,), (1.0,))]
-
-
-def _combination_row(material: Material, combination: Combination) -> list[Any]:
-    """A determined combination."""
-    c = combination
-    cells: list[Any] = [c.formula]
-    if material.of("/diagnosis/fault"):
-        deviates = c in combinations_of(material, "not_isolated") and not material.unexplained
-        cells.append(tag("span", "present", class_="bad") if deviates else "")
-    return [
-        *cells,
-        *estimate_cells(c.parameters[0], c.unit, c.value, c.std),
-        *_simulated(material, c.unit, c.parameters, c.coefficients),
-    ]
-
-
-def _simulated(material: Material, unit: str, names: Sequence[str], coefficients: Sequence[float]) -> list[str]:
-    """The simulated value of a combination, empty if one of its parameters has none; no cell for measured data."""
-    if not material.truth:
-        return []
+def _simulated(material: Material, unit: str, names: Sequence[str], coefficients: Sequence[float]) -> str:
+    """The simulated value of a combination; empty if one of its parameters has none."""
     value = sum(c * material.truth.get(name, np.nan) for c, name in zip(coefficients, names, strict=True))
-    return [number(shown_unit(unit, names[0])[1] * value) if np.isfinite(value) else ""]
+    return number(shown_unit(unit, names[0])[1] * value) if np.isfinite(value) else ""
 
 
 def _finding(material: Material, name: str) -> Any:

@@ -49,8 +49,7 @@ def where_section(material: Material) -> Section | None:
     names = [name for name, _ in ranked]
     meaning = material.meaning_of_shares
     label = "share of the gap, %" if material.answer.get("format") == FORMAT_1 else "probability, %"
-    figure = bar_panel("", label, names, shares, texts, [name in guilty for name in names])
-    _up_to_all(figure)
+    figure = _bars(label, names, shares, texts, [name in guilty for name in names])
     words = f"{meaning[:1].upper()}{meaning[1:]}. Orange: causes of the likeliest explanation."
     return Section("Where the gap lies", [words, [Picture("gap_where", figure, caption)]], lead=True)
 
@@ -121,8 +120,7 @@ def posterior_bars(answer: Mapping[str, Any]) -> list[list[Picture]]:
         return []
     percents = [100.0 * chance for chance in chances]
     texts = [probability_text(0.01 * percent) for percent in percents]
-    figure = bar_panel("", "probability, %", names, percents, texts, within)
-    _up_to_all(figure)
+    figure = _bars("probability, %", names, percents, texts, within)
     caption = f"All contain {explanation_words(shared)}. " if shared else ""
     return [
         [Picture("gap_posterior", figure, f"{caption}Orange: together they have at least 95 % of the probability.")]
@@ -135,10 +133,12 @@ def _beside(shared: Sequence[Mapping[str, Any]], causes: Sequence[Mapping[str, A
     return explanation_words(others) if others or not shared else "nothing else"
 
 
-def _up_to_all(figure: Figure) -> None:
-    """Remove ticks beyond 100 %: that part of the axis only makes room for the numbers beside the bars."""
+def _bars(label: str, *bars: Any) -> Figure:
+    """Bars without ticks beyond 100 %: that part of the axis only makes room for the numbers beside the bars."""
+    figure = bar_panel("", label, *bars)
     axes = figure.axes[0]
     axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= 100.0])
+    return figure
 
 
 def _cause_rows(cause: Mapping[str, Any]) -> list[list[str]]:
