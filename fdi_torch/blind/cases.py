@@ -90,13 +90,23 @@ def _case(draft: CaseDraft, runs: Sequence[SimulatedRun]) -> Case:
         readings.append(noisy)
         noise_rms[name] = (rig.scales.length * np.sqrt(np.mean((noisy - clean) ** 2, axis=0))).tolist()
         gap_rms[name] = rig.scales.length * float(np.sqrt(np.mean((clean - nominal) ** 2)))
-    invisible = []
+    invisible = []  # full causes masked by others, such as a weir above a level that a leak lowers
     for k, run in zip(draft.full, runs[4:], strict=False) if len(draft.full) > 1 else ():
         other, _ = noisy_readings(c, run, 0, draft.without(k))
         if np.sqrt(np.mean(((other - readings[0]) / c.noise) ** 2)) < INVISIBLE:
             invisible.append(k)
     highest = np.maximum(*(run.levels.max(axis=0) for run in runs[:2]))
-    truth = _truth(draft, invisible) | {
+    causes = [draft.deviations[k] for k in draft.full if k not in invisible]
+    truth: dict[str, Any] = {
+        "case": draft.plan.name,
+        "kind": draft.plan.kind,
+        "index": draft.plan.index,
+        "causes": [
+            {"effect": d.effect, "location": d.location} | ({"really": d.law} if d.effect == "unknown" else {})
+            for d in causes
+        ],
+        "leave_out": list(draft.chosen.leave_out),
+        "deviations": [d.as_dict() for d in draft.deviations],
         "noise_rms_m": noise_rms,
         "gap_rms_m": gap_rms,
         "signal": c.signal,
@@ -117,22 +127,6 @@ def _case(draft: CaseDraft, runs: Sequence[SimulatedRun]) -> Case:
         asked = (runs[part].asked for part in (0, 1))
         commands = tuple(commands_of_pumps(c.built, q) for q in asked)  # type: ignore[assignment]
     return Case(draft.plan, rig, commands, (readings[0], readings[1]), truth)
-
-
-def _truth(draft: CaseDraft, invisible: Collection[int]) -> dict[str, Any]:
-    """The key of a case. invisible: full causes masked by others, such as a weir above a level that a leak lowers."""
-    full = [draft.deviations[k] for k in draft.full if k not in invisible]
-    return {
-        "case": draft.plan.name,
-        "kind": draft.plan.kind,
-        "index": draft.plan.index,
-        "causes": [
-            {"effect": d.effect, "location": d.location} | ({"really": d.law} if d.effect == "unknown" else {})
-            for d in full
-        ],
-        "leave_out": list(draft.chosen.leave_out),
-        "deviations": [d.as_dict() for d in draft.deviations],
-    }
 
 
 _DECIMALS_OF_LEVEL = 3

@@ -1,7 +1,7 @@
 """`fdi predict`: what it does and prints. Its options: `options/predict.py`.
 
 Path: cli.predict.run → config.loaded_recordings.named_recordings → gap.free_runs.prediction.predict →
-estimate.misfit.misfit_of → recordings.check.doubts_about → cli.explained.say_first → report.fit_figure.fit_figure
+estimate.misfit.misfit_of → recordings.check.doubts_about → cli.explained.say_first → report.chart.fit_figure
 """
 
 from __future__ import annotations

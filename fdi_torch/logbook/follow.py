@@ -10,7 +10,7 @@ from mcap.opcode import Opcode
 
 from fdi_torch.logbook import scan
 from fdi_torch.logbook.errors import LogError
-from fdi_torch.logbook.reader import Directory, Message, map_file, open_part
+from fdi_torch.logbook.reader import Directory, Message, map_file
 
 
 def follow(
@@ -71,7 +71,7 @@ class _Tail:
                 self.on_damage(part)
             elif part.opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
                 try:
-                    yield from open_part(data, part, self.directory)
+                    yield from self.directory.open(data, part)
                 except scan.ChunkError as error:
                     self.on_damage(scan.Damage(part.start, part.end, str(error)))
             self.place = part.end
