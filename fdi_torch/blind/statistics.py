@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Sequence
 from typing import Any
 
@@ -27,22 +28,17 @@ def median_interval(values: Sequence[float]) -> tuple[float, float, float]:
     ranked, n = sorted(values), len(values)
     if not ranked:
         return math.nan, math.nan, math.nan
-    median = 0.5 * (ranked[(n - 1) // 2] + ranked[n // 2])
     outside = [k for k in range(1, n // 2 + 1) if special.bdtr(k - 1, n, 0.5) <= 0.025]
-    if not outside:
-        return median, math.nan, math.nan
-    return median, ranked[outside[-1] - 1], ranked[n - outside[-1]]
+    low, high = (ranked[outside[-1] - 1], ranked[n - outside[-1]]) if outside else (math.nan, math.nan)
+    return statistics.median(ranked), low, high
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Mean and its normal 95 % interval; NaN without values, zero width for one value."""
+    """Mean and its normal 95 % interval; NaN without values, and its ends for one value."""
     if not values:
         return math.nan, math.nan, math.nan
-    mean = math.fsum(values) / len(values)
-    if len(values) == 1:
-        return mean, math.nan, math.nan
-    std = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1))
-    half = 1.96 * std / math.sqrt(len(values))
+    mean = statistics.fmean(values)
+    half = 1.96 * statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.nan
     return mean, mean - half, mean + half
 
 

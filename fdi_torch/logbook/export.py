@@ -74,8 +74,14 @@ def _csv(_run: Run, messages: Sequence[Message], stream: BinaryIO) -> None:
 
 
 def _ndjson(run: Run, messages: Sequence[Message], stream: BinaryIO) -> None:
+    """The raw JSON, with its lists of non-finite numbers."""
     for message in messages:
-        stream.write(orjson.dumps(_loaded(run, message), option=orjson.OPT_APPEND_NEWLINE))
+        if message.channel.encoding != "json":
+            raise LogError(f"{run.path}: {message.topic} is in {message.channel.encoding}, only json can be exported")
+        try:
+            stream.write(orjson.dumps(orjson.loads(message.data), option=orjson.OPT_APPEND_NEWLINE))
+        except ValueError as error:
+            raise LogError(f"{run.path}: a message on {message.topic} is not JSON ({error})") from None
 
 
 def _npz(_run: Run, messages: Sequence[Message], stream: BinaryIO) -> None:
@@ -93,16 +99,6 @@ def _columns(messages: Sequence[Message]) -> tuple[list[dict[str, Any]], list[st
     names = dict.fromkeys(name for payload in payloads for name in payload)
     units = {name: unit for message in messages for name, unit in message.channel.units.items()}
     return payloads, sorted(names, key=lambda name: name != "t"), units
-
-
-def _loaded(run: Run, message: Message) -> Any:
-    """The raw JSON, with its list of non-finite numbers."""
-    if message.channel.encoding != "json":
-        raise LogError(f"{run.path}: {message.topic} is in {message.channel.encoding}, only json can be exported")
-    try:
-        return orjson.loads(message.data)
-    except ValueError as error:
-        raise LogError(f"{run.path}: a message on {message.topic} is not JSON ({error})") from None
 
 
 def _header(name: str, unit: str) -> str:
