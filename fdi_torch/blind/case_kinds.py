@@ -121,7 +121,9 @@ def choose(
     """The causes of case `index` of this kind. trial: number of earlier draws whose causes were not visible."""
     rng, plant = case_generator(seed, kind.name, index, 2, *([trial] if trial else [])), rig.plant
     if kind.name == "twins":
-        return Chosen((_twin(plant, index, rng),), 1)
+        families = [(effects, places(plant, (at,))) for effects, at in TWINS if places(plant, (at,))]
+        effects, at = families[index % len(families)]
+        return Chosen(((str(rng.choice(effects)), str(rng.choice(at))),), 1)
     if kind.name == "left_out":
         return _left_out(plant, seed, index, leave_out, rng)
 
@@ -146,12 +148,6 @@ def choose(
     unknown = laws[_chosen(sorted(laws))]
     free = [p for p in places(plant, unknown.at) if all(p not in place.split("-") for _, place in causes)]
     return Chosen(tuple(causes), full, unknown, str(rng.choice(free or places(plant, unknown.at))))
-
-
-def _twin(plant: PlantDescription, index: int, rng: np.random.Generator) -> Cause:
-    families = [(effects, places(plant, (at,))) for effects, at in TWINS if places(plant, (at,))]
-    effects, at = families[index % len(families)]
-    return str(rng.choice(effects)), str(rng.choice(at))
 
 
 def _left_out(

@@ -135,7 +135,10 @@ class Register:
         definition = topic_definition(topic)
         named = named_kinds(definition, channel.schema_data) if channel else {}
         named.update({name: _kind(message.get(name)) for name in present if name not in definition.fields})
-        _check_names(topic, definition, named)
+        if named and not definition.named:
+            raise ValueError(f"{topic}: expected only {', '.join(definition.fields)}, got {', '.join(named)}")
+        for name in named.keys() & {NON_FINITE, WALL}:
+            raise ValueError(f"{topic}: expected a name other than {NON_FINITE} and {WALL}, got {name}; rename it")
         units = {f"unit.{name}": unit for name, (_, unit, _) in definition.fields.items() if unit}
         previous = dict(channel.metadata) if channel else {}
         further = {f"unit.{name}": unit for name, unit in (named_units or {}).items()} | dict(about or {})
@@ -157,14 +160,6 @@ class Register:
             properties = orjson.loads(channel.schema_data)["properties"]
             self._described[channel.topic] = (frozenset(properties), channel)
         self._count[channel.topic] = sequence + 1
-
-
-def _check_names(topic: str, definition: Topic, named: Mapping[str, Kind]) -> None:
-    if named and not definition.named:
-        raise ValueError(f"{topic}: expected only {', '.join(definition.fields)}, got {', '.join(named)}")
-    for name in named:
-        if name in (NON_FINITE, WALL):
-            raise ValueError(f"{topic}: expected a name other than {NON_FINITE} and {WALL}, got {name}; rename it")
 
 
 def _kind(value: Any) -> Kind:

@@ -121,10 +121,8 @@ class TextBlock:
 
     def placed_lines(self) -> list[tuple[Point, LetterStyle]]:
         """Each line with the point of its upper end if `down`, else of its lower end."""
-        x, y = self.point
-        if self.down:
-            return [((x, y - k * LINE), line) for k, line in enumerate(self.lines)]
-        return [((x, y + k * LINE), line) for k, line in enumerate(reversed(self.lines))]
+        (x, y), step = self.point, -LINE if self.down else LINE
+        return [((x, y + k * step), line) for k, line in enumerate(self.lines[:: 1 if self.down else -1])]
 
 
 @lru_cache(maxsize=1024)  # a drawing asks for the width of each line again and again

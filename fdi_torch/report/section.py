@@ -77,15 +77,13 @@ def section_html(section: Section, prefix: str, own_id: str) -> Markup:
     for block in section.blocks:
         if isinstance(block, str):
             blocks.append(block if isinstance(block, Markup) else tag("p", block))
-        else:
-            blocks.append(tag("div", *(_entry(entry, prefix) for entry in block), class_="grid"))
+            continue
+        entries = []
+        for entry in block:
+            figures = [_figure(each, prefix) for each in ([entry] if isinstance(entry, Picture) else entry)]
+            entries += figures if isinstance(entry, Picture) else [tag("div", *figures, class_="column")]
+        blocks.append(tag("div", *entries, class_="grid"))
     return tag("section", tag("h3", section.title), join(blocks), id=own_id)
-
-
-def _entry(entry: Picture | Column, prefix: str) -> Markup:
-    if isinstance(entry, Picture):
-        return _figure(entry, prefix)
-    return tag("div", *(_figure(picture, prefix) for picture in entry), class_="column")
 
 
 def _figure(picture: Picture, prefix: str) -> Markup:
