@@ -23,7 +23,7 @@ from fdi_torch.blind.inputs import SIGNALS, commanded, with_standstills
 from fdi_torch.blind.laws_pipe import HEAD_LAWS, PIPE_LAWS
 from fdi_torch.blind.laws_pump import PUMP_LAWS
 from fdi_torch.blind.laws_tank import STORAGE_LAWS, TANK_LAWS
-from fdi_torch.blind.named_effects import NAMED, NominalRun
+from fdi_torch.blind.named_effects import DRAWS, NominalRun, draw_effect
 from fdi_torch.blind.places import EFFECTS, canonical, effect_places
 from fdi_torch.blind.plants import Rig, Scales, cascaded_tanks, on_bench, quadruple_tank, three_tank
 from fdi_torch.blind.sensor_noise import NoiseCorrelation, autoregressive, rippling, smoothed
@@ -341,7 +341,7 @@ def test_leaving_out_nothing_that_exists_is_refused() -> None:
 def test_a_library_that_names_all_leaves_nothing_unknown() -> None:
     assert "check_valve" not in [u.law for u in unknown_to(("check_valve",))]
     with pytest.raises(ValueError, match="lacks some effect"):
-        unknown_to([alias for u in UNKNOWN for alias in u.aliases])
+        unknown_to([u.effect for u in UNKNOWN])
 
 
 def test_every_law_belongs_to_an_effect_or_an_unknown() -> None:
@@ -350,12 +350,12 @@ def test_every_law_belongs_to_an_effect_or_an_unknown() -> None:
     built, rng = rig.plant, np.random.default_rng(4)
     levels, asked = rng.uniform(0.2, 0.5, (1000, 3)), rng.uniform(1e-5, 7e-5, (1000, 2))
     around = NominalRun(built, levels, asked, 1.0, rng)
-    drawn = {NAMED[effect](around, place).law for effect, place in effect_places(built) * 30}
+    drawn = {draw_effect(effect, around, place).law for effect, place in effect_places(built) * 30}
     assert drawn | {u.law for u in UNKNOWN} == laws and not drawn & {u.law for u in UNKNOWN}
 
 
 def test_the_vocabulary_is_the_protocols() -> None:
-    assert set(NAMED) == set(EFFECTS)
+    assert set(DRAWS) == set(EFFECTS)
     assert len(effect_places(three_tank().plant)) == 62
     assert canonical(("plugging", "OUT2"), three_tank().plant) == ("leak", "T2")
     assert canonical(("plugging", "P13"), three_tank().plant) == ("plugging", "P13")

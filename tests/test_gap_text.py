@@ -14,7 +14,7 @@ from fdi_torch.gap.answer import Amount, Answer, Cause, ProbableExplanation, ado
 from fdi_torch.gap.verdict_words import causes_of, probability_words, verdict_sentence
 from fdi_torch.jobs.python_results import GapResult
 from fdi_torch.quantities import displayed_in
-from fdi_torch.report.reference_models import flows_that_matter
+from fdi_torch.report.diagnosed_effects import flows_that_matter
 from fdi_torch.report.sections.gap import _cause_rows
 from tests.test_gap import nominal_plant
 

@@ -8,20 +8,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdi_torch.blind.case_kinds import FAINT, KINDS, Chosen, Kind, case_generator, choose
-from fdi_torch.blind.case_readings import PARTS, Deviations, noisy_readings, simulated
+from fdi_torch.blind.case_readings import PARTS, noisy_readings
 from fdi_torch.blind.conditions import (
     COARSE,
     Conditions,
+    Deviations,
     controlled,
     disturbed,
     draw_conditions,
     kept_within,
     levels_at_rest,
     nominal_runs,
+    simulated,
 )
 from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.inputs import channel_to_rest
-from fdi_torch.blind.named_effects import NAMED, NominalRun
+from fdi_torch.blind.named_effects import NominalRun, draw_effect
 from fdi_torch.blind.networks import Networks, with_unmeasured
 from fdi_torch.blind.plants import Rig
 from fdi_torch.blind.random_flows import draw_disturbance
@@ -159,7 +161,7 @@ def _with_sizes(draft: CaseDraft, chosen: Chosen, seed: int, trial: int = 0) -> 
 
     strengths = [draft.kind.strength if i < chosen.full else FAINT for i in range(len(chosen.causes))]
     pairs = zip(chosen.causes, strengths, strict=True)
-    deviations = tuple(NAMED[effect](nominal_run(strength), place) for (effect, place), strength in pairs)
+    deviations = tuple(draw_effect(effect, nominal_run(strength), place) for (effect, place), strength in pairs)
     if chosen.unknown:
         deviations += (chosen.unknown.draw(nominal_run(draft.kind.strength), chosen.place),)
     return replace(draft, chosen=chosen, deviations=deviations)
@@ -185,8 +187,6 @@ def _with_visible_causes(
 
 def _all_visible(drafts: Sequence[CaseDraft]) -> list[bool]:
     """Whether every full cause of a draft is visible, by coarse runs with and without it."""
-    if not drafts:
-        return []
     sets = [[d.deviations, *(d.without(k) for k in d.full)] for d in drafts]
     runs = simulated(
         [(d.conditions, 0, off, False) for d, variants in zip(drafts, sets, strict=True) for off in variants], COARSE

@@ -1,4 +1,4 @@
-"""Simulation of cases and of their sensors' readings, with the equations of deviations that sit at sensors.
+"""Readings of the sensors of cases, with the equations of deviations that sit at sensors.
 
 Such an equation, a law, maps a signal sampled at the times `time` (T,), s; each lane is a column. A sensor law acts on
 the true level (T, n), m, before noise; a readout law acts on the noisy reading. Inputs switch at samples only, so that
@@ -7,28 +7,17 @@ a level is interpolated linearly between samples.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from fdi_torch.blind.conditions import HELD_OUT, RECORDED, Conditions
+from fdi_torch.blind.conditions import HELD_OUT, RECORDED, Conditions, Deviations
 from fdi_torch.blind.deviation import Array, Deviation, Numbers
 from fdi_torch.blind.plants import Rig
-from fdi_torch.blind.simulator import HiddenRigs, SimulatedRun, grouped, simulate
+from fdi_torch.blind.simulator import SimulatedRun, grouped
 from fdi_torch.plant.description import PlantDescription
 
 PARTS = (("recording", RECORDED), ("holdout", HELD_OUT))
-Deviations = tuple[Deviation, ...]
-"""Differences of a rig from its plant file."""
-Lane = tuple[Conditions, int, Deviations, bool]
-"""One simulation: conditions, part (0 recording, 1 hold-out), deviations, whether random flows act."""
-
-
-def simulated(lanes: Sequence[Lane], step: float) -> list[SimulatedRun]:
-    """All simulations in one batch, with integration steps of `step` s."""
-    rigs = HiddenRigs([c.built for c, *_ in lanes], [off for _, _, off, _ in lanes])
-    return simulate(rigs, [c.drive(part, disturbed) for c, part, _, disturbed in lanes], step)
 
 
 def noisy_readings(c: Conditions, run: SimulatedRun, part: int, deviations: Deviations) -> tuple[Array, Array]:
@@ -45,7 +34,7 @@ def _measured_levels(rig: Rig, built: PlantDescription, levels: Array, deviation
     return sensed * gain + np.array([(true.offset - nominal.offset) / nominal.gain for true, nominal in pairs])
 
 
-def _with_laws(laws: Any, rig: Rig, signal: Array, deviations: Sequence[Deviation]) -> Array:
+def _with_laws(laws: Mapping[str, Law], rig: Rig, signal: Array, deviations: Sequence[Deviation]) -> Array:
     """The signal (T, S) after each active law of a group of laws, at its sensor."""
     time, result = np.arange(len(signal), dtype=np.float64), signal.copy()
     for group in grouped(laws, [[s.name for s in rig.plant.sensors]], [tuple(deviations)]):
@@ -53,20 +42,8 @@ def _with_laws(laws: Any, rig: Rig, signal: Array, deviations: Sequence[Deviatio
     return result
 
 
+Law = Callable[[Array, Array, Numbers], Array]
 _SUBSTEPS = 20
-
-
-def offset(x: Array, time: Array, p: Numbers) -> Array:
-    return x + p["offset"]
-
-
-def stretched(x: Array, time: Array, p: Numbers) -> Array:
-    return p["gain"] * x
-
-
-def creeping(x: Array, time: Array, p: Numbers) -> Array:
-    """Drift at a constant rate."""
-    return x + p["rate"] * time[:, None]
 
 
 def late_reading(x: Array, time: Array, p: Numbers) -> Array:
@@ -75,17 +52,8 @@ def late_reading(x: Array, time: Array, p: Numbers) -> Array:
     return np.stack(columns, axis=1)
 
 
-def damped(x: Array, time: Array, p: Numbers) -> Array:
-    """First-order lag (stilling pipe), by backward Euler with twenty steps per sample."""
-    return _chain(x, time, (p["tau"],))
-
-
-def damped_twice(x: Array, time: Array, p: Numbers) -> Array:
-    """Second-order lag (stilling pipe and filter): poles at 94 % and 6 % of the time constant."""
-    return _chain(x, time, (0.94 * p["tau"], 0.06 * p["tau"]))
-
-
 def _chain(x: Array, time: Array, taus: tuple[Array, ...]) -> Array:
+    """First-order lags in series, by backward Euler with twenty steps per sample."""
     states, out = [x[0].copy() for _ in taus], np.empty_like(x)
     out[0] = x[0]
     for i in range(1, len(time)):
@@ -97,10 +65,6 @@ def _chain(x: Array, time: Array, taus: tuple[Array, ...]) -> Array:
                 drive = states[k]
         out[i] = states[-1]
     return out
-
-
-def clipped(x: Array, time: Array, p: Numbers) -> Array:
-    return np.minimum(x, p["ceiling"])
 
 
 def bowed(x: Array, time: Array, p: Numbers) -> Array:
@@ -119,11 +83,6 @@ def sticking_float(x: Array, time: Array, p: Numbers) -> Array:
     return out
 
 
-def humming(x: Array, time: Array, p: Numbers) -> Array:
-    """Slow beat between a disturbance and the sampling."""
-    return x + p["height"] * np.sin(2 * np.pi * time[:, None] / p["period"])
-
-
 def freezing(x: Array, time: Array, p: Numbers) -> Array:
     """A transmitter that sometimes repeats its last value for a while."""
     phase = np.mod(time[:, None] / p["period"], 1.0)
@@ -134,29 +93,10 @@ def freezing(x: Array, time: Array, p: Numbers) -> Array:
     return out
 
 
-def jumped(x: Array, time: Array, p: Numbers) -> Array:
-    """A zero shift at some time."""
-    return x + p["offset"] * (time[:, None] > p["onset"])
-
-
-def kinked(x: Array, time: Array, p: Numbers) -> Array:
-    """A different gain above some level."""
-    return x + p["extra"] * np.maximum(x - p["knee"], 0.0)
-
-
-def leading(x: Array, time: Array, p: Numbers) -> Array:
-    """Foam: positive error while the level rises, negative while it falls."""
-    return x + p["ahead"] * np.gradient(x, time, axis=0)
-
-
 def wandering(x: Array, time: Array, p: Numbers) -> Array:
     """Zero that varies with the temperature: two slow sines of incommensurate periods."""
     t = 2 * np.pi * time[:, None] / p["period"]
     return x + 0.5 * p["height"] * (np.sin(t) + np.sin(t / 0.618 + 1.0))
-
-
-def rounded(x: Array, time: Array, p: Numbers) -> Array:
-    return p["step"] * np.round(x / p["step"])
 
 
 def bursting(x: Array, time: Array, p: Numbers) -> Array:
@@ -169,9 +109,32 @@ def bursting(x: Array, time: Array, p: Numbers) -> Array:
     return out
 
 
-SENSOR_LAWS = {law.__name__: law for law in (
-    late_reading, damped, damped_twice, bowed, sticking_float, leading, kinked, stretched, offset, jumped, wandering,
-    creeping, humming, freezing, clipped,
-)} | {"clipped_reading": clipped}  # fmt: skip
+SENSOR_LAWS: dict[str, Law] = {  # in the order in which they act
+    "late_reading": late_reading,
+    # Stilling pipe: first-order lag; with a filter: poles at 94 % and 6 % of the time constant.
+    "damped": lambda x, time, p: _chain(x, time, (p["tau"],)),
+    "damped_twice": lambda x, time, p: _chain(x, time, (0.94 * p["tau"], 0.06 * p["tau"])),
+    "bowed": bowed,
+    "sticking_float": sticking_float,
+    # Foam: positive error while the level rises, negative while it falls.
+    "leading": lambda x, time, p: x + p["ahead"] * np.gradient(x, time, axis=0),
+    # A different gain above some level.
+    "kinked": lambda x, time, p: x + p["extra"] * np.maximum(x - p["knee"], 0.0),
+    "stretched": lambda x, time, p: p["gain"] * x,
+    "offset": lambda x, time, p: x + p["offset"],
+    # A zero shift at some time.
+    "jumped": lambda x, time, p: x + p["offset"] * (time[:, None] > p["onset"]),
+    "wandering": wandering,
+    "creeping": lambda x, time, p: x + p["rate"] * time[:, None],
+    # Slow beat between a disturbance and the sampling.
+    "humming": lambda x, time, p: x + p["height"] * np.sin(2 * np.pi * time[:, None] / p["period"]),
+    "freezing": freezing,
+    "clipped": lambda x, time, p: np.minimum(x, p["ceiling"]),
+    "clipped_reading": lambda x, time, p: np.minimum(x, p["ceiling"]),
+}
 # A transmitter's own limit clips the noise with the level: it acts twice, on either side of the noise.
-READOUT_LAWS = {"bursting": bursting, "clipped_reading": clipped, "rounded": rounded}
+READOUT_LAWS: dict[str, Law] = {
+    "bursting": bursting,
+    "clipped_reading": SENSOR_LAWS["clipped_reading"],
+    "rounded": lambda x, time, p: p["step"] * np.round(x / p["step"]),
+}

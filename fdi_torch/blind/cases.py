@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.blind.case_drafts import CaseDraft, CasePlan, draft_cases
-from fdi_torch.blind.case_readings import PARTS, Lane, noisy_readings, simulated
-from fdi_torch.blind.conditions import commands_of_pumps, moved_by
+from fdi_torch.blind.case_readings import PARTS, noisy_readings
+from fdi_torch.blind.conditions import Lane, commands_of_pumps, moved_by, simulated
 from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.inputs import DECIMALS, command_unit, pumps_of_channels
 from fdi_torch.blind.networks import Networks
@@ -90,13 +90,23 @@ def _case(draft: CaseDraft, runs: Sequence[SimulatedRun]) -> Case:
         readings.append(noisy)
         noise_rms[name] = (rig.scales.length * np.sqrt(np.mean((noisy - clean) ** 2, axis=0))).tolist()
         gap_rms[name] = rig.scales.length * float(np.sqrt(np.mean((clean - nominal) ** 2)))
-    invisible = []
+    invisible = []  # full causes masked by others, such as a weir above a level that a leak lowers
     for k, run in zip(draft.full, runs[4:], strict=False) if len(draft.full) > 1 else ():
         other, _ = noisy_readings(c, run, 0, draft.without(k))
         if np.sqrt(np.mean(((other - readings[0]) / c.noise) ** 2)) < INVISIBLE:
             invisible.append(k)
     highest = np.maximum(*(run.levels.max(axis=0) for run in runs[:2]))
-    truth = _truth(draft, invisible) | {
+    causes = [draft.deviations[k] for k in draft.full if k not in invisible]
+    truth: dict[str, Any] = {
+        "case": draft.plan.name,
+        "kind": draft.plan.kind,
+        "index": draft.plan.index,
+        "causes": [
+            {"effect": d.effect, "location": d.location} | ({"really": d.law} if d.effect == "unknown" else {})
+            for d in causes
+        ],
+        "leave_out": list(draft.chosen.leave_out),
+        "deviations": [d.as_dict() for d in draft.deviations],
         "noise_rms_m": noise_rms,
         "gap_rms_m": gap_rms,
         "signal": c.signal,
@@ -117,22 +127,6 @@ def _case(draft: CaseDraft, runs: Sequence[SimulatedRun]) -> Case:
         asked = (runs[part].asked for part in (0, 1))
         commands = tuple(commands_of_pumps(c.built, q) for q in asked)  # type: ignore[assignment]
     return Case(draft.plan, rig, commands, (readings[0], readings[1]), truth)
-
-
-def _truth(draft: CaseDraft, invisible: Collection[int]) -> dict[str, Any]:
-    """The key of a case. invisible: full causes masked by others, such as a weir above a level that a leak lowers."""
-    full = [draft.deviations[k] for k in draft.full if k not in invisible]
-    return {
-        "case": draft.plan.name,
-        "kind": draft.plan.kind,
-        "index": draft.plan.index,
-        "causes": [
-            {"effect": d.effect, "location": d.location} | ({"really": d.law} if d.effect == "unknown" else {})
-            for d in full
-        ],
-        "leave_out": list(draft.chosen.leave_out),
-        "deviations": [d.as_dict() for d in draft.deviations],
-    }
 
 
 _DECIMALS_OF_LEVEL = 3
@@ -216,11 +210,9 @@ def read_plant(out: Path, line: Mapping[str, Any]) -> PlantDescription:
     path = _plant_file(out, line["case"])
     _expect_unchanged(line, "plant", file_sha256(path))
     data = json.loads(path.read_text())
-    kinds = {"tanks": Tank, "sensors": Sensor} | {kind.part(): kind for kind in FLOW_KINDS}
+    kinds = {"tanks": Tank, "sensors": Sensor, "matters": FaultPriority} | {kind.part(): kind for kind in FLOW_KINDS}
     parts = {name: tuple(kind(**fields) for fields in data.get(name, ())) for name, kind in kinds.items()}
-    matters = tuple(FaultPriority(**matter) for matter in data.get("matters", ()))
-    lists = {"effects": (), "varying": tuple(data["varying"]), "matters": matters}
-    return PlantDescription(**(data | parts | lists))
+    return PlantDescription(**(data | parts | {"effects": (), "varying": tuple(data["varying"])}))
 
 
 def read_recording(out: Path, line: Mapping[str, Any], part: str, plant: PlantDescription) -> Recording:
@@ -256,10 +248,5 @@ def open_key(out: Path) -> dict[str, dict[str, Any]]:
     for case, line in manifest(out).items():
         if case not in keys:
             raise ValueError(f"{case}: expected a sealed key, got none; repeat `fdi challenge`")
-        actual = digest(sealed_line(keys[case]))
-        if actual != line["key"]:
-            raise ValueError(
-                f"{case}: expected a key of SHA-256 {line['key'][:12]}..., got {actual[:12]}...; "
-                "it was changed after it was sealed: repeat `fdi challenge`"
-            )
+        _expect_unchanged(line, "key", digest(sealed_line(keys[case])))
     return keys

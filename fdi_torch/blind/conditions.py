@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.blind.deviation import Array
+from fdi_torch.blind.deviation import Array, Deviation
 from fdi_torch.blind.inputs import (
     DECIMALS,
     FACTORS,
@@ -84,13 +84,11 @@ def as_built(plant: PlantDescription, rng: np.random.Generator) -> PlantDescript
         nominal = float(getattr(plant.component(name.place), name.field))
         value = nominal + tolerance * z if name.field == "offset" else nominal * max(1 + tolerance * z, _LEAST)
         drawn.setdefault(name.place, {})[name.field] = value
-    return replace(
-        plant,
-        tanks=tuple(replace(t, **drawn.get(t.name, {})) for t in plant.tanks),
-        pipes=tuple(replace(p, **drawn.get(p.name, {})) for p in plant.pipes),
-        pumps=tuple(replace(p, **drawn.get(p.name, {})) for p in plant.pumps),
-        sensors=tuple(replace(s, **drawn.get(s.name, {})) for s in plant.sensors),
-    )
+    parts: dict[str, Any] = {
+        part: tuple(replace(c, **drawn.get(c.name, {})) for c in getattr(plant, part))
+        for part in ("tanks", "pipes", "pumps", "sensors")
+    }
+    return replace(plant, **parts)
 
 
 def draw_conditions(
@@ -131,6 +129,20 @@ def commands_of_pumps(plant: PlantDescription, asked: Array) -> Array:
     return np.stack(columns, axis=1)
 
 
+Deviations = tuple[Deviation, ...]
+"""Differences of a rig from its plant file."""
+Lane = tuple[Conditions, int, Deviations, bool]
+"""One simulation: conditions, part (0 recording, 1 hold-out), deviations, whether random flows act."""
+
+
+def simulated(lanes: Sequence[Lane], step: float) -> list[SimulatedRun]:
+    """All simulations in one batch, with integration steps of `step` s."""
+    if not lanes:
+        return []
+    rigs = HiddenRigs([c.built for c, *_ in lanes], [off for _, _, off, _ in lanes])
+    return simulate(rigs, [c.drive(part, disturbed) for c, part, _, disturbed in lanes], step)
+
+
 def levels_at_rest(rig: Rig) -> Array:
     """Equilibrium levels (N,) m of the rig without any effect at medium inputs."""
     if rig.rest is not None:
@@ -143,10 +155,7 @@ def levels_at_rest(rig: Rig) -> Array:
 
 def nominal_runs(conditions: Sequence[Conditions], part: int, disturbed: bool = False) -> list[SimulatedRun]:
     """Coarse simulations of each recording (part 0) or hold-out (part 1) without any effect."""
-    if not conditions:
-        return []
-    rigs = HiddenRigs([c.built for c in conditions], [()] * len(conditions))
-    return simulate(rigs, [c.drive(part, disturbed) for c in conditions], COARSE)
+    return simulated([(c, part, (), disturbed) for c in conditions], COARSE)
 
 
 def kept_within(conditions: Sequence[Conditions]) -> list[Conditions]:

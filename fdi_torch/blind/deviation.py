@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,4 @@ class Deviation:
     other: str | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        return {"effect": self.effect, "location": self.location, "law": self.law, "numbers": self.numbers} | (
-            {"other": self.other} if self.other else {}
-        )
+        return {name: value for name, value in asdict(self).items() if value is not None}

@@ -1,11 +1,12 @@
 """Laws of deviations at the hidden rigs' pipes and outlets.
 
 A head law maps the driving head (n,) m. A pipe law is f(head, q, now, p, state) -> (factor, state):
-what the square-root flow q = k sign(head) sqrt|head| (m^3/s) is multiplied by.
+what the square-root flow q = k sign(head) sqrt|head| (m^3/s) is multiplied by. A law without memory leaves state None.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -29,34 +30,10 @@ def viscous_and_inertial(head: Array, q: Array, now: Moment, p: Numbers, state: 
     return 1.0 / (np.sqrt(1 + 0.25 * e * e) + 0.5 * e), None
 
 
-def reynolds_blend(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """Discharge coefficient tending to its turbulent value as tanh of the root of the head."""
-    return np.tanh(np.sqrt(np.abs(head) / p["head"])), None
-
-
-def sharp_transition(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """Linear in the head below a threshold, square root above it."""
-    return np.minimum(np.sqrt(np.abs(head) / p["head"]), 1.0), None
-
-
 def other_power(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
     """((x^2 + w^2) / x_ref^2)^((n - 1/2)/2), w = 2 mm."""
     ratio = (head * head + (2 * _MILLIMETRE) ** 2) / p["reference"] ** 2
     return np.exp(0.5 * (p["power"] - 0.5) * np.log(ratio)), None
-
-
-def drifting_evenly(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    return 1 + p["change"] * now.time / p["span"], None
-
-
-def drifting_to_rest(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """Exponential approach: (1 - exp(-1.5 t/T)) / (1 - exp(-1.5))."""
-    return 1 + p["change"] * (1 - np.exp(-1.5 * now.time / p["span"])) / (1 - np.exp(-1.5)), None
-
-
-def drifting_as_sine(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """A quarter of a slow sine."""
-    return 1 + p["change"] * np.sin(0.5 * np.pi * now.time / p["span"]), None
 
 
 def drifting_unevenly(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
@@ -69,11 +46,6 @@ def narrowed(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Fact
     """A smaller (larger) opening from `onset` on, reached within `ramp` seconds."""
     grown = np.minimum(np.maximum((now.time - p["onset"]) / p["ramp"], 0.0), 1.0)
     return 1 - p["loss"] * grown, None
-
-
-def check_valve(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """A check valve: flow in the forward direction only."""
-    return (head > 0).astype(np.float64), None
 
 
 def silting(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
@@ -90,11 +62,6 @@ def two_regimes(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> F
     return np.where(attached, 1.0, 1 - p["loss"]), attached
 
 
-def fluttering(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """A flap that opens and closes periodically."""
-    return 1 - p["loss"] * np.sin(np.pi * now.time / p["period"]) ** 2, None
-
-
 def choked(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
     """A flow limiter: q_max tanh(q/q_max) with a sharper knee."""
     x = (q / p["most"]) ** 2
@@ -107,19 +74,36 @@ def blocked_at_times(head: Array, q: Array, now: Moment, p: Numbers, state: Any)
     return 1 - p["loss"] * (np.sin(t) + np.sin(t / 0.618 + 1.0) > 0.7), None
 
 
-def lopsided(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """A different discharge coefficient for reverse flow."""
-    return np.where(head > 0, 1 + p["change"], 1 - p["change"]), None
-
-
-def gulping(head: Array, q: Array, now: Moment, p: Numbers, state: Any) -> Factor:
-    """A vortex that entrains air at low head."""
-    return np.where(np.abs(head) < p["head"], 1 - p["loss"], 1.0), None
-
-
 HEAD_LAWS = {"down_pipe": down_pipe}
-PIPE_LAWS = {law.__name__: law for law in (
-    viscous_and_inertial, reynolds_blend, sharp_transition, other_power, drifting_evenly, drifting_to_rest,
-    drifting_as_sine, drifting_unevenly, narrowed, check_valve, silting, two_regimes, fluttering, choked,
-    blocked_at_times, lopsided, gulping
-)}  # fmt: skip
+PIPE_LAWS: dict[str, Callable[[Array, Array, Moment, Numbers, Any], Factor]] = {
+    "viscous_and_inertial": viscous_and_inertial,
+    # Discharge coefficient tending to its turbulent value as tanh of the root of the head.
+    "reynolds_blend": lambda head, q, now, p, state: (np.tanh(np.sqrt(np.abs(head) / p["head"])), None),
+    # Linear in the head below a threshold, square root above it.
+    "sharp_transition": lambda head, q, now, p, state: (np.minimum(np.sqrt(np.abs(head) / p["head"]), 1.0), None),
+    "other_power": other_power,
+    "drifting_evenly": lambda head, q, now, p, state: (1 + p["change"] * now.time / p["span"], None),
+    # Exponential approach: (1 - exp(-1.5 t/T)) / (1 - exp(-1.5)).
+    "drifting_to_rest": lambda head, q, now, p, state: (
+        1 + p["change"] * (1 - np.exp(-1.5 * now.time / p["span"])) / (1 - np.exp(-1.5)),
+        None,
+    ),
+    # A quarter of a slow sine.
+    "drifting_as_sine": lambda head, q, now, p, state: (
+        1 + p["change"] * np.sin(0.5 * np.pi * now.time / p["span"]),
+        None,
+    ),
+    "drifting_unevenly": drifting_unevenly,
+    "narrowed": narrowed,
+    "check_valve": lambda head, q, now, p, state: ((head > 0).astype(np.float64), None),
+    "silting": silting,
+    "two_regimes": two_regimes,
+    # A flap that opens and closes periodically.
+    "fluttering": lambda head, q, now, p, state: (1 - p["loss"] * np.sin(np.pi * now.time / p["period"]) ** 2, None),
+    "choked": choked,
+    "blocked_at_times": blocked_at_times,
+    # A different discharge coefficient for reverse flow.
+    "lopsided": lambda head, q, now, p, state: (np.where(head > 0, 1 + p["change"], 1 - p["change"]), None),
+    # A vortex that entrains air at low head.
+    "gulping": lambda head, q, now, p, state: (np.where(np.abs(head) < p["head"], 1 - p["loss"], 1.0), None),
+}

@@ -1,52 +1,24 @@
 """Laws of deviations at the hidden rigs' pumps: maps of the requested flow to the delivered flow.
 
-A law is f(q, now, p, state) -> (q, state): q (n,) m^3/s, p its numbers (n,) each, state None at the first step.
-A flow that changes within a step is given as its mean over the step.
+A law is f(q, now, p, state) -> (q, state): q (n,) m^3/s, p its numbers (n,) each, state None at the first step and
+always for a law without memory. A flow that changes within a step is given as its mean over the step.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fdi_torch.blind.deviation import Array, Moment, Numbers
 
 Delivered = tuple[Array, Any]
 
 
-def late(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """Pure delay: plug flow in a hose."""
-    return now.asked(p["delay"]), None
-
-
-def late_and_smeared(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """Delay with some mixing: half arrives a little earlier, half a little later."""
-    return 0.5 * (now.asked(0.92 * p["delay"]) + now.asked(1.08 * p["delay"])), None
-
-
 def late_and_slow(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
     """Delay, and a first-order valve with a fifth of the delay as time constant."""
     return slow(now.asked(0.8 * p["delay"]), now, {"tau": 0.2 * p["delay"]}, state)
-
-
-def scaled(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    return p["gain"] * q, None
-
-
-def soft_threshold(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """A dead zone whose knee is a hyperbola: (x + sqrt(x^2 + w^2)) / 2 with x = q - d."""
-    x = q - p["zone"]
-    return np.where(q > 0, 0.5 * (x + np.sqrt(x * x + p["knee"] ** 2)), 0.0), None
-
-
-def threshold(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    return np.maximum(q - p["zone"], 0.0), None
-
-
-def hard_limit(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    return np.minimum(q, p["limit"]), None
 
 
 def rounded_limit(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
@@ -81,25 +53,6 @@ def slow_in_two_poles(q: Array, now: Moment, p: Numbers, state: Any) -> Delivere
     return 0.5 * (rotor + rotor_new), (fast_new, rotor_new)
 
 
-def shut_off_head(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """A centrifugal pump's curve: q sqrt(1 - h/H)."""
-    return q * np.sqrt(np.maximum(1 - now.level / p["head"], 0.0)), None
-
-
-def falling(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """Linear in the level: q (1 - h/H)."""
-    return q * np.maximum(1 - now.level / p["head"], 0.0), None
-
-
-def drooping(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """Quadratic in the level: q (1 - (h/H)^2)."""
-    return q * np.maximum(1 - (now.level / p["head"]) ** 2, 0.0), None
-
-
-def pulsating(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    return q * (1 + p["depth"] * np.sin(2 * np.pi * now.time / p["period"])), None
-
-
 def backlash(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
     """The play operator: backlash between command and spindle."""
     old = q - p["slack"] if state is None else state
@@ -129,13 +82,10 @@ def stalling(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
 
 
 def sputtering(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """Air intake at irregular times."""
-    return np.where(_irregular(now.time, p["period"]), p["rest"] * q, q), None
-
-
-def bent(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
-    """Nonlinearity that vanishes at zero and full flow: q (1 + 4 b (1 - q/q_max))."""
-    return q * (1 + 4 * p["bow"] * (1 - q / p["rated"])), None
+    """Air intake for about a quarter of the time at aperiodic intervals: two sines of incommensurate periods."""
+    turns = 2 * np.pi * now.time
+    on = np.sin(turns / p["period"]) + np.sin(turns / (0.618 * p["period"]) + 1.0) > 0.9
+    return np.where(on, p["rest"] * q, q), None
 
 
 def slewing(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
@@ -146,14 +96,39 @@ def slewing(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
     return 0.5 * (old + new), new
 
 
-def _irregular(time: float, period: Array) -> npt.NDArray[np.bool_]:
-    """True for about a quarter of the time at aperiodic intervals: two sines of incommensurate periods."""
-    return np.sin(2 * np.pi * time / period) + np.sin(2 * np.pi * time / (0.618 * period) + 1.0) > 0.9
+def soft_threshold(q: Array, now: Moment, p: Numbers, state: Any) -> Delivered:
+    """A dead zone whose knee is a hyperbola: (x + sqrt(x^2 + w^2)) / 2 with x = q - d."""
+    x = q - p["zone"]
+    return np.where(q > 0, 0.5 * (x + np.sqrt(x * x + p["knee"] ** 2)), 0.0), None
 
 
 # In the order in which they act: what replaces the command comes first.
-PUMP_LAWS = {law.__name__: law for law in (
-    late, late_and_smeared, late_and_slow, slewing, sticking, backlash, soft_threshold, threshold, bent, scaled,
-    slow, slow_in_two_poles, shut_off_head, falling, drooping, pulsating, sputtering, tiring, stalling,
-    hard_limit, rounded_limit
-)}  # fmt: skip
+PUMP_LAWS: dict[str, Callable[[Array, Moment, Numbers, Any], Delivered]] = {
+    "late": lambda q, now, p, state: (now.asked(p["delay"]), None),  # plug flow in a hose
+    # With some mixing: half arrives a little earlier, half a little later.
+    "late_and_smeared": lambda q, now, p, state: (
+        0.5 * (now.asked(0.92 * p["delay"]) + now.asked(1.08 * p["delay"])),
+        None,
+    ),
+    "late_and_slow": late_and_slow,
+    "slewing": slewing,
+    "sticking": sticking,
+    "backlash": backlash,
+    "soft_threshold": soft_threshold,
+    "threshold": lambda q, now, p, state: (np.maximum(q - p["zone"], 0.0), None),
+    # Vanishes at zero and full flow.
+    "bent": lambda q, now, p, state: (q * (1 + 4 * p["bow"] * (1 - q / p["rated"])), None),
+    "scaled": lambda q, now, p, state: (p["gain"] * q, None),
+    "slow": slow,
+    "slow_in_two_poles": slow_in_two_poles,
+    # A centrifugal pump's curve; linear and quadratic in the level.
+    "shut_off_head": lambda q, now, p, state: (q * np.sqrt(np.maximum(1 - now.level / p["head"], 0.0)), None),
+    "falling": lambda q, now, p, state: (q * np.maximum(1 - now.level / p["head"], 0.0), None),
+    "drooping": lambda q, now, p, state: (q * np.maximum(1 - (now.level / p["head"]) ** 2, 0.0), None),
+    "pulsating": lambda q, now, p, state: (q * (1 + p["depth"] * np.sin(2 * np.pi * now.time / p["period"])), None),
+    "sputtering": sputtering,
+    "tiring": tiring,
+    "stalling": stalling,
+    "hard_limit": lambda q, now, p, state: (np.minimum(q, p["limit"]), None),
+    "rounded_limit": rounded_limit,
+}

@@ -6,6 +6,7 @@ one is named. A storage law gives the cross-section at levels (m, n) as a share 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,6 @@ def hole(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Out
     """Leak through a round hole: partly submerged over its diameter, then Torricelli."""
     x = np.maximum(level - p["height"], 0.0)
     return p["conductance"] * np.sqrt(x) * np.minimum(x / p["bore"], 1.0), None
-
-
-def floor_hole(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
-    return p["conductance"] * np.sqrt(np.maximum(level, 0.0)), None
 
 
 def slot(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
@@ -58,11 +55,6 @@ def notched_weir(level: Array, other: Array, now: Moment, p: Numbers, state: Any
     return p["flow"] * x * x * np.sqrt(x), None
 
 
-def brim(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
-    """Overflow over a long straight edge: q = q_ref x/x_ref."""
-    return p["flow"] * np.maximum(level - p["crest"], 0.0) / p["depth"], None
-
-
 def siphon(level: Array, other: Array, now: Moment, p: Numbers, state: Any) -> Outflow:
     """A siphon: starts when its bend is submerged, stops when its mouth draws air."""
     running = np.zeros(level.shape, dtype=bool) if state is None else state
@@ -96,16 +88,6 @@ def splashing_in(level: Array, other: Array, now: Moment, p: Numbers, state: Any
     return np.where(np.sin(t) + np.sin(t / 0.618 + 1.0) > 0.8, -p["flow"], 0.0), None
 
 
-def cone(level: Array, p: Numbers) -> Array:
-    """Width grows linearly, the cross-section with the square: (1 + b h)^2, nominal at a reference level."""
-    return ((1 + p["slope"] * level) / (1 + p["slope"] * p["reference"])) ** 2
-
-
-def wedge(level: Array, p: Numbers) -> Array:
-    """One inclined wall: the cross-section grows linearly, 1 + b h, nominal at a reference level."""
-    return (1 + 2 * p["slope"] * level) / (1 + 2 * p["slope"] * p["reference"])
-
-
 def block(level: Array, p: Numbers) -> Array:
     """A body with chamfered edges between two levels."""
     x = (level - p["low"]) / (p["high"] - p["low"])
@@ -125,8 +107,28 @@ def heap(level: Array, p: Numbers) -> Array:
     return 1 - np.where((x >= 0) & (x <= 1), p["share"] * (1 - 0.5 * x), 0.0)
 
 
-TANK_LAWS = {law.__name__: law for law in (
-    hole, floor_hole, slot, window, tapped, rectangular_weir, notched_weir, brim, siphon, cycling_user,
-    float_valve, side_chamber, splashing_in
-)}  # fmt: skip
-STORAGE_LAWS = {"cone": cone, "wedge": wedge, "block": block, "barrel": barrel, "heap": heap}
+TANK_LAWS: dict[str, Callable[[Array, Array, Moment, Numbers, Any], Outflow]] = {
+    "hole": hole,
+    "floor_hole": lambda level, other, now, p, state: (p["conductance"] * np.sqrt(np.maximum(level, 0.0)), None),
+    "slot": slot,
+    "window": window,
+    "tapped": tapped,
+    "rectangular_weir": rectangular_weir,
+    "notched_weir": notched_weir,
+    # Overflow over a long straight edge: q = q_ref x/x_ref.
+    "brim": lambda level, other, now, p, state: (p["flow"] * np.maximum(level - p["crest"], 0.0) / p["depth"], None),
+    "siphon": siphon,
+    "cycling_user": cycling_user,
+    "float_valve": float_valve,
+    "side_chamber": side_chamber,
+    "splashing_in": splashing_in,
+}
+STORAGE_LAWS: dict[str, Callable[[Array, Numbers], Array]] = {
+    # Width grows linearly, the cross-section with the square: (1 + b h)^2, nominal at a reference level.
+    "cone": lambda level, p: ((1 + p["slope"] * level) / (1 + p["slope"] * p["reference"])) ** 2,
+    # One inclined wall: the cross-section grows linearly.
+    "wedge": lambda level, p: (1 + 2 * p["slope"] * level) / (1 + 2 * p["slope"] * p["reference"]),
+    "block": block,
+    "barrel": barrel,
+    "heap": heap,
+}

@@ -10,7 +10,7 @@ from fdi_torch.blind.case_kinds import KINDS
 from fdi_torch.blind.conditions import HELD_OUT
 from fdi_torch.blind.places import Cause, canonical, effect_places
 from fdi_torch.blind.sizes import size_errors
-from fdi_torch.blind.statistics import clopper_pearson, mean_interval, median_interval
+from fdi_torch.blind.statistics import mean_interval, median_interval, share_of
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
 from fdi_torch.quantities import unit_factor
 
@@ -44,8 +44,8 @@ def utility(answer: Collection[Cause], truth: Collection[Cause], pairs: int) -> 
 
 def expected_utility(answer: Answer, sets: Sequence[list[Cause]], truth: list[Cause], plant: PlantDescription) -> float:
     """Utility averaged over the posterior; without one, over the members of the answer set with equal weights."""
-    post = [(_causes(x["causes"], plant), float(x["probability"])) for x in answer.get("posterior") or []]
-    post = post or [(s, 1.0) for s in sets or [[]]]
+    stated = [(_causes(x["causes"], plant), float(x["probability"])) for x in answer.get("posterior") or []]
+    post = stated or [(s, 1.0) for s in sets or [[]]]
     weight, pairs = sum(w for _, w in post) or 1.0, len(effect_places(plant))
     return sum(w * utility(_with_names(s), truth, pairs) for s, w in post) / weight
 
@@ -84,7 +84,9 @@ def judge(truth: Mapping[str, Any], answer: Answer, plant: PlantDescription) -> 
         return row | _judge_unknown(outside_library[0], named, causes, sets, verdict, where)
     row |= {"z": size_errors(truth, answer.get("causes") or (), plant)} if verdict in ("named", "ambiguous") else {}
     if kind == "messy":
-        return row | _judge_messy(true[0], causes, verdict)
+        full = true[0]  # the faint ones need not be named
+        row |= {"right": full in causes, "place": any(place == full[1] for _, place in causes)}
+        return row | {"named_wrong": verdict == "named" and not row["right"]}
     of_outlets = [[("leak", p.source)] for p in plant.pipes if p.target == OUTSIDE]
     tolerated = verdict == "no_gap" and true in of_outlets and not KINDS[kind].shows
     row |= _judge_named(true, causes, sets, verdict, tolerated)
@@ -117,15 +119,6 @@ def _judge_unknown(
     return row | {
         "cause_beside": row["right"] and _with_names(causes) == named,
         "in_set": any(sorted(s) == whole for s in sets),
-    }
-
-
-def _judge_messy(full: Cause, causes: list[Cause], verdict: Any) -> Row:
-    """Scores of a case with one effect of full size among faint ones, which need not be named."""
-    return {
-        "right": full in causes,
-        "place": any(place == full[1] for _, place in causes),
-        "named_wrong": verdict == "named" and full not in causes,
     }
 
 
@@ -187,16 +180,12 @@ def _stratum(rows: Sequence[Row]) -> dict[str, Any]:
     for name in SHARES:
         hits = [bool(r[name]) for r in rows if name in r]
         if hits:
-            low, high = clopper_pearson(sum(hits), len(hits))
-            out[name] = {"of": len(hits), "hits": sum(hits), "share": sum(hits) / len(hits), "ci95": [low, high]}
-    for name in MEANS:
-        values = [float(r[name]) for r in rows if r.get(name) is not None]
-        if values:
-            mean, low, high = mean_interval(values)
-            out[name] = {"of": len(values), "mean": mean, "ci95": [low, high]}
-    for name in MEDIANS:
-        values = [float(r[name]) for r in rows if r.get(name) is not None]
-        if values:
-            median, low, high = median_interval(values)
-            out[f"median_{name}"] = {"of": len(values), "median": median, "ci95": [low, high]}
+            out[name] = share_of(sum(hits), len(hits))
+    for names, kind, interval in ((MEANS, "mean", mean_interval), (MEDIANS, "median", median_interval)):
+        for name in names:
+            values = [float(r[name]) for r in rows if r.get(name) is not None]
+            if values:
+                middle, *ends = interval(values)
+                key = name if kind == "mean" else f"median_{name}"
+                out[key] = {"of": len(values), kind: middle, "ci95": ends}
     return out

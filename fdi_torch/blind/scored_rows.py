@@ -16,7 +16,7 @@ from typing import Any
 from fdi_torch.blind.cases import answers, lines_of, manifest, open_key, read_plant
 from fdi_torch.blind.score import Row, by_effect, judge, summary
 from fdi_torch.blind.sizes import sizes
-from fdi_torch.blind.statistics import clopper_pearson
+from fdi_torch.blind.statistics import share_of
 from fdi_torch.disk import write_text
 from fdi_torch.plant.description import PlantDescription
 
@@ -106,10 +106,7 @@ def reliability(rows: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
         if inside:
             hits = sum(right for _, right in inside)
             mean = math.fsum(p for p, _ in inside) / len(inside)
-            share = {"of": len(inside), "hits": hits, "share": hits / len(inside)}
-            bins.append(
-                {"low": low, "high": high, "stated": mean} | share | {"ci95": clopper_pearson(hits, len(inside))}
-            )
+            bins.append({"low": low, "high": high, "stated": mean} | share_of(hits, len(inside)))
     return bins
 
 

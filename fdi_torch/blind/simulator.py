@@ -11,7 +11,7 @@ in the order of its rig's pipes, so that a rig's result does not depend on the o
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -41,7 +41,7 @@ class Group:
     spot: Index
     other: Index
     numbers: dict[str, Array]
-    state: Any = field(default=None)
+    state: Any = None
 
 
 def grouped(
@@ -90,10 +90,8 @@ class HiddenRigs:
 
         self.area = np.array([t.area for plant in built for t in plant.tanks])
         self.caught = spots(lambda plant: [t.overflow_to for t in plant.tanks])
-        self.source, self.target = (
-            spots(lambda p: [x.source for x in p.pipes]),
-            spots(lambda p: [x.target for x in p.pipes]),
-        )
+        self.source = spots(lambda plant: [p.source for p in plant.pipes])
+        self.target = spots(lambda plant: [p.target for p in plant.pipes])
         self.fed = spots(lambda plant: [p.target for p in plant.pumps])
         self.conductance = np.concatenate([conductance(plant) for plant in built])
         self.elevation = np.array([p.elevation for plant in built for p in plant.pipes])
@@ -108,16 +106,12 @@ class HiddenRigs:
             for group in grouped(STORAGE_LAWS, tanks, deviations)
             for i, at in enumerate(group.spot.tolist())
         ]
-        self._stack_tables()
-        self.rim = self.volumes(np.array([t.height for t in every_tank]))
-
-    def _stack_tables(self) -> None:
-        """All tables in one array (n, grid), so that one look-up serves all tanks."""
+        # All tables in one array (n, grid), so that one look-up serves all tanks.
         self.table_spot = np.array([t.spot for t in self.tables], dtype=np.intp)
-        if self.tables:
-            self.table_levels = np.concatenate([t.levels for t in self.tables])
-            self.table_last = np.array([t.volumes_per_cell for t in self.tables])
-            self.table_base = np.arange(len(self.tables)) * _GRID
+        self.table_levels = np.concatenate([np.zeros(0), *(t.levels for t in self.tables)])
+        self.table_last = np.array([t.volumes_per_cell for t in self.tables])
+        self.table_base = np.arange(len(self.tables)) * _GRID
+        self.rim = self.volumes(np.array([t.height for t in every_tank]))
 
     def volumes(self, levels: Array) -> Array:
         """Volumes (N,) m^3 from levels (N,) m."""
@@ -159,8 +153,7 @@ class HiddenRigs:
         q = self.piped(wet, now)
         net = self._into(self.target, q) - self._into(self.source, q)
         for group in self.tank_groups:
-            args = (level[group.spot], wet[group.other], now, group.numbers, group.state)
-            q, group.state = group.law(*args)
+            q, group.state = group.law(level[group.spot], wet[group.other], now, group.numbers, group.state)
             net += self._into(group.other, q) - self._into(group.spot, q)
         return net
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from fdi_torch.blind.plants import Scales
 from fdi_torch.blind.simulator import conductance
-from fdi_torch.blind.statistics import clopper_pearson, root_mean_square_interval
+from fdi_torch.blind.statistics import root_mean_square_interval, share_of
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import unit_factor
 
@@ -110,6 +110,5 @@ def sizes(rows: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
 
 def _scores(z: list[float]) -> dict[str, Any]:
     rms, *ends = root_mean_square_interval(z)
-    within = sum(abs(v) <= NORMAL_95 for v in z)
-    share = {"of": len(z), "hits": within, "share": within / len(z), "ci95": clopper_pearson(within, len(z))}
-    return {"rms": {"of": len(z), "mean": rms, "ci95": ends}, "within": share}
+    within = share_of(sum(abs(v) <= NORMAL_95 for v in z), len(z))
+    return {"rms": {"of": len(z), "mean": rms, "ci95": ends}, "within": within}

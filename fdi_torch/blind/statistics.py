@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Sequence
+from typing import Any
 
 from scipy import special
 
@@ -16,27 +18,27 @@ def clopper_pearson(k: int, n: int) -> tuple[float, float]:
     return float(low), float(special.betaincinv(k + 1, n - k, 0.975)) if k < n else 1.0
 
 
+def share_of(hits: int, count: int) -> dict[str, Any]:
+    """A share with its exact 95 % interval, as in the tables of scores."""
+    return {"of": count, "hits": hits, "share": hits / count, "ci95": clopper_pearson(hits, count)}
+
+
 def median_interval(values: Sequence[float]) -> tuple[float, float, float]:
     """Median and the order statistics of its distribution-free 95 % interval; NaN for few values."""
     ranked, n = sorted(values), len(values)
     if not ranked:
         return math.nan, math.nan, math.nan
-    median = 0.5 * (ranked[(n - 1) // 2] + ranked[n // 2])
     outside = [k for k in range(1, n // 2 + 1) if special.bdtr(k - 1, n, 0.5) <= 0.025]
-    if not outside:
-        return median, math.nan, math.nan
-    return median, ranked[outside[-1] - 1], ranked[n - outside[-1]]
+    low, high = (ranked[outside[-1] - 1], ranked[n - outside[-1]]) if outside else (math.nan, math.nan)
+    return statistics.median(ranked), low, high
 
 
 def mean_interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Mean and its normal 95 % interval; NaN without values, zero width for one value."""
+    """Mean and its normal 95 % interval; NaN without values, and its ends for one value."""
     if not values:
         return math.nan, math.nan, math.nan
-    mean = math.fsum(values) / len(values)
-    if len(values) == 1:
-        return mean, math.nan, math.nan
-    std = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (len(values) - 1))
-    half = 1.96 * std / math.sqrt(len(values))
+    mean = statistics.fmean(values)
+    half = 1.96 * statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.nan
     return mean, mean - half, mean + half
 
 

@@ -25,7 +25,7 @@ from fdi_torch.names import listed
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_unit, significant
-from fdi_torch.report.reference_models import flows_that_matter, has_causes, reference_models
+from fdi_torch.report.diagnosed_effects import flows_that_matter, has_causes, reference_models
 
 MOST_ROWS = 5
 SMALLEST_SHOWN = 1e-3  # probability

@@ -102,7 +102,8 @@ def compare(paths: Sequence[str | Path]) -> Comparison:
     if len(paths) < 2:
         raise ValueError(f"expected at least two logs to compare, got {len(paths)}; name more")
     runs = [read_run(path) for path in paths]
-    first, *others = map(_hashes, runs)
+    # Hashes of the recordings' files; "" for a recording that was in memory.
+    first, *others = ({k: text for k, text in run.about("data").items() if k.endswith("sha256")} for run in runs)
     return Comparison(
         labels_of([run.path for run in runs]),
         {section: entries for section in SECTIONS if (entries := _differing(runs, section))},
@@ -160,23 +161,12 @@ def _differing(runs: Sequence[Run], section: str) -> dict[str, tuple[str, ...]]:
     return {key: texts for key, texts in table.items() if len(set(texts)) > 1}
 
 
-def _hashes(run: Run) -> dict[str, str]:
-    """Hashes of the recordings' files; "" for a recording that was in memory."""
-    return {key: text for key, text in run.about("data").items() if key.endswith("sha256")}
-
-
 def _results(runs: Sequence[Run]) -> tuple[Result, ...]:
-    estimates = [_estimates(run) for run in runs]
-    names = dict.fromkeys(name for e in estimates for name in e)
-    return tuple(_result(name, [e.get(name, _NOTHING) for e in estimates]) for name in names)
-
-
-def _result(name: str, estimates: Sequence[tuple[float, float, str]]) -> Result:
-    values, std, units = zip(*estimates, strict=True)
-    return Result(name, next(filter(None, units), ""), values, std, chi2_p_value(values, std))
-
-
-_NOTHING = (float("nan"), float("nan"), "")
+    estimates, results = [_estimates(run) for run in runs], []
+    for name in dict.fromkeys(name for each in estimates for name in each):
+        values, std, units = zip(*(each.get(name, (math.nan, math.nan, "")) for each in estimates), strict=True)
+        results.append(Result(name, next(filter(None, units), ""), values, std, chi2_p_value(values, std)))
+    return tuple(results)
 
 
 def _estimates(run: Run) -> dict[str, tuple[float, float, str]]:

@@ -11,7 +11,7 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -49,13 +49,11 @@ def export_attachment(run: Run, name: str, folder: str | Path) -> Path:
     target = Path(folder) / safe_name(name)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        if target.exists():
-            raise LogError(f"{target}: exists already; choose another folder, or delete it")
         with target.open("xb") as file:
             file.write(content)
-    except LogError:
-        raise
     except OSError as error:
+        if isinstance(error, FileExistsError) and target.exists():
+            raise LogError(f"{target}: exists already; choose another folder, or delete it") from None
         raise log_error(target, error) from None
     return target
 
@@ -67,50 +65,40 @@ def safe_name(name: str) -> str:
 
 
 def _csv(_run: Run, messages: Sequence[Message], stream: BinaryIO) -> None:
-    columns, units = _columns(messages)
+    payloads, columns, units = _columns(messages)
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
     table = csv.writer(text)
     table.writerow([_header(name, units.get(name, "")) for name in columns])
-    for message in messages:
-        payload = message.payload
-        table.writerow([_cell(payload.get(name)) for name in columns])
+    table.writerows([_cell(payload.get(name)) for name in columns] for payload in payloads)
     text.detach()
 
 
 def _ndjson(run: Run, messages: Sequence[Message], stream: BinaryIO) -> None:
+    """The raw JSON, with its lists of non-finite numbers."""
     for message in messages:
-        stream.write(orjson.dumps(_loaded(run, message), option=orjson.OPT_APPEND_NEWLINE))
+        if message.channel.encoding != "json":
+            raise LogError(f"{run.path}: {message.topic} is in {message.channel.encoding}, only json can be exported")
+        try:
+            stream.write(orjson.dumps(orjson.loads(message.data), option=orjson.OPT_APPEND_NEWLINE))
+        except ValueError as error:
+            raise LogError(f"{run.path}: a message on {message.topic} is not JSON ({error})") from None
 
 
 def _npz(_run: Run, messages: Sequence[Message], stream: BinaryIO) -> None:
-    columns, _ = _columns(messages)
-    payloads = [message.payload for message in messages]
+    payloads, columns, _ = _columns(messages)
     arrays = {name: _array([payload.get(name) for payload in payloads]) for name in columns}
-    usable = {name: array for name, array in arrays.items() if array is not None}
-    np.savez_compressed(stream, **usable)  # type: ignore[arg-type]
+    np.savez_compressed(stream, **{name: array for name, array in arrays.items() if array is not None})  # type: ignore[arg-type]
 
 
 FORMATS: dict[str, Callable[[Run, Sequence[Message], BinaryIO], None]] = {"csv": _csv, "ndjson": _ndjson, "npz": _npz}
 
 
-def _columns(messages: Sequence[Message]) -> tuple[list[str], dict[str, str]]:
-    """Fields of the messages, `t` first, and their units."""
-    names: dict[str, None] = {}
-    units: dict[str, str] = {}
-    for message in messages:
-        names.update(dict.fromkeys(message.payload))
-        units |= message.channel.units
-    return sorted(names, key=lambda name: name != "t"), units
-
-
-def _loaded(run: Run, message: Message) -> Any:
-    """The raw JSON, with its list of non-finite numbers."""
-    if message.channel.encoding != "json":
-        raise LogError(f"{run.path}: {message.topic} is in {message.channel.encoding}, only json can be exported")
-    try:
-        return orjson.loads(message.data)
-    except ValueError as error:
-        raise LogError(f"{run.path}: a message on {message.topic} is not JSON ({error})") from None
+def _columns(messages: Sequence[Message]) -> tuple[list[dict[str, Any]], list[str], dict[str, str]]:
+    """Payloads of the messages, their fields with `t` first, and the units of these."""
+    payloads = [message.payload for message in messages]
+    names = dict.fromkeys(name for payload in payloads for name in payload)
+    units = {name: unit for message in messages for name, unit in message.channel.units.items()}
+    return payloads, sorted(names, key=lambda name: name != "t"), units
 
 
 def _header(name: str, unit: str) -> str:
@@ -185,7 +173,7 @@ class Inspection:
     topics: dict[str, TopicInfo]
     attachments: dict[str, Attachment]
     health: Health
-    advice: str = field(default="")
+    advice: str = ""
 
     @property
     def messages(self) -> int:
@@ -195,35 +183,24 @@ class Inspection:
 def inspect_log(path: str | Path) -> Inspection:
     """Read and check a whole log of this or another program. Raises LogError if it is not an MCAP file."""
     run = read_run(path, salvage=True)
-    topics = _topics(run)
-    about = {name.removeprefix(PREFIX): values for name, values in run.metadata.items() if name.startswith(PREFIX)}
-    others = {name: values for name, values in run.metadata.items() if not name.startswith(PREFIX)}
-    health = check_health(run, topics)
-    advice = run.advice
-    if not health.sound and not advice:
-        advice = f"{run.path}: the file is damaged; `fdi recover {run.path}` saves what can be read"
-    return Inspection(
-        run.path, len(run.data), run.ours, run.library, about, others, topics, run.attachments, health, advice
-    )
-
-
-def check_health(run: Run, topics: dict[str, TopicInfo]) -> Health:
-    """Check CRCs, indices and completeness; `topics` counts what is actually in `run`, which was opened for salvage."""
-    problems = [*_ending(run), *(f"bytes {gap.start} to {gap.end}: {gap.reason}" for gap in run.damages)]
-    if run.ended:
-        problems += [*_data_crc(run), *_summary(run, sum(info.messages for info in topics.values()))]
-    chunks = sum(isinstance(part, Frame) and part.opcode == Opcode.CHUNK for part in run.parts)
-    return Health(run.ended, chunks, tuple(run.damages), tuple(problems))
-
-
-def _topics(run: Run) -> dict[str, TopicInfo]:
     topics: dict[str, TopicInfo] = {}
     for message in run.messages():
         if message.topic not in topics:
             channel = message.channel
             topics[message.topic] = TopicInfo(channel.topic, channel.schema_name, channel.encoding, channel.units)
         topics[message.topic].count(message)
-    return topics
+    about = {name.removeprefix(PREFIX): values for name, values in run.metadata.items() if name.startswith(PREFIX)}
+    others = {name: values for name, values in run.metadata.items() if not name.startswith(PREFIX)}
+    problems = [*_ending(run), *(f"bytes {gap.start} to {gap.end}: {gap.reason}" for gap in run.damages)]
+    if run.ended:
+        problems += _summary(run, sum(info.messages for info in topics.values()))
+    health = Health(run.ended, len(_frames(run, Opcode.CHUNK)), tuple(run.damages), tuple(problems))
+    advice = run.advice
+    if not health.sound and not advice:
+        advice = f"{run.path}: the file is damaged; `fdi recover {run.path}` saves what can be read"
+    return Inspection(
+        run.path, len(run.data), run.ours, run.library, about, others, topics, run.attachments, health, advice
+    )
 
 
 def _ending(run: Run) -> Iterator[str]:
@@ -233,16 +210,12 @@ def _ending(run: Run) -> Iterator[str]:
         yield "the run does not say how it ended"
 
 
-def _data_crc(run: Run) -> Iterator[str]:
-    """Check the CRC of all records before the end of data."""
+def _summary(run: Run, messages: int) -> Iterator[str]:
+    """Check the CRC of all records before the end of data, and the counts and positions in the summary."""
     for part in _frames(run, Opcode.DATA_END):
         (crc,) = struct.unpack("<I", body_of(run.data, part))
         if crc and zlib.crc32(run.data[: part.start]) != crc:
             yield "the CRC over the data differs"
-
-
-def _summary(run: Run, messages: int) -> Iterator[str]:
-    """Check the counts and positions in the summary against the file."""
     for part in _frames(run, Opcode.STATISTICS):
         counted = Statistics.read(stream_of(body_of(run.data, part))).message_count
         if counted != messages:
@@ -254,5 +227,5 @@ def _summary(run: Run, messages: int) -> Iterator[str]:
         yield f"the index names {len(places)} chunks, {len(places & chunks)} of the file's {len(chunks)} among them"
 
 
-def _frames(run: Run, opcode: Opcode) -> Iterator[Frame]:
-    return (part for part in run.parts if isinstance(part, Frame) and part.opcode == opcode)
+def _frames(run: Run, opcode: Opcode) -> list[Frame]:
+    return [part for part in run.parts if isinstance(part, Frame) and part.opcode == opcode]

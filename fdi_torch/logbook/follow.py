@@ -10,7 +10,7 @@ from mcap.opcode import Opcode
 
 from fdi_torch.logbook import scan
 from fdi_torch.logbook.errors import LogError
-from fdi_torch.logbook.reader import Directory, Message, map_file, open_part
+from fdi_torch.logbook.reader import Directory, Message, map_file
 
 
 def follow(
@@ -25,18 +25,13 @@ def follow(
     path: NAME.mcap, which may not exist yet (`NAME.mcap.partial` grows meanwhile), or any growing file. Damaged parts
     are passed to `on_damage` and skipped. Raises LogError if nothing arrives for `idle_seconds`.
     """
-    tail = _Tail(Path(path), on_damage)
-    quiet_since = time.monotonic()
+    tail, quiet_since = _Tail(Path(path), on_damage), time.monotonic()
     while True:
-        finished = tail.finished()
-        count = 0
-        for message in tail.new_messages():
-            count += 1
-            if topics is None or message.topic in topics:
-                yield message
+        finished, place = tail.finished(), tail.place
+        yield from (message for message in tail.new_messages() if topics is None or message.topic in topics)
         if finished:
             return
-        if count:
+        if tail.place != place:
             quiet_since = time.monotonic()
         elif time.monotonic() - quiet_since > idle_seconds:
             raise LogError(f"{path}: nothing came for {idle_seconds:g} s and the log has no end; is its writer alive?")
@@ -61,6 +56,7 @@ class _Tail:
         return scan.ends_whole(map_file(self.final))
 
     def new_messages(self) -> Iterator[Message]:
+        """Messages of the records completed since the last call."""
         source = self.partial if self.partial.exists() else self.final
         try:
             data = map_file(source) if source.stat().st_size else b""
@@ -68,22 +64,14 @@ class _Tail:
             if source.exists():
                 raise
             return  # not there yet, or just finished: the next call finds it under its final name
-        if data:
-            yield from self._grown(data)
-
-    def _grown(self, data: scan.Buffer) -> Iterator[Message]:
-        """Messages of the records completed since the last call."""
         for part in scan.frames(data, self.place):
             if isinstance(part, scan.Damage):
                 if part.end == len(data):
                     return  # still being written
                 self.on_damage(part)
             elif part.opcode in (Opcode.CHUNK, Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
-                yield from self._opened(data, part)
+                try:
+                    yield from self.directory.open(data, part)
+                except scan.ChunkError as error:
+                    self.on_damage(scan.Damage(part.start, part.end, str(error)))
             self.place = part.end
-
-    def _opened(self, data: scan.Buffer, part: scan.Frame) -> Iterator[Message]:
-        try:
-            yield from open_part(data, part, self.directory)
-        except scan.ChunkError as error:
-            self.on_damage(scan.Damage(part.start, part.end, str(error)))

@@ -43,7 +43,6 @@ def foxglove_layout(run: Run) -> dict[str, Any]:
         "Events": [("Table", {"topicPath": topic}) for topic in _TABLES if topic in fields],
         "Results": [("RawMessages", {"topicPath": topic}) for topic in _TEXTS if topic in fields],
     }
-    log: list[Panel] = [("RosOut", {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/log"})]
     panels: dict[str, dict[str, Any]] = {}
     pages = [
         {"title": title if first == 0 else f"{title} {first // MOST_PER_TAB + 1}", "layout": _column(names)}
@@ -56,31 +55,20 @@ def foxglove_layout(run: Run) -> dict[str, Any]:
     panels["Tab!fdi"] = {"activeTabIdx": 0, "tabs": pages}
     layout: Any = "Tab!fdi"
     if "/log" in fields:
-        (name,) = _named(panels, log)
+        (name,) = _named(panels, [("RosOut", {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/log"})])
         layout = {"direction": "column", "first": "Tab!fdi", "second": name, "splitPercentage": 82}
-    return {
-        "configById": panels,
-        "globalVariables": {},
-        "userNodes": {},
-        "playbackConfig": {"speed": 10},
-        "layout": layout,
-    }
+    unused: dict[str, Any] = {"globalVariables": {}, "userNodes": {}}
+    return {"configById": panels, **unused, "playbackConfig": {"speed": 10}, "layout": layout}
 
 
 def numeric_fields(run: Run) -> dict[str, dict[str, str]]:
     """For each topic, its numeric fields with their units."""
     fields: dict[str, dict[str, str]] = {}
-    channels = set()
-    for message in run.messages():
-        channel = message.channel
-        if channel in channels or not _PLAIN_TOPIC.fullmatch(channel.topic):
-            continue
-        channels.add(channel)
-        units = channel.units
-        known = fields.setdefault(channel.topic, {})
-        for name, part in _properties(channel.schema_data).items():
-            if part.get("type") in ("number", "integer"):
-                known[name] = units.get(name, "")
+    for channel in dict.fromkeys(message.channel for message in run.messages()):
+        if _PLAIN_TOPIC.fullmatch(channel.topic):
+            parts, known = _properties(channel.schema_data), fields.setdefault(channel.topic, {})
+            numeric = [name for name, part in parts.items() if part.get("type") in ("number", "integer")]
+            known.update({name: channel.units.get(name, "") for name in numeric})
     return fields
 
 
@@ -103,9 +91,7 @@ def _path(topic: str, name: str) -> str:
 def _sensor_plots(fields: Fields) -> list[Panel]:
     """One plot per sensor of each recording: measured, and estimated where the log has it."""
     plots = []
-    for topic in fields:
-        if not (topic.startswith("/plant/") and topic.endswith("/output")):
-            continue
+    for topic in _topics(fields, "/plant/", "/output"):
         model = topic.replace("/plant/", "/estimate/", 1)
         for name, unit in _signals(fields[topic]):
             lines = [(_path(topic, name), "measured")]
@@ -117,9 +103,7 @@ def _sensor_plots(fields: Fields) -> list[Panel]:
 def _residual_plots(fields: Fields) -> list[Panel]:
     """One plot per sensor, its residual with its band, and one per test statistic of the monitor with its threshold."""
     plots = []
-    for topic in fields:
-        if not (topic.startswith(("/estimate/", "/observer/")) and topic.endswith("/residual")):
-            continue
+    for topic in _topics(fields, ("/estimate/", "/observer/"), "/residual"):
         present = fields[topic]
         for name, unit in _signals(present):
             lines = [(_path(topic, name), "residual"), *_companions(present, topic, name, _BAND)]
@@ -127,6 +111,10 @@ def _residual_plots(fields: Fields) -> list[Panel]:
         for name in _tests(present):
             plots.append(_plot(_title(f"{name}: test statistic", topic, ""), _companions(present, topic, name, _TEST)))
     return plots
+
+
+def _topics(fields: Fields, start: str | tuple[str, ...], end: str) -> list[str]:
+    return [topic for topic in fields if topic.startswith(start) and topic.endswith(end)]
 
 
 def _tests(present: Mapping[str, str]) -> list[str]:
@@ -142,12 +130,10 @@ def _companions(present: Mapping[str, str], topic: str, name: str, ends: Sequenc
 def _input_plots(fields: Fields) -> list[Panel]:
     """One plot per recording and unit of its inputs."""
     plots = []
-    for topic in fields:
-        if topic.startswith("/plant/") and topic.endswith("/input"):
-            units = dict.fromkeys(unit for _, unit in _signals(fields[topic]))
-            for unit in units:
-                lines = [(_path(topic, name), name) for name, its in _signals(fields[topic]) if its == unit]
-                plots.append(_plot(_title("Inputs", topic, unit), lines))
+    for topic in _topics(fields, "/plant/", "/input"):
+        for unit in dict.fromkeys(unit for _, unit in _signals(fields[topic])):
+            lines = [(_path(topic, name), name) for name, its in _signals(fields[topic]) if its == unit]
+            plots.append(_plot(_title("Inputs", topic, unit), lines))
     return plots
 
 

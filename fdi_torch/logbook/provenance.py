@@ -35,21 +35,14 @@ def version_of(package: str) -> str:
 
 def git_state(folder: Path | None = None) -> dict[str, str]:
     """The commit of the code and whether it was changed since; empty texts outside a repository."""
-    folder = folder or Path(__file__).parent
     # One process with the least work for git.
     options = ("--porcelain=v2", "--branch", "--untracked-files=no", "--no-ahead-behind", "--no-renames")
-    lines = _git(folder, "status", *options).splitlines()
+    command = ("git", "--no-optional-locks", "-C", str(folder or Path(__file__).parent), "status", *options)
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return {"commit": "", "changed": ""}
+    lines = done.stdout.splitlines()
     commit = next((line.split()[-1] for line in lines if line.startswith("# branch.oid ")), "")
     changed = any(not line.startswith("#") for line in lines)
-    return {"commit": commit, "changed": "yes" if changed else "no" if commit else ""}
-
-
-def _git(folder: Path, *arguments: str) -> str:
-    try:
-        command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
-        done = subprocess.run(
-            command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, timeout=5, check=False
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return done.stdout.strip() if done.returncode == 0 else ""
+    return {"commit": commit, "changed": "yes" if changed else "no"}

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment as AttachmentRecord
 from mcap.records import Channel as ChannelRecord
@@ -29,6 +30,8 @@ from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_UNPACKED
 
 # Outside chunks these records have no CRC. Logs of this program have none there; one found there is a damaged record.
 _LOOSE = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
+_DESCRIBING: dict[int, type[Schema | ChannelRecord]] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: ChannelRecord}
+_MESSAGE = struct.Struct("<HIQQ")
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +162,7 @@ class Run:
         """Messages of a chunk. The total expansion of compressed chunks is limited relative to the file's size."""
         try:
             cap = min(scan.MAX_CHUNK_BYTES, self._allowed)
-            messages = open_part(self.data, part, directory, cap, require_crc=self.ours)
+            messages = directory.open(self.data, part, cap, require_crc=self.ours)
             self._allowed -= scan.unpacked_size(self.data, part)
             return messages
         except scan.ChunkError as error:
@@ -171,11 +174,14 @@ class Run:
 
     def _summary_records(self) -> Iterator[Schema | ChannelRecord]:
         """Schemas and channels of the summary, if its CRC is valid; they replace those of a lost first chunk."""
-        start = _summary_start(self.data)
-        for part in self.parts if start else ():
-            if isinstance(part, scan.Frame) and part.start >= start and part.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                kind = Schema if part.opcode == Opcode.SCHEMA else ChannelRecord
-                yield kind.read(scan.stream_of(scan.body_of(self.data, part)))
+        if not self.ended:
+            return
+        start, _, crc = struct.unpack_from("<QQI", self.data, len(self.data) - 28)
+        if not 0 < start < len(self.data) - 37 or zlib.crc32(self.data[start : len(self.data) - 12]) != crc:
+            return
+        for part in self.parts:
+            if isinstance(part, scan.Frame) and part.start >= start and part.opcode in _DESCRIBING:
+                yield _DESCRIBING[part.opcode].read(scan.stream_of(scan.body_of(self.data, part)))
 
     def _read_head(self) -> None:
         """Read header, metadata and the list of attachments."""
@@ -224,32 +230,35 @@ class Directory:
         if self._channels.get(record.id) != learnt:  # keeping one object per channel speeds up lookups
             self._channels[record.id] = learnt
 
-    def message(self, raw: scan.RawMessage) -> Message:
-        channel = self._channels.get(raw.channel_id)
-        if channel is None:
-            raise scan.ChunkError(f"message on channel {raw.channel_id}, which nothing describes")
-        return Message(channel, raw.sequence, raw.log_time, raw.publish_time, raw.data)
-
-
-def open_part(
-    data: scan.Buffer,
-    part: scan.Frame,
-    directory: Directory,
-    max_chunk_bytes: int = scan.MAX_CHUNK_BYTES,
-    require_crc: bool = False,
-) -> list[Message]:
-    """All messages of a chunk, read completely or not at all, or of a record outside chunks. Raises ChunkError."""
-    if part.opcode == Opcode.CHUNK:
-        body = scan.chunk_body(data, part, max_chunk_bytes, require_crc)
-    else:
-        body = bytes(data[part.start : part.end])
-    messages = []
-    for record in scan.chunk_records(body):
-        if isinstance(record, scan.RawMessage):
-            messages.append(directory.message(record))
+    def open(
+        self,
+        data: scan.Buffer,
+        part: scan.Frame,
+        max_chunk_bytes: int = scan.MAX_CHUNK_BYTES,
+        require_crc: bool = False,
+    ) -> list[Message]:
+        """All messages of a chunk, read completely or not at all, or of a record outside chunks. Raises ChunkError."""
+        if part.opcode == Opcode.CHUNK:
+            body = scan.chunk_body(data, part, max_chunk_bytes, require_crc)
         else:
-            directory.learn(record)
-    return messages
+            body = bytes(data[part.start : part.end])
+        messages = []
+        try:
+            for opcode, record in scan.chunk_records(body):
+                if opcode == Opcode.MESSAGE:
+                    messages.append(self._message(record))
+                elif opcode in _DESCRIBING:
+                    self.learn(_DESCRIBING[opcode].read(scan.stream_of(record)))
+        except (struct.error, UnicodeDecodeError, McapError) as error:
+            raise scan.ChunkError(f"chunk with a record that does not parse ({error})") from error
+        return messages
+
+    def _message(self, record: bytes) -> Message:
+        number, sequence, log_time, publish_time = _MESSAGE.unpack_from(record)
+        channel = self._channels.get(number)
+        if channel is None:
+            raise scan.ChunkError(f"message on channel {number}, which nothing describes")
+        return Message(channel, sequence, log_time, publish_time, record[_MESSAGE.size :])
 
 
 def map_file(path: Path) -> Any:
@@ -262,12 +271,3 @@ def map_file(path: Path) -> Any:
     except OSError as error:
         raise log_error(path, error) from None
     return data
-
-
-def _summary_start(data: Any) -> int:
-    """The start of the summary if there is one with a valid CRC, else 0."""
-    if not scan.ends_whole(data):
-        return 0
-    start, _, crc = struct.unpack_from("<QQI", data, len(data) - 28)
-    whole = 0 < start < len(data) - 37 and zlib.crc32(data[start : len(data) - 12]) == crc
-    return int(start) if whole else 0

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Callable, Mapping
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +23,6 @@ from fdi_torch.logbook.scan import Damage, Frame
 from fdi_torch.logbook.sink import Sink
 
 RECORD = "fdi_torch.recovery"
-Extra = Callable[[Run, int], Mapping[str, Mapping[str, str]]]
 
 
 @dataclass(frozen=True)
@@ -46,13 +45,14 @@ class Recovery:
         """The result in words."""
         if self.whole:
             return f"{self.source}: the file is whole, all {self.messages} messages are in {self.target}"
-        size = sum(damage.end - damage.start for damage in self.lost)
-        gaps = "" if not self.lost else f"1 damaged stretch of {size} bytes is lost"
-        if len(self.lost) > 1:
-            gaps = f"{len(self.lost)} damaged stretches, {size} bytes in all, are lost"
-        end = "" if self.ended else "the run did not finish: at most its last second is missing"
-        losses = "; ".join(part for part in (gaps, end) if part)
-        return f"{self.source}: {self.messages} messages saved in {self.target}; {losses}"
+        size, losses = sum(damage.end - damage.start for damage in self.lost), []
+        if len(self.lost) == 1:
+            losses.append(f"1 damaged stretch of {size} bytes is lost")
+        elif self.lost:
+            losses.append(f"{len(self.lost)} damaged stretches, {size} bytes in all, are lost")
+        if not self.ended:
+            losses.append("the run did not finish: at most its last second is missing")
+        return f"{self.source}: {self.messages} messages saved in {self.target}; {'; '.join(losses)}"
 
 
 def recover(source: str | Path, target: str | Path | None = None) -> Recovery:
@@ -61,50 +61,27 @@ def recover(source: str | Path, target: str | Path | None = None) -> Recovery:
     Raises LogError if the source cannot be opened or is not MCAP, or if the target cannot be written.
     """
     source = Path(source)
-    target = _beside(source) if target is None else Path(target)
-    recoveries: list[Recovery] = []
-
-    def report(run: Run, messages: int) -> dict[str, dict[str, str]]:
-        lost = tuple(sorted(run.damages, key=lambda damage: damage.start))
-        recoveries.append(Recovery(source, target, messages, lost, run.ended))
-        return {RECORD: _record(recoveries[-1])}
-
-    try:
-        copy_log(source, target, salvage=True, extra=report)
-    except LogError:
-        if recoveries:
-            target.unlink(missing_ok=True)
-        raise
-    return recoveries[0]
-
-
-def _beside(source: Path) -> Path:
     name = source.name.removesuffix(".partial").removesuffix(".mcap")
-    return source.with_name(f"{name}.recovered.mcap")
+    target = source.with_name(f"{name}.recovered.mcap") if target is None else Path(target)
+    run = read_run(source, salvage=True)
+    sink = Sink(target, run.library, run.profile)
+    try:
+        messages = _copy_records(run, sink)
+        lost = tuple(sorted(run.damages, key=lambda damage: damage.start))
+        done = Recovery(source, target, messages, lost, run.ended)
+        sink.metadata(RECORD, _record(done))
+    except BaseException:
+        sink.abandon()
+        target.unlink(missing_ok=True)
+        raise
+    sink.finish()
+    return done
 
 
 def _record(recovery: Recovery) -> dict[str, str]:
     gaps = {f"lost.{i}": f"{gap.start} to {gap.end}: {gap.reason}" for i, gap in enumerate(recovery.lost)}
     about = {"source": recovery.source.name, "messages": str(recovery.messages), "ended": str(recovery.ended).lower()}
     return {**about, "lost": str(len(recovery.lost)), **gaps}
-
-
-def copy_log(source: Path, target: Path, salvage: bool = False, extra: Extra | None = None) -> Run:
-    """Write every readable record of `source` to the new file `target`, then the metadata of `extra`.
-
-    extra: called with the run and the number of copied messages.
-    """
-    run = read_run(source, salvage=salvage)
-    sink = Sink(target, run.library, run.profile)
-    try:
-        messages = _copy_records(run, sink)
-        for name, values in (extra(run, messages) if extra else {}).items():
-            sink.metadata(name, values)
-    except BaseException:
-        sink.abandon()
-        raise
-    sink.finish()
-    return run
 
 
 def _copy_records(run: Run, sink: Sink) -> int:
@@ -149,7 +126,5 @@ def unfinished(path: str | Path) -> Run | None:
 
 def last_state(run: Run) -> tuple[int, dict[str, np.ndarray]] | None:
     """The last logged state of the search: generation and arrays; None if none was logged."""
-    latest = None
-    for message in run.messages(["/estimator/de/population"]):
-        latest = message.payload
-    return (int(latest["generation"]), unpack(latest)) if latest else None
+    latest = deque(run.messages(["/estimator/de/population"]), maxlen=1)
+    return (int(latest[0].payload["generation"]), unpack(latest[0].payload)) if latest else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -57,54 +58,47 @@ def replay(
     path: str | Path,
     rerun: Rerun,
     *,
-    relative: float = RELATIVE,
     select: Select | None = None,
     env: Mapping[str, str] | None = None,
 ) -> Replay:
     """Repeat a run and compare it with its log.
 
     rerun: receives the opened log and returns the new log's path, or its messages. Numbers are within tolerance if |a -
-    b| <= ABSOLUTE + relative max(|a|, |b|). select: chooses and orders the messages to compare on each side; by default
+    b| <= ABSOLUTE + RELATIVE max(|a|, |b|). select: chooses and orders the messages to compare on each side; by default
     all as logged. Sentences on `/log` are not compared. Raises LogError for an unreadable log.
     """
     run = read_run(path)
     repeated = rerun(run)
     replayed = read_run(repeated).messages() if isinstance(repeated, str | Path) else repeated
-    return compare_events(
-        *((select(side) if select else side) for side in (run.messages(), replayed)),
-        relative=relative,
-        versions=version_changes(run, environment() if env is None else env),
-    )
+    logged, again = (select(side) if select else side for side in (run.messages(), replayed))
+    return compare_events(logged, again, version_changes(run, environment() if env is None else env))
 
 
 def compare_events(
     logged: Iterable[Message],
     replayed: Iterable[Message],
-    *,
-    relative: float,
-    versions: dict[str, tuple[str, str]] | None = None,
+    versions: dict[str, tuple[str, str]],
 ) -> Replay:
     """Compare two ordered streams of events, up to the first difference beyond the tolerance."""
     events, largest, first_inexact = 0, 0.0, None
     streams = ((m for m in stream if m.topic != "/log") for stream in (logged, replayed))
     for events, (then, now) in enumerate(zip_longest(*streams), 1):
         for deviation in _deviations(then, now):
-            difference = Difference(
-                events, *_event(then, now), deviation.field, repr(deviation.then), repr(deviation.now)
-            )
+            event = _event(then or now)  # one of both is there
+            difference = Difference(events, *event, deviation.field, repr(deviation.then), repr(deviation.now))
             first_inexact = first_inexact or difference
             largest = max(largest, deviation.relative)
-            if not deviation.within(relative):
-                return Replay("differs", events, difference, first_inexact, largest, versions or {})
+            if not deviation.within:
+                return Replay("differs", events, difference, first_inexact, largest, versions)
     outcome: Outcome = "bit-equal" if first_inexact is None else "within tolerance"
-    return Replay(outcome, events, None, first_inexact, largest, versions or {})
+    return Replay(outcome, events, None, first_inexact, largest, versions)
 
 
 def version_changes(run: Run, now: Mapping[str, str]) -> dict[str, tuple[str, str]]:
     """Differences of the environment since the log was written."""
     then = run.about("env")
-    names = dict.fromkeys([*then, *now])
-    return {name: (then.get(name, ""), now.get(name, "")) for name in names if then.get(name, "") != now.get(name, "")}
+    pairs = {name: (then.get(name, ""), now.get(name, "")) for name in dict.fromkeys([*then, *now])}
+    return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
 
 
 @dataclass(frozen=True)
@@ -127,10 +121,11 @@ class _Deviation:
         scale = max(abs(self.then), abs(self.now))
         return abs(self.then - self.now) / scale if scale else 0.0
 
-    def within(self, relative: float) -> bool:
+    @property
+    def within(self) -> bool:
         if not self.numeric:
             return False
-        return bool(abs(self.then - self.now) <= ABSOLUTE + relative * max(abs(self.then), abs(self.now)))
+        return bool(abs(self.then - self.now) <= ABSOLUTE + RELATIVE * max(abs(self.then), abs(self.now)))
 
 
 def _deviations(then: Message | None, now: Message | None) -> Iterator[_Deviation]:
@@ -163,12 +158,9 @@ def _unequal(name: str, then: Any, now: Any) -> Iterator[_Deviation]:
 
 def _parsed(text: str) -> Any:
     """The value of a JSON text that is a mapping or a list; other texts unchanged."""
-    if not text.startswith(("{", "[")):
-        return text
-    try:
-        return orjson.loads(text)
-    except ValueError:
-        return text
+    with suppress(ValueError):
+        return orjson.loads(text) if text.startswith(("{", "[")) else text
+    return text
 
 
 def _same(then: Any, now: Any) -> bool:
@@ -184,12 +176,8 @@ def _fields(message: Message) -> dict[str, Any]:
     return payload | arrays
 
 
-def _event(then: Message | None, now: Message | None) -> tuple[str, str]:
+def _event(message: Message) -> tuple[str, str]:
     """The topic of an event and its position."""
-    message = then or now
-    if message is None:
-        return "", ""
-    payload = message.payload
-    axis = AXES.get(message.topic, "t")
+    payload, axis = message.payload, AXES.get(message.topic, "t")
     problem = f", problem {payload['problem']}" if payload.get("problem") else ""
     return message.topic, f"{axis} {payload.get(axis, message.t)}{problem}"

@@ -13,20 +13,17 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Schema
 
 MAGIC = b"\x89MCAP0\r\n"
 MAX_CHUNK_BYTES = 64 * 2**20
 _HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQI")
-_MESSAGE = struct.Struct("<HIQQ")
 # Records at which reading may resume after damage, because inner lengths validate them: chunk, chunk index, attachment,
 # statistics, metadata, data end. The three high bytes of any plausible length are zero.
 _ANCHORS = re.compile(rb"[\x06\x08\x09\x0b\x0c\x0f](?=.{5}\x00\x00\x00)", re.DOTALL)
@@ -69,14 +66,6 @@ class Damage:
     start: int
     end: int
     reason: str
-
-
-class RawMessage(NamedTuple):
-    channel_id: int
-    sequence: int
-    log_time: int
-    publish_time: int
-    data: bytes
 
 
 class ChunkError(ValueError):
@@ -124,25 +113,16 @@ def chunk_body(data: Buffer, frame: Frame, cap: int = MAX_CHUNK_BYTES, require_c
     return body
 
 
-def chunk_records(body: bytes) -> Iterator[Schema | Channel | RawMessage]:
-    """Schemas, channels and messages inside a chunk. Raises ChunkError if they cannot be parsed."""
+def chunk_records(body: bytes) -> Iterator[tuple[int, bytes]]:
+    """Opcode and body of each record inside a chunk. Raises ChunkError for a record that leaves its chunk."""
     place = 0
-    try:
-        while place < len(body):
-            opcode, length = _HEAD.unpack_from(body, place)
-            place += 9
-            if place + length > len(body):
-                raise ChunkError("record that leaves its chunk")
-            if opcode == Opcode.MESSAGE:
-                head = _MESSAGE.unpack_from(body, place)
-                yield RawMessage(head[0], head[1], head[2], head[3], body[place + 22 : place + length])
-            elif opcode == Opcode.SCHEMA:
-                yield Schema.read(stream_of(body[place : place + length]))
-            elif opcode == Opcode.CHANNEL:
-                yield Channel.read(stream_of(body[place : place + length]))
-            place += length
-    except (struct.error, UnicodeDecodeError, McapError) as error:
-        raise ChunkError(f"chunk with a record that does not parse ({error})") from error
+    while place < len(body):
+        opcode, length = _HEAD.unpack_from(body, place) if len(body) >= place + 9 else (0, len(body))
+        end = place + 9 + length
+        if end > len(body):
+            raise ChunkError("record that leaves its chunk")
+        yield opcode, body[place + 9 : end]
+        place = end
 
 
 def stream_of(data: bytes) -> ReadDataStream:

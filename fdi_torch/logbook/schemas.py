@@ -10,7 +10,8 @@ the same topic, so that a schema describes every message.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -50,11 +51,9 @@ def conforming(topic: str, schema: str, fields: Mapping[str, Any]) -> Fields:
     Fields of the topic must have their kind, and `t` must be a number; others must be numbers, texts or lists of these.
     Messages with other schemas are unchanged.
     """
-    kinds = _kinds(topic, schema)
-    if not kinds:
-        return Fields(topic, fields)
-    kept = {k: v for k, v in fields.items() if (_is_of(kinds[k], v) if k in kinds else _is_plain(v))}
-    return Fields(topic, kept)
+    if kinds := _kinds(topic, schema):
+        fields = {k: v for k, v in fields.items() if (_is_of(kinds[k], v) if k in kinds else _is_plain(v))}
+    return Fields(topic, fields)
 
 
 @lru_cache(maxsize=256)
@@ -94,14 +93,8 @@ def json_schema(definition: Topic, named: Mapping[str, Kind]) -> bytes:
     properties.update({name: dict(_JSON[kind]) for name, kind in named.items()})
     properties["non_finite"] = {**_JSON["texts"], "description": "numbers JSON cannot hold, as name=nan"}
     properties["wall"] = {**_TIME, "description": "wall-clock time, if requested"}
-    schema = {
-        "title": definition.schema,
-        "description": definition.meaning,
-        "type": "object",
-        "properties": properties,
-        "required": ["t"],
-    }
-    return orjson.dumps(schema)
+    about = {"title": definition.schema, "description": definition.meaning, "type": "object"}
+    return orjson.dumps({**about, "properties": properties, "required": ["t"]})
 
 
 def named_kinds(definition: Topic, schema: bytes) -> dict[str, Kind]:
@@ -117,7 +110,7 @@ class Register:
 
     def __init__(self) -> None:
         self._described: dict[str, tuple[frozenset[str], Channel]] = {}
-        self._count: dict[str, int] = {}
+        self._count: Counter[str] = Counter()
 
     def channel(
         self,
@@ -142,37 +135,24 @@ class Register:
         definition = topic_definition(topic)
         named = named_kinds(definition, channel.schema_data) if channel else {}
         named.update({name: _kind(message.get(name)) for name in present if name not in definition.fields})
-        _check_names(topic, definition, named)
+        if named and not definition.named:
+            raise ValueError(f"{topic}: expected only {', '.join(definition.fields)}, got {', '.join(named)}")
+        for name in named.keys() & {NON_FINITE, WALL}:
+            raise ValueError(f"{topic}: expected a name other than {NON_FINITE} and {WALL}, got {name}; rename it")
         units = {f"unit.{name}": unit for name, (_, unit, _) in definition.fields.items() if unit}
         previous = dict(channel.metadata) if channel else {}
-        pairs = {
-            "schema_version": FORMAT_VERSION,
-            "unit.t": "s",
-            **units,
-            **previous,
-            **{f"unit.{name}": unit for name, unit in (named_units or {}).items()},
-            **(about or {}),
-        }
+        further = {f"unit.{name}": unit for name, unit in (named_units or {}).items()} | dict(about or {})
+        pairs = {"schema_version": FORMAT_VERSION, "unit.t": "s"} | units | previous | further
         schema = json_schema(definition, named)
         channel = Channel(topic, "json", definition.schema, "jsonschema", schema, tuple(pairs.items()))
         self._described[topic] = (frozenset({"t", *definition.fields, *named}), channel)
         return channel
 
-    def count(self, topic: str) -> int:
-        """The number of messages so far, which is the next sequence number."""
-        return self._count.get(topic, 0)
-
-    def next_number(self, topic: str) -> int:
-        """Take the next sequence number of the topic."""
-        number = self._count.get(topic, 0)
-        self._count[topic] = number + 1
-        return number
-
-    def next_numbers(self, topics: Sequence[str], count: int) -> tuple[list[Channel], list[int]]:
-        """The channels of `count` further messages of each topic, and their first sequence numbers."""
-        first = [self.count(topic) for topic in topics]
-        self._count.update({topic: number + count for topic, number in zip(topics, first, strict=True)})
-        return [self._described[topic][1] for topic in topics], first
+    def take_numbers(self, topic: str, count: int = 1) -> int:
+        """Take the next sequence numbers of the topic; returns the first."""
+        first = self._count[topic]
+        self._count[topic] += count
+        return first
 
     def follow_on(self, channel: Channel, sequence: int) -> None:
         """Continue description and numbering as if the message (channel, sequence) had just been written."""
@@ -180,14 +160,6 @@ class Register:
             properties = orjson.loads(channel.schema_data)["properties"]
             self._described[channel.topic] = (frozenset(properties), channel)
         self._count[channel.topic] = sequence + 1
-
-
-def _check_names(topic: str, definition: Topic, named: Mapping[str, Kind]) -> None:
-    if named and not definition.named:
-        raise ValueError(f"{topic}: expected only {', '.join(definition.fields)}, got {', '.join(named)}")
-    for name in named:
-        if name in (NON_FINITE, WALL):
-            raise ValueError(f"{topic}: expected a name other than {NON_FINITE} and {WALL}, got {name}; rename it")
 
 
 def _kind(value: Any) -> Kind:

@@ -20,8 +20,7 @@ from fdi_torch.logbook.sink import EPOCH_NS
 from fdi_torch.logbook.topic_definitions import Channel, topic_definition
 from fdi_torch.untrusted_input import MOST_ARRAY_BYTES, MOST_ARRAY_EXPANSION, expect_unpacked
 
-_STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
-_BLOCK = 65536
+_STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")  # a name or an index of a path such as pose.x[2]
 
 Source = tuple[str, str]  # topic, field
 
@@ -50,7 +49,7 @@ def series(run: Run, topic: str, fields: Sequence[str] | None = None) -> dict[st
     fields: names, or paths into nested messages such as "pose.x" and "data[2]"; default: all top-level numbers.
     """
     names = list(fields) if fields is not None else _numeric_fields(run, topic)
-    rows = ((_time(message, payload), *_numbers(payload, names)) for message, payload in _of(run, topic))
+    rows = (_row(message, message.payload, names) for message in run.messages([topic]))
     table = _table(rows, len(names) + 1)
     return {"t": table[:, 0], **{name: table[:, i + 1] for i, name in enumerate(names) if name != "t"}}
 
@@ -87,7 +86,7 @@ def mapped_signals(
     tables = {t: _mapped_table(run, t, sources, time_field, origin) for t in {t for t, _ in sources.values()}}
     clock = tables[clock_topic][0]
     columns = {name: held(tables[topic][0], tables[topic][1][name], clock) for name, (topic, _) in sources.items()}
-    u, y = (_columns([columns[name] for name in part], len(clock)) for part in (inputs, outputs))
+    u, y = (np.array([columns[name] for name in part]).reshape(len(part), len(clock)).T for part in (inputs, outputs))
     return Signals(
         clock, u, y, np.isfinite(y), tuple(inputs), tuple(outputs), ("",) * len(inputs), ("",) * len(outputs)
     )
@@ -131,24 +130,16 @@ def _array_in(content: bytes) -> np.ndarray:
     return np.load(file, allow_pickle=False)
 
 
-def field_path(text: str) -> list[str | int]:
-    """ "pose.x[2]" -> ["pose", "x", 2]."""
-    return [int(index) if index else name for name, index in _STEP.findall(text)]
-
-
-def _of(run: Run, topic: str) -> Iterable[tuple[Message, dict[str, Any]]]:
-    return ((message, message.payload) for message in run.messages([topic]))
-
-
-def _time(message: Message, payload: Mapping[str, Any]) -> float:
+def _row(message: Message, payload: Mapping[str, Any], fields: Iterable[str]) -> list[float]:
+    """Time and fields of a message."""
     t = payload.get("t")
-    return float(t) if isinstance(t, int | float) else message.t
+    return [float(t) if isinstance(t, int | float) else message.t, *_numbers(payload, fields)]
 
 
 def number_at(payload: Any, field: str) -> float:
     """A field by its name, or else by its path; NaN if it is not a number."""
     value = payload
-    for step in [field] if field in payload else field_path(field):
+    for step in [field] if field in payload else (int(i) if i else name for name, i in _STEP.findall(field)):
         try:
             value = value[step]
         except (KeyError, IndexError, TypeError):
@@ -163,20 +154,13 @@ def _numbers(payload: Any, fields: Iterable[str]) -> list[float]:
 def _numeric_fields(run: Run, topic: str) -> list[str]:
     """Names of all top-level numbers in the topic's messages, in order of appearance."""
     names: dict[str, None] = {}
-    for _, payload in _of(run, topic):
-        names.update(dict.fromkeys(k for k, v in payload.items() if isinstance(v, int | float)))
+    for message in run.messages([topic]):
+        names.update(dict.fromkeys(k for k, v in message.payload.items() if isinstance(v, int | float)))
     return [name for name in names if name != "t"]
 
 
 def _table(rows: Iterable[Sequence[float]], width: int) -> np.ndarray:
-    """The rows as an array, converted in blocks to save memory."""
-    blocks, block = [np.zeros((0, width))], []
-    for row in rows:
-        block.append(row)
-        if len(block) == _BLOCK:
-            blocks.append(np.array(block, dtype=np.float64))
-            block = []
-    return np.concatenate([*blocks, np.array(block, dtype=np.float64).reshape(-1, width)])
+    return np.fromiter(map(tuple, rows), dtype=np.dtype((np.float64, (width,))))
 
 
 def _first_channel(run: Run, topic: str) -> Channel | None:
@@ -194,8 +178,7 @@ def _names(channel: Channel) -> tuple[str, ...]:
 
 
 def _units(channel: Channel) -> tuple[str, ...]:
-    units = channel.units
-    return tuple(units.get(name, "") for name in _names(channel))
+    return tuple(channel.units.get(name, "") for name in _names(channel))
 
 
 def _own_table(run: Run, channel: Channel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -205,10 +188,11 @@ def _own_table(run: Run, channel: Channel) -> tuple[np.ndarray, np.ndarray, np.n
     may_mask = "masked" in topic_definition(channel.topic).fields  # elsewhere the field is a stranger's, of any kind
 
     def rows() -> Iterable[Sequence[float]]:
-        for row, (message, payload) in enumerate(_of(run, channel.topic)):
+        for row, message in enumerate(run.messages([channel.topic])):
+            payload = message.payload
             if may_mask:
                 masked.extend((row, names.index(name)) for name in payload.get("masked", ()) if name in names)
-            yield (_time(message, payload), *(number_at(payload, name) for name in names))
+            yield _row(message, payload, names)
 
     table = _table(rows(), len(names) + 1)
     mask = np.isfinite(table[:, 1:])
@@ -224,15 +208,12 @@ def _mapped_table(
     paths = {name: path for name, (where, path) in sources.items() if where == topic}
 
     def rows() -> Iterable[Sequence[float]]:
-        for message, payload in _of(run, topic):
+        for message in run.messages([topic]):
+            payload = message.payload
             t = number_at(payload, time_field) if time_field else (message.log_time - origin) * 1e-9
-            yield (t, *_numbers(payload, paths.values()))
+            yield [t, *_numbers(payload, paths.values())]
 
     table = _table(rows(), len(paths) + 1)
     if not len(table):
         raise LogError(f"{run.path}: expected messages on {topic}, got none; `fdi inspect {run.path}` lists the topics")
     return table[:, 0], {name: table[:, i + 1] for i, name in enumerate(paths)}
-
-
-def _columns(columns: Sequence[np.ndarray], samples: int) -> np.ndarray:
-    return np.stack(columns, axis=1) if columns else np.zeros((samples, 0))

@@ -61,11 +61,6 @@ class Sink:
         """Bytes on disk."""
         return self._file.size
 
-    @property
-    def waiting(self) -> bool:
-        """Whether there is a message that is not on disk yet."""
-        return bool(self._indexes)
-
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
         self.flush()
         data = _bytes(records.Metadata(name=name, metadata=dict(values)))
@@ -174,11 +169,9 @@ class Sink:
     def _register(self, channel: Channel) -> _Described:
         schema = None
         if channel.schema_name:
-            key = (channel.schema_name, channel.schema_encoding, channel.schema_data)
-            schema = self._schemas.get(key)
-            if schema is None:
-                number, (name, encoding, data) = len(self._schemas) + 1, key
-                schema = self._schemas[key] = records.Schema(id=number, name=name, encoding=encoding, data=data)
+            name, encoding, data = key = (channel.schema_name, channel.schema_encoding, channel.schema_data)
+            new = records.Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data)
+            schema = self._schemas.setdefault(key, new)
         record = records.Channel(
             id=len(self._channels) + 1,
             topic=channel.topic,
@@ -186,9 +179,8 @@ class Sink:
             metadata=dict(channel.metadata),
             schema_id=schema.id if schema else 0,
         )
-        described = _Described(record, b"".join(_bytes(each) for each in (schema, record) if each))
-        self._channels[channel] = described
-        return described
+        self._channels[channel] = _Described(record, b"".join(_bytes(each) for each in (schema, record) if each))
+        return self._channels[channel]
 
     def _summary(self) -> list[tuple[Opcode, Sequence[Any]]]:
         statistics = records.Statistics(

@@ -7,7 +7,7 @@ that viewers draw it over its number; other events default to the latest logged 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain, count, repeat
 from typing import Any
 
@@ -62,18 +62,7 @@ class Topics:
                 data = orjson.dumps(message)
             self._latest = max(self._latest, t)
             channel, log_time = self.register.channel(topic, fields, message, units), log_time_of(t)
-            self.put([(channel, log_time, log_time, self.register.next_number(topic), data)])
-
-    def samples(
-        self,
-        topic: str,
-        time: Any,
-        values: Any,
-        names: Sequence[str],
-        units: Sequence[str],
-    ) -> None:
-        """Write a whole signal, values (T, N) over time (T,), one message per sample."""
-        self.recording_blocks([(topic, as_array(values), names, units, None, None)], as_array(time))
+            self.put([(channel, log_time, log_time, self.register.take_numbers(topic), data)])
 
     def recording(
         self,
@@ -95,13 +84,9 @@ class Topics:
         """
         root = f"/plant/{group}" if group else "/plant"
         mask = None if mask is None else as_array(mask).astype(bool)
-        self.recording_blocks(
-            [
-                (f"{root}/input", as_array(inputs), input_names, input_units, None, {"hold": hold}),
-                (f"{root}/output", as_array(outputs), output_names, output_units, mask, None),
-            ],
-            as_array(time),
-        )
+        source = (f"{root}/input", as_array(inputs), input_names, input_units, None, {"hold": hold})
+        readings = (f"{root}/output", as_array(outputs), output_names, output_units, mask, None)
+        self.recording_blocks([source, readings], as_array(time))
 
     def predictions(
         self,
@@ -130,13 +115,8 @@ class Topics:
             residual = np.concatenate([residual, -band, band], axis=1)
             columns += [f"{name}_{side}" for side in ("low", "high") for name in names]
             shown += [*units, *units]
-        self.recording_blocks(
-            [
-                (f"{root}/output", model, names, units, None, None),
-                (f"{root}/residual", residual, columns, shown, None, None),
-            ],
-            as_array(time),
-        )
+        fitted = (f"{root}/output", model, names, units, None, None)
+        self.recording_blocks([fitted, (f"{root}/residual", residual, columns, shown, None, None)], as_array(time))
 
     def recording_blocks(self, signals: Sequence[tuple[Any, ...]], time: np.ndarray) -> None:
         """Write several signals with one clock, sample by sample, in blocks that limit memory."""
@@ -144,19 +124,19 @@ class Topics:
             _check_signal(topic, values, names, len(time))
         if not np.isfinite(time).all():
             raise ValueError(f"{signals[0][0]}: expected finite times, got NaN or infinity; drop those samples")
-        topics = [topic for topic, *_ in signals]
         for first in range(0, len(time), _BLOCK):
             block = slice(first, first + _BLOCK)
             clock = time[block].astype(np.float64)
-            log_times = EPOCH_NS + np.rint(clock * 1e9).astype(np.int64)
-            encoded = []
+            log_times = (EPOCH_NS + np.rint(clock * 1e9).astype(np.int64)).tolist()
+            streams = []
             for topic, values, names, units, mask, about in signals:
                 numbers = dict.fromkeys(names, 0.0)
-                self.register.channel(topic, numbers, numbers, dict(zip(names, units, strict=True)), about)
+                channel = self.register.channel(topic, numbers, numbers, dict(zip(names, units, strict=True)), about)
                 valid = None if mask is None else mask[block]
-                encoded.append(_payloads(names, clock, values[block].astype(np.float64), valid))
-            channels, sequences = self.register.next_numbers(topics, len(clock))
-            self.put(_interleaved(channels, sequences, log_times.tolist(), encoded))
+                payloads = _payloads(names, clock, values[block].astype(np.float64), valid)
+                sequence = count(self.register.take_numbers(topic, len(clock)))
+                streams.append(zip(repeat(channel), log_times, log_times, sequence, payloads, strict=False))
+            self.put(chain.from_iterable(zip(*streams, strict=True)))
         self._latest = max(self._latest, float(time.max())) if len(time) else self._latest
 
     def follow_on(self, channel: Channel, sequence: int, t: float) -> None:
@@ -253,20 +233,6 @@ class Topics:
         sec, nsec = divmod(log_time_of(self._latest), 10**9)
         fields = {"timestamp": {"sec": sec, "nsec": nsec}, "level": _INFO, "message": message, "name": "fdi"}
         self.write("/log", {**fields, "file": "", "line": 0})
-
-
-def _interleaved(
-    channels: Sequence[Channel],
-    sequences: Sequence[int],
-    log_times: Sequence[int],
-    encoded: Sequence[Sequence[bytes]],
-) -> Iterator[Timed]:
-    """One message of each channel per sample."""
-    streams = [
-        zip(repeat(channel), log_times, log_times, count(first), payloads, strict=False)
-        for channel, first, payloads in zip(channels, sequences, encoded, strict=True)
-    ]
-    return chain.from_iterable(zip(*streams, strict=True))
 
 
 def _payloads(names: Sequence[str], clock: np.ndarray, values: np.ndarray, valid: np.ndarray | None) -> list[bytes]:

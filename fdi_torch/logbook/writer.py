@@ -1,7 +1,7 @@
 """RunLog: the log of one run or study; a crash loses at most its last second.
 
-The run is written to `NAME.mcap.partial`, which becomes `NAME.mcap` at its end. Waiting messages go to disk after 0.75
-s at the latest, by a small thread, also while the run computes without logging. Equal configuration, data and seed give
+The run is written to `NAME.mcap.partial`, which becomes `NAME.mcap` at its end. Waiting messages go to disk after 0.7 s
+at the latest, by a small thread, also while the run computes without logging. Equal configuration, data and seed give
 equal messages; how these are divided into chunks depends on the clock.
 """
 
@@ -80,8 +80,6 @@ class RunLog(Topics):
         self._arrays: dict[str, np.ndarray] = {}
         self._sink: Sink | None = None
         self._stop = threading.Event()
-        self._waiting_since: float | None = None
-        self._size = 0
 
     def __enter__(self) -> RunLog:
         _expect_free(self.path)
@@ -112,7 +110,10 @@ class RunLog(Topics):
                 if error is None:
                     raise
             if self.status == "interrupted" and error is not None:
-                self._say_what_is_kept(error)
+                kept = self.path if self.path.exists() else self.partial_path
+                error.add_note(f"what was computed until now is in {kept}")
+                if self._after_interruption:
+                    error.add_note(self._after_interruption)
 
     def _end(self) -> None:
         """Complete the log under its final name."""
@@ -121,12 +122,6 @@ class RunLog(Topics):
             os.replace(self.partial_path, self.path)
         except OSError as error:
             raise log_error(self.path, error) from None
-
-    def _say_what_is_kept(self, error: BaseException) -> None:
-        kept = self.path if self.path.exists() else self.partial_path
-        error.add_note(f"what was computed until now is in {kept}")
-        if self._after_interruption:
-            error.add_note(self._after_interruption)
 
     def set_status(self, status: str, reason: str = "") -> None:
         """Set how the run ended, such as "not_converged"; the default is "completed"."""
@@ -144,20 +139,16 @@ class RunLog(Topics):
         """Attach a file to the log."""
         with self._lock:
             self._open_sink().attachment(name, media_type, data)
-            self._note_progress()
 
     def flush(self) -> None:
         """Write everything logged so far to disk."""
         with self._lock:
             self._open_sink().flush()
-            self._note_progress()
 
     def put(self, messages: Iterable[Timed]) -> None:
         """Write encoded messages; all methods of `Topics` call it."""
         with self._lock:
-            sink = self._open_sink()
-            sink.messages(messages if self._listener is None else self._forwarding(messages, self._listener))
-            self._note_progress()
+            self._open_sink().messages(self._forwarding(messages, self._listener) if self._listener else messages)
 
     def carry_over(self, messages: Iterable[Message]) -> int:
         """Copy messages of an earlier log of the same run, to be continued; returns their number."""
@@ -179,25 +170,12 @@ class RunLog(Topics):
             raise ValueError(f"{self.path}: expected an open log, got one outside its `with` block; write inside it")
         return self._sink
 
-    def _note_progress(self) -> None:
-        """Update the time since when messages have been waiting in memory."""
-        sink = self._open_sink()
-        if not sink.waiting:
-            self._waiting_since = None
-        elif self._waiting_since is None or sink.written != self._size:
-            self._waiting_since = time.monotonic()
-        self._size = sink.written
-
     def _flush_by_clock(self) -> None:
-        """Flush messages that have waited."""
-        while not self._stop.wait(self._flush_seconds / 2):
-            with self._lock:
-                since = self._waiting_since
-                if since is not None and time.monotonic() - since >= self._flush_seconds / 2:
-                    try:
-                        self.flush()
-                    except LogError:
-                        return  # the sink is dead; the next write says so
+        while not self._stop.wait(self._flush_seconds):
+            try:
+                self.flush()
+            except LogError:
+                return  # the sink is dead; the next write says so
 
     def _write_start(self, sink: Sink) -> None:
         sink.metadata("fdi_torch.run", self._run)

@@ -16,9 +16,9 @@ from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.comparison_headline import comparison_headline, left_out_words, setting_differences
 from fdi_torch.report.html import folded, short, table, tag
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import axis, number, plain_unit, raised, shown_unit, with_error
+from fdi_torch.report.numbers import number, plain_unit, raised, with_error
 from fdi_torch.report.predictions import residuals
-from fdi_torch.report.section import Picture, Section, signals
+from fdi_torch.report.section import Picture, Section, channel_signals, signals
 from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT
 
 MOST_LETTERS = 160  # of a setting or result that differs; a longer one, such as a covariance, is cut
@@ -64,7 +64,8 @@ def in_words(compared: Comparison) -> list[str]:
     apart = [result.name for result in compared.results if result.agree is False]
     if any(result.agree is not None for result in compared.results):
         words.append(f"At 95 % these differ: {', '.join(apart)}." if apart else "At 95 % the results agree.")
-    shares = [name for name in apart if _is_capacity_share(ParameterName.parse(name))]
+    relative = {effect.name for effect in EFFECTS if effect.capacity_share}  # to the capacity of a pipe, as a leak
+    shares = [name for name in apart if (p := ParameterName.parse(name)).field == "size" and p.effect in relative]
     pipes = [key for key in compared.differences.get("config", {}) if PIPE_CAPACITY.fullmatch(key)]
     if shares and pipes:
         words.append(
@@ -73,11 +74,6 @@ def in_words(compared: Comparison) -> list[str]:
     if compared.same_data and words:
         words.append("All runs read the same data, so their errors are not independent.")
     return words
-
-
-def _is_capacity_share(name: ParameterName) -> bool:
-    """Whether a parameter is the size of an effect, such as a leak, that is relative to the capacity of a pipe."""
-    return name.field == "size" and any(e.capacity_share for e in EFFECTS if e.name == name.effect)
 
 
 def result_table(compared: Comparison) -> tuple[list[str], list[list[str]]]:
@@ -118,20 +114,10 @@ def _residuals(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:
         if residual is None:
             continue
         recording = run.recordings[0]
-        for i, name in enumerate(recording.output_names):
-            unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
-            lines.setdefault((name, unit), []).append(Line(label, recording.time, scale * residual[:, i], colour))
-    return [
-        signals(
-            f"compare_residual_{k + 1}",
-            Chart(
-                runs[0].channel_words(name),
-                "time, s",
-                axis("residual", unit),
-                sensor_lines,
-                level=0.0,
-                clock="residuals",
-            ),
-        )
-        for k, ((name, unit), sensor_lines) in enumerate(lines.items())
-    ]
+        for i, sensor in enumerate(zip(recording.output_names, recording.output_units, strict=True)):
+            lines.setdefault(sensor, []).append(Line(label, recording.time, residual[:, i], colour))
+    pictures = []
+    for k, ((name, unit), of_sensor) in enumerate(lines.items()):
+        words = f"compare_residual_{k + 1}", runs[0].channel_words(name), "residual"
+        pictures.append(channel_signals(*words, unit, of_sensor, name, level=0.0, clock="residuals"))
+    return pictures

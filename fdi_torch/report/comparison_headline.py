@@ -18,7 +18,7 @@ from fdi_torch.quantities import quantity_text
 from fdi_torch.report.html import short
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import percent
-from fdi_torch.report.predictions import SensorResidual, sensor_residuals
+from fdi_torch.report.predictions import sensor_residuals
 from fdi_torch.report.verdict import headline, kind_words
 from fdi_torch.units import UnitError, in_unit, number_and_unit
 
@@ -51,7 +51,7 @@ def _better(compared: Comparison, runs: Sequence[Material]) -> str:
     """
     residuals = [sensor_residuals(run) for run in runs]
     common = [name for name in residuals[0] if all(name in each and each[name].rms > 0.0 for each in residuals)]
-    same, of_one_kind = _same_readings(runs), len({run.kind == MONITOR for run in runs}) == 1
+    same, of_one_kind = _same(runs, "time", "outputs"), len({run.kind == MONITOR for run in runs}) == 1
     if not (same and of_one_kind and common):
         verdicts = "; ".join(f"{label}: {headline(run)}" for label, run in zip(compared.labels, runs, strict=True))
         reason = "" if of_one_kind else " A monitor's observer follows the readings, so residuals do not rank them."
@@ -65,23 +65,20 @@ def _better(compared: Comparison, runs: Sequence[Material]) -> str:
     if smaller <= chance:
         by = percent(smaller) if smaller >= 1e-3 else "less than 0.1 %"
         return f"{best} and {next_best} explain the recording equally well: residuals differ by {by}."
-    errors = _first(
-        [_both(runs[0].channel_words(name), name, residuals[first][name], residuals[second][name]) for name in common]
-    )
+    errors = []
+    for name in common:
+        pair = residuals[first][name], residuals[second][name]
+        texts = [quantity_text(each.rms, each.unit, 3, name) for each in pair]
+        errors.append(f"{runs[0].channel_words(name)} {' against '.join(texts)}")
     return (
         f"{best} explains the recording best: its residuals are {percent(smaller)} smaller than those of {next_best} "
-        f"({errors})."
+        f"({_first(errors)})."
     )
 
 
-def _same_readings(runs: Sequence[Material]) -> bool:
-    """Whether all runs have the same readings at the same times."""
-    return _same(runs, "time") and _same(runs, "outputs")
-
-
-def _same(runs: Sequence[Material], columns: str) -> bool:
+def _same(runs: Sequence[Material], *columns: str) -> bool:
     """Whether the recordings' `time`, `inputs` or `outputs` are the same in all runs, whatever their hold-outs."""
-    first, *others = ([getattr(recording, columns) for recording in run.fitted.values()] for run in runs)
+    first, *others = ([getattr(each, name) for each in run.fitted.values() for name in columns] for run in runs)
     return all(
         len(first) == len(other)
         and all(np.array_equal(a, b, equal_nan=True) for a, b in zip(first, other, strict=True))
@@ -89,15 +86,10 @@ def _same(runs: Sequence[Material], columns: str) -> bool:
     )
 
 
-def _both(sensor: str, channel: str, one: SensorResidual, other: SensorResidual) -> str:
-    texts = (quantity_text(each.rms, each.unit, 3, channel) for each in (one, other))
-    return f"{sensor} " + " against ".join(texts)
-
-
 def _differences(compared: Comparison, runs: Sequence[Material]) -> str:
     """What differs in the inputs: recordings, settings, versions."""
     parts = []
-    if not _same_readings(runs):
+    if not _same(runs, "time", "outputs"):
         parts.append(f"the recording ({_recordings_in_words(runs)})")
     elif not _same(runs, "inputs"):
         parts.append("the inputs of the recording")

@@ -15,25 +15,14 @@ from fdi_torch.clock import clock_shown, of_stamp
 from fdi_torch.effects import units_for_display
 from fdi_torch.gap.verdict_words import FORMAT_1
 from fdi_torch.logbook import Inspection, LogError, Run, Signals, arrays, inspect_log, own_signals, series
+from fdi_torch.logbook.topic_definitions import TOPICS
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import displayed_in
 
 CLOCK = "/source/clock"
-# Only these topics are kept as messages; signals and search populations are read as arrays when needed.
-EVENTS = (
-    "/plant/truth",
-    "/observer/alarm",
-    "/estimator/de/generation",
-    "/estimator/refine/iteration",
-    "/estimate/final",
-    "/diagnosis/fault",
-    "/gap/where",
-    "/gap/verdict",
-    "/study/trial",
-    "/study/summary",
-    CLOCK,
-    "/log",
-)
+# Signals and search populations are read as arrays when needed; messages on all other topics are kept.
+SIGNALS = {"/plant/input", "/plant/output", "/estimate/output", "/estimate/residual", "/observer/residual"}
+EVENTS = TOPICS.keys() - SIGNALS - {"/estimator/de/population"}
 MOST_EVENTS = 100_000
 
 Payload = dict[str, Any]

@@ -102,12 +102,12 @@ def _article(report: RunReport, prefix: str) -> Markup:
     top = [tag("h1", f"{kind_words(material)} · {material.run.path.stem}"), tag("h2", unbroken(headline(material)))]
     top += bullets(f"Doubt about the recording: {doubt}" for doubt in material.listed("doubts"))
     top.append(tag("p", how_it_ended(material), class_="meta"))
-    named = [(f"{prefix}s{k}", section) for k, section in enumerate(report.sections)]
-    lead = [section_html(section, prefix, name) for name, section in named if section.lead]
-    others = [section_html(section, prefix, name) for name, section in named if not section.lead]
-    ordered = [each for each in named if each[1].lead] + [each for each in named if not each[1].lead]
-    index = _index([(name, section.title) for name, section in ordered])
-    return tag("article", *top, index, *_lead(report, lead), *others, id=f"{prefix}run")
+    named = {f"{prefix}s{k}": section for k, section in enumerate(report.sections)}
+    ordered = dict(sorted(named.items(), key=lambda each: not each[1].lead))
+    index = _index([(name, section.title) for name, section in ordered.items()])
+    made = [section_html(section, prefix, name) for name, section in ordered.items()]
+    leading = sum(section.lead for section in report.sections)
+    return tag("article", *top, index, *_lead(report, made[:leading]), *made[leading:], id=f"{prefix}run")
 
 
 def unbroken(sentence: str) -> str:
@@ -134,9 +134,5 @@ def _made(maker: Maker, material: Material) -> Section | None:
         return maker(material)
     except (KeyError, IndexError, TypeError, ValueError, OverflowError, OSError) as error:
         name = maker.__name__.removesuffix("_section").replace("_", " ")
-        return Section(name.capitalize(), [tag("p", f"The log cannot be shown here: {_reason(error)}", class_="bad")])
-
-
-def _reason(error: Exception) -> str:
-    """The error as text."""
-    return f"{type(error).__name__}: {error}" if not isinstance(error, OSError) else str(error)
+        reason = str(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+        return Section(name.capitalize(), [tag("p", f"The log cannot be shown here: {reason}", class_="bad")])

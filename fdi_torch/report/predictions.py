@@ -24,21 +24,6 @@ import numpy as np
 from fdi_torch.names import counted
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
-from fdi_torch.report.reference_models import has_causes
-from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT
-
-# Models of a gap diagnosis: array -> label on the page and colour.
-MODELS = {
-    "nominal": ("nominal model", SOFT),
-    "recalibrated": ("recalibrated", OTHER),
-    "augmented": ("with the causes", MODEL),
-    "ceiling": ("free-form", MARK),
-}
-
-
-def compared_models(material: Material) -> tuple[str, ...]:
-    """The models whose residuals the page compares: without the causes and, if there are any, with them."""
-    return ("recalibrated", "augmented") if has_causes(material.answer) else ("recalibrated",)
 
 
 def predicted(material: Material, k: int) -> np.ndarray | None:

@@ -13,17 +13,21 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent, Sketch
 from fdi_torch.report.html import short
-from fdi_torch.report.rig_layout import Point, arrow_head, direction, longest_piece, tank_places
-from fdi_torch.report.rig_overlay import (
+from fdi_torch.report.rig_layout import (
     GAP,
     LINE,
     POINTS,
     Box,
     LetterStyle,
     Overlay,
+    Point,
     TextBlock,
+    arrow_head,
+    direction,
     level_text,
+    longest_piece,
     separated,
+    tank_places,
     text_width,
 )
 from fdi_torch.report.style import INK, MARK, MODEL, PAPER, SOFT, styled

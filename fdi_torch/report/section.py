@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from matplotlib.figure import Figure
 
-from fdi_torch.report.chart import Chart, chart_json, draw
+from fdi_torch.report.chart import TIME, Chart, Line, chart_json, draw
 from fdi_torch.report.html import Markup, clean, escape, join, tag
 from fdi_torch.report.material import Material
+from fdi_torch.report.numbers import axis, shown_unit
 from fdi_torch.report.style import inline_svg
 
 REM_PER_INCH = 7.6  # width of a wide picture; its text then has the size of the page's text
@@ -57,21 +59,31 @@ def signals(name: str, chart: Chart, caption: str = "") -> Picture:
     return Picture(name, draw(chart), caption, chart=chart)
 
 
+def channel_signals(
+    name: str, title: str, label: str, si_unit: str, lines: Sequence[Line], channel: str = "", **about: Any
+) -> Picture:
+    """Signals of one quantity over time in its unit for display. lines: SI. channel: chooses the unit.
+
+    about: further fields of the `Chart`.
+    """
+    unit, scale = shown_unit(si_unit, channel)
+    lines = [line._replace(y=scale * line.y) for line in lines]
+    return signals(name, Chart(title, y_label=axis(label, unit), lines=lines, **({"x_label": TIME} | about)))
+
+
 def section_html(section: Section, prefix: str, own_id: str) -> Markup:
     """The section as HTML. prefix: makes picture ids unique on the page. own_id: that of the section."""
     blocks = []
     for block in section.blocks:
         if isinstance(block, str):
             blocks.append(block if isinstance(block, Markup) else tag("p", block))
-        else:
-            blocks.append(tag("div", *(_entry(entry, prefix) for entry in block), class_="grid"))
+            continue
+        entries = []
+        for entry in block:
+            figures = [_figure(each, prefix) for each in ([entry] if isinstance(entry, Picture) else entry)]
+            entries += figures if isinstance(entry, Picture) else [tag("div", *figures, class_="column")]
+        blocks.append(tag("div", *entries, class_="grid"))
     return tag("section", tag("h3", section.title), join(blocks), id=own_id)
-
-
-def _entry(entry: Picture | Column, prefix: str) -> Markup:
-    if isinstance(entry, Picture):
-        return _figure(entry, prefix)
-    return tag("div", *(_figure(picture, prefix) for picture in entry), class_="column")
 
 
 def _figure(picture: Picture, prefix: str) -> Markup:

@@ -56,6 +56,13 @@ _SETTINGS: dict[Any, Any] = {
     "ytick.color": SOFT,
     "xtick.labelsize": 9.0,
     "ytick.labelsize": 9.0,
+    "legend.frameon": False,
+    "legend.labelcolor": "linecolor",
+    "legend.handlelength": 1.0,
+    "legend.handletextpad": 0.4,
+    "legend.columnspacing": 0.9,
+    "legend.borderaxespad": 0.0,
+    "legend.fontsize": 9.0,
     "text.color": INK,
     "lines.linewidth": 1.5,
     "figure.facecolor": PAPER,
@@ -117,18 +124,7 @@ def label_lines(axes: Axes, columns: int = 4) -> None:
     with styled():
         if "\n" in title or len(title) + sum(len(name) + 4 for name in names) > _row(axes):
             axes.set_title(title, pad=18.0)
-        axes.legend(
-            loc="lower right",
-            bbox_to_anchor=(1.02, 0.97),
-            ncols=columns,
-            frameon=False,
-            labelcolor="linecolor",
-            handlelength=1.0,
-            handletextpad=0.4,
-            columnspacing=0.9,
-            borderaxespad=0.0,
-            fontsize=9.0,
-        )
+        axes.legend(loc="lower right", bbox_to_anchor=(1.02, 0.97), ncols=columns)
 
 
 def set_panel_title(axes: Axes, title: str) -> None:

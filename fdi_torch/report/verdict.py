@@ -9,7 +9,6 @@ from typing import Any
 
 from fdi_torch.amounts import parameter_words
 from fdi_torch.clock import clock_text
-from fdi_torch.estimate.combinations import Combination
 from fdi_torch.estimate.misfit import NONE_EXPLAINS, NOT_ESTABLISHED, unreliable
 from fdi_torch.estimate.uncertainty import convergence_warning
 from fdi_torch.gap.verdict_words import verdict_sentence
@@ -68,7 +67,10 @@ def fault_words(material: Material) -> str:
     if not effects:
         return ""
     present = [f.sized for f in effects if f.present]
-    not_isolated = [_rivals(combination) for combination in combinations_of(material, "not_isolated")]
+    not_isolated = [
+        f"{' or '.join(map(parameter_words, combination.parameters))} ({combination.words})"
+        for combination in combinations_of(material, "not_isolated")
+    ]
     if material.unexplained:
         return f"{NOT_ESTABLISHED.capitalize()}: {listed(present + not_isolated) or NONE_EXPLAINS}"
     if not present and not not_isolated:
@@ -76,10 +78,6 @@ def fault_words(material: Material) -> str:
     count = len(present) + len(not_isolated)
     kind = f"{count} faults" if count > 1 else "Fault" if present else "Fault not isolated"
     return f"{kind}: {listed(present + not_isolated)}"
-
-
-def _rivals(combination: Combination) -> str:
-    return f"{' or '.join(map(parameter_words, combination.parameters))} ({combination.words})"
 
 
 def gap_words(material: Material) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 
 from fdi_torch.jobs.report import plant_of
@@ -91,8 +92,8 @@ def _read(name: str, path: Path, running: bool) -> Entry:
             error_text = amount(error, unit, 3, sensor) if error == error else ""
         status = material.about("status").get("status", NO_END).replace("_", " ")
         started = material.about("run").get("started", "")[:19].replace("T", " ")
-        state, verdict = (RUNNING, progress_of(material).text) if running else (status, headline(material))
         kind, progress = kind_words(material), progress_of(material)
+        state, verdict = (RUNNING, progress.text) if running else (status, headline(material))
         return Entry(name, path, kind, verdict, error, error_text, state, started, progress)
     except UNSHOWN as problem:
         return _unreadable(name, path, str(problem), running)
@@ -104,15 +105,8 @@ def _unreadable(name: str, path: Path, problem: str, running: bool) -> Entry:
     return Entry(name, path, "", verdict, math.nan, "", state, "", Progress(verdict))
 
 
-SORTS = {
-    "started": lambda entry: entry.started,
-    "log": lambda entry: entry.name,
-    "kind": lambda entry: entry.kind,
-    "verdict": lambda entry: entry.verdict,
-    "error": lambda entry: entry.error,
-    "state": lambda entry: entry.state,
-}
-"""Sorting keys by the name of their column."""
+SORTS = ("started", "log", "kind", "verdict", "error", "state")
+"""Columns that the list can be sorted by."""
 
 
 def selected(
@@ -121,7 +115,7 @@ def selected(
     """The entries of that kind which contain every word of `text`, sorted; unknown errors come last."""
     words = text.casefold().split()
     kept = [entry for entry in entries if kind in ("", entry.kind) and all(word in entry.text for word in words)]
-    key = SORTS.get(sort, SORTS["started"])
+    key = attrgetter("name" if sort == "log" else sort)
     if sort != "error":
         return sorted(kept, key=key, reverse=down)
     known = sorted((entry for entry in kept if not math.isnan(entry.error)), key=key, reverse=down)

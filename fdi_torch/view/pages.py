@@ -24,6 +24,7 @@ form > div { flex-basis: 100%; min-width: 0; }
 input[type=search] { min-width: 14rem; } input, select, button { font: inherit; padding: .2rem .5rem; }
 nav { margin: 0 0 1rem; } progress { width: min(100%, 30rem); }
 """
+NAVIGATION = tag("nav", tag("a", "← all logs", href="/"))  # the link to the list
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ def _filter(kinds: Sequence[str], query: Query) -> Markup:
 def _choice(entries: Sequence[Entry], query: Query) -> Markup:
     """The table of logs, with a box to tick in each row."""
     header = ["", *(_sorting(key, name, query) for key, name in COLUMNS.items()), _sorting("error", "error", query)]
-    rows = [[_box(entry), _link(entry), *_texts(entry), entry.error_text] for entry in entries]
+    rows = [_row(entry) for entry in entries]
     return tag(
         "form",
         tag("button", "Compare the ticked logs"),
@@ -92,25 +93,18 @@ def _sorting(key: str, name: str, query: Query) -> Markup:
     return tag("a", name + arrow, href=query.link(key))
 
 
-def _box(entry: Entry) -> Markup:
-    if entry.state == UNREADABLE:
-        return Markup("")
-    return _field(type="checkbox", name="log", value=entry.name, aria_label=f"compare {entry.name}")
-
-
-def _link(entry: Entry) -> Markup | str:
-    if entry.state == UNREADABLE:
-        return entry.name
-    return tag("a", entry.name, href=address("/follow" if entry.state == RUNNING else "/report", log=entry.name))
-
-
-def _texts(entry: Entry) -> list[Markup | str]:
-    state: Markup | str = entry.state
+def _row(entry: Entry) -> list[Markup | str]:
+    """A log in the list; one that cannot be read has neither box nor link."""
+    box, name, state = "", entry.name, entry.state
+    if entry.state != UNREADABLE:
+        box = _field(type="checkbox", name="log", value=entry.name, aria_label=f"compare {entry.name}")
+        page = "/follow" if entry.state == RUNNING else "/report"
+        name = tag("a", entry.name, href=address(page, log=entry.name))
     if entry.state == RUNNING:
         state = join([tag("span", RUNNING, class_="good"), " ", _bar(entry.progress)])
     elif entry.state != "completed":
         state = tag("span", entry.state, class_="bad")
-    return [entry.started, entry.kind, state, entry.verdict]
+    return [box, name, entry.started, entry.kind, state, entry.verdict, entry.error_text]
 
 
 def _bar(progress: Progress) -> Markup:
@@ -124,7 +118,7 @@ def _field(**attributes: str) -> Markup:
 
 def follow_page(entry: Entry, material: Material | None) -> str:
     """A running job: its progress and newest events; the page reloads itself until the job has ended."""
-    content = [navigation(), tag("h1", f"{entry.kind or 'Job'} · {entry.name}"), tag("h2", entry.progress.text)]
+    content = [NAVIGATION, tag("h1", f"{entry.kind or 'Job'} · {entry.name}"), tag("h2", entry.progress.text)]
     content += [tag("p", _bar(entry.progress)), tag("p", f"running, started {entry.started or 'just now'} UTC")]
     content.append(tag("p", tag("a", "report of what is logged so far", href=address("/report", log=entry.name))))
     if material is not None:
@@ -140,12 +134,7 @@ def follow_page(entry: Entry, material: Material | None) -> str:
 
 
 def problem_page(problem: str) -> str:
-    return document("Not shown", [navigation(), tag("h2", problem)], STYLE)
-
-
-def navigation() -> Markup:
-    """The link to the list."""
-    return tag("nav", tag("a", "← all logs", href="/"))
+    return document("Not shown", [NAVIGATION, tag("h2", problem)], STYLE)
 
 
 def query_of(values: dict[str, str]) -> Query:

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from fdi_torch.jobs.report import page_of, report_of_log
-from fdi_torch.logbook import LogError, read_run
+from fdi_torch.logbook import read_run
 from fdi_torch.report.material import gather
 from fdi_torch.report.page import POLICY
 from fdi_torch.tables import needed
-from fdi_torch.view.log_list import RUNNING, UNSHOWN, Entry, LogList, selected
-from fdi_torch.view.pages import address, follow_page, list_page, navigation, problem_page, query_of
+from fdi_torch.view.log_list import RUNNING, UNSHOWN, LogList, selected
+from fdi_torch.view.pages import NAVIGATION, address, follow_page, list_page, problem_page, query_of
 
 HOST = "127.0.0.1"
 HOSTS = (HOST, "localhost")
@@ -61,7 +61,7 @@ class Pages:
         try:
             with self._lock:
                 reports = [report_of_log(path, []) for path in paths.values() if path is not None]
-                return self._page(page_of(reports, [navigation()]))
+                return self._page(page_of(reports, [NAVIGATION]))
         except UNSHOWN as error:
             return self._problem(f"This log cannot be shown: {error}", 422)
 
@@ -75,21 +75,17 @@ class Pages:
             return self._problem(f"Expected a log below {self.logs.folder}, got none at {name}.", 404)
         if entry.state != RUNNING:
             return self._responses.RedirectResponse(address("/report", log=entry.name), 303, HEADERS)
-        return self._page(follow_page(entry, _material(entry)))
+        try:
+            material = gather(read_run(entry.path, salvage=True))
+        except OSError:  # nothing can be read yet
+            material = None
+        return self._page(follow_page(entry, material))
 
     def _page(self, text: str, status: int = 200) -> Any:
         return self._responses.HTMLResponse(text.encode("utf-8", "replace"), status, HEADERS)
 
     def _problem(self, sentence: str, status: int) -> Any:
         return self._page(problem_page(sentence), status)
-
-
-def _material(entry: Entry) -> Any:
-    """What is logged so far; None if nothing can be read yet."""
-    try:
-        return gather(read_run(entry.path, salvage=True))
-    except (LogError, OSError):
-        return None
 
 
 def application(folder: Path) -> Any:

@@ -155,7 +155,7 @@ def test_a_replay_within_tolerance(finished: Path) -> None:
 @pytest.mark.parametrize(("deviation", "outcome"), [(5e-10, "within tolerance"), (2e-9, "differs")])
 def test_the_tolerance_of_a_replay_is_relative(finished: Path, deviation: float, outcome: str) -> None:
     cost = 1 / 3 * (1 + deviation)
-    found = replay(finished, lambda run: changed(run, "/estimator/de/generation", best_cost=cost), relative=1e-9)
+    found = replay(finished, lambda run: changed(run, "/estimator/de/generation", best_cost=cost))
     assert found.outcome == outcome
 
 

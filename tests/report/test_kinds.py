@@ -32,7 +32,7 @@ from fdi_torch.report.chart import draw
 from fdi_torch.report.diagnosed_effects import diagnosed_effects
 from fdi_torch.report.material import gather
 from fdi_torch.report.page import RunReport, page, report_of, unbroken
-from fdi_torch.report.sections.before_after import profile_section
+from fdi_torch.report.sections.signals import profile_section
 from fdi_torch.report.verdict import _latest, headline
 
 DATA = Path(__file__).parents[1] / "data"

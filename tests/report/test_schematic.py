@@ -10,8 +10,7 @@ import pytest
 from fdi_torch import Plant, Transfer, Weir
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.plant.description import OUTSIDE, Pipe, PlantDescription, Pump, Sensor, Tank
-from fdi_torch.report.rig_layout import tank_places
-from fdi_torch.report.rig_overlay import level_text
+from fdi_torch.report.rig_layout import level_text, tank_places
 from fdi_torch.report.schematic import Overlay, schematic
 from fdi_torch.report.style import inline_svg
 

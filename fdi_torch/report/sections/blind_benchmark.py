@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from fdi_torch.blind.kind_meanings import KIND_MEANINGS
+from fdi_torch.blind.places import EFFECTS, OUTLET, PAIR, PIPE, PUMP, SENSOR, TANK
 from fdi_torch.blind.score import Row
 from fdi_torch.blind.scored_rows import OWN, Scores, Sheet, group_of, misses, sheets, tables
 from fdi_torch.report.html import Markup, folded, short, table, tag
@@ -19,13 +20,7 @@ from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.sections.study import TRIAL, group_panel
 from fdi_torch.report.style import INK, MARK, MODEL, OTHER, PAPER, SOFT, label_lines, panel
 
-# Effects by component: first words of their names.
-PLACES = {
-    "pumps": ("pump_",),
-    "pipes and outlets": ("laminar_flow", "flow_exponent", "outlet_drop", "coefficient_drift", "plugging"),
-    "tanks": ("cross_flow", "leak", "unmetered_flow", "area_taper", "internal_body", "overflow"),
-    "sensors": ("sensor_",),
-}
+PLACES = {"pumps": (PUMP,), "pipes and outlets": (PIPE, OUTLET), "tanks": (TANK, PAIR), "sensors": (SENSOR,)}
 Share = Mapping[str, Any]
 """share, of, ci95."""
 LONE = ("single", "weak", "coloured", "twins", "poor")
@@ -81,10 +76,11 @@ def confusion_section(material: Material) -> Section | None:
     """True cause against answer, for cases with one cause."""
     rows = [row for row in benchmark_rows(material) if row["by"] == OWN]
     pictures = []
-    for k, (place, names) in enumerate(PLACES.items()):
-        own = [r for r in rows if r["kind"] in LONE and r["effect"].startswith(names)]
+    for k, (place, kinds) in enumerate(PLACES.items()):
+        names = [effect for effect, at in EFFECTS.items() if set(at) & set(kinds)]
+        own = [r for r in rows if r["kind"] in LONE and r["effect"] in names]
         if own:
-            prefix = names[0] if names[0].endswith("_") else ""
+            prefix = f"{kinds[0]}_"
             pairs = [(r["effect"].removeprefix(prefix), _answered(r).removeprefix(prefix)) for r in own]
             pictures.append(_confusion(f"challenge_confusion_{k + 1}", place, pairs))
     for title, kind in (

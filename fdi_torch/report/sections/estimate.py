@@ -10,15 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.estimate.combinations import Combination
 from fdi_torch.estimate.misfit import NOT_ESTABLISHED
 from fdi_torch.names import counted
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.html import bullets, table, tag
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import HEADER, amount, axis, correlation_table, estimate_cells, number, shown_unit, signed
-from fdi_torch.report.section import Picture, Section, signals
+from fdi_torch.report.numbers import HEADER, amount, correlation_table, estimate_cells, number, shown_unit, signed
+from fdi_torch.report.section import Picture, Section, channel_signals, signals
 from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT, ellipse_panel
 
 MOST_ELLIPSES = 6
@@ -29,16 +28,20 @@ def estimate_section(material: Material) -> Section | None:
     final = last_estimate(material)
     if final is None:
         return None
-    rows = [_row(material, final, i) for i in range(len(final["names"]))]
-    rows += [_combination_row(material, combination) for combination in combinations_of(material, "combinations")]
-    header = ["parameter", "finding"] if material.of("/diagnosis/fault") else ["parameter"]
-    header += HEADER
-    header += ["simulated"] if material.truth else []
+    names, units = [str(name) for name in final["names"]], final.get("units") or [""] * len(final["names"])
+    rows = []
+    for name, unit, value, std in zip(names, units, final["values"], final["std"], strict=True):
+        cells = estimate_cells(name, str(unit), float(value), float(std))
+        rows.append([name, _finding(material, name), *cells, _simulated(material, str(unit), (name,), (1.0,))])
+    for c in combinations_of(material, "combinations"):
+        deviates = c in combinations_of(material, "not_isolated") and not material.unexplained
+        found = tag("span", "present", class_="bad") if deviates else ""
+        cells = estimate_cells(c.parameters[0], c.unit, c.value, c.std)
+        rows.append([c.formula, found, *cells, _simulated(material, c.unit, c.parameters, c.coefficients)])
+    header = ("parameter", "finding", *HEADER, "simulated")  # without the columns that are empty
     notes = [str(note) for note in final.get("unidentifiable") or ()]
     notes += [f"{name} lies at an end of its range" for name in final.get("at_bound") or ()]
-    return Section(
-        "Estimate", [table(header, rows, left=header.index("unit") + 1), *_water(material), *bullets(notes)], lead=True
-    )
+    return Section("Estimate", [table(header, rows, left=3), *_water(material), *bullets(notes)], lead=True)
 
 
 def posterior_section(material: Material) -> Section | None:
@@ -73,34 +76,10 @@ def covariance_of(final: Payload) -> np.ndarray | None:
     return flat.reshape(count, count) if flat.size == count * count else None
 
 
-def _row(material: Material, final: Payload, i: int) -> list[Any]:
-    name = str(final["names"][i])
-    unit = str(final["units"][i]) if final.get("units") else ""
-    cells: list[Any] = [name, _finding(material, name)] if material.of("/diagnosis/fault") else [name]
-    cells += estimate_cells(name, unit, float(final["values"][i]), float(final["std"][i]))
-    return [*cells, *_simulated(material, unit, (name,), (1.0,))]
-
-
-def _combination_row(material: Material, combination: Combination) -> list[Any]:
-    """A determined combination."""
-    c = combination
-    cells: list[Any] = [c.formula]
-    if material.of("/diagnosis/fault"):
-        deviates = c in combinations_of(material, "not_isolated") and not material.unexplained
-        cells.append(tag("span", "present", class_="bad") if deviates else "")
-    return [
-        *cells,
-        *estimate_cells(c.parameters[0], c.unit, c.value, c.std),
-        *_simulated(material, c.unit, c.parameters, c.coefficients),
-    ]
-
-
-def _simulated(material: Material, unit: str, names: Sequence[str], coefficients: Sequence[float]) -> list[str]:
-    """The simulated value of a combination, empty if one of its parameters has none; no cell for measured data."""
-    if not material.truth:
-        return []
+def _simulated(material: Material, unit: str, names: Sequence[str], coefficients: Sequence[float]) -> str:
+    """The simulated value of a combination; empty if one of its parameters has none."""
     value = sum(c * material.truth.get(name, np.nan) for c, name in zip(coefficients, names, strict=True))
-    return [number(shown_unit(unit, names[0])[1] * value) if np.isfinite(value) else ""]
+    return number(shown_unit(unit, names[0])[1] * value) if np.isfinite(value) else ""
 
 
 def _finding(material: Material, name: str) -> Any:
@@ -195,12 +174,9 @@ def _best_members(material: Material, events: Sequence[Payload], steps: np.ndarr
     names = [str(name) for name in (final or {}).get("names", ()) if name in events[-1]][:MOST_PARAMETERS]
     pictures = []
     for k, name in enumerate(names):
-        unit, scale = shown_unit(material.unit(GENERATIONS, name))
-        lines = [Line("best member", steps, scale * column(events, name), MODEL)]
+        lines = [Line("best member", steps, column(events, name), MODEL)]
         if name in material.truth:
-            lines.append(
-                Line("simulated", steps, np.full(len(steps), scale * material.truth[name]), OTHER, dashed=True)
-            )
-        chart = Chart(name, "generation", axis("best member", unit), lines, clock="search")
-        pictures.append(signals(f"search_parameter_{k + 1}", chart))
+            lines.append(Line("simulated", steps, np.full(len(steps), material.truth[name]), OTHER, dashed=True))
+        about, unit = (f"search_parameter_{k + 1}", name, "best member"), material.unit(GENERATIONS, name)
+        pictures.append(channel_signals(*about, unit, lines, x_label="generation", clock="search"))
     return pictures

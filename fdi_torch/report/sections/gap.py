@@ -18,10 +18,10 @@ from fdi_torch.gap.verdict_words import (
     explanation_words,
     rounding_words,
 )
+from fdi_torch.report.diagnosed_effects import flows_that_matter, has_causes
 from fdi_torch.report.html import bullets, table
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, number, percent, probability_text, shown_unit, with_error
-from fdi_torch.report.reference_models import flows_that_matter, has_causes
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.style import BAR_NAME, bar_panel
 
@@ -39,14 +39,17 @@ def where_section(material: Material) -> Section | None:
     caption = f"Below {percent(LEAST_SHOWN)}: {len(ranked) - len(shown)} other places." if ranked[len(shown) :] else ""
     ranked = shown[:MOST_BARS]
     shares = [100.0 * float(place["share"]) for _, place in ranked]
-    texts = [probability_text(float(place["share"])) + _chance(place) for _, place in ranked]
+    texts = []
+    for _, place in ranked:
+        p = place.get("p_value")
+        chance = f"  (p {number(float(p), 2)})" if isinstance(p, int | float) else ""
+        texts.append(probability_text(float(place["share"])) + chance)
     likeliest = [cause for item in material.answer.get("posterior", [])[:1] for cause in causes_of(item)]
     guilty = {str(c["location"]) for c in apart_from_rounding([*material.answer.get("causes", []), *likeliest])}
     names = [name for name, _ in ranked]
     meaning = material.meaning_of_shares
     label = "share of the gap, %" if material.answer.get("format") == FORMAT_1 else "probability, %"
-    figure = bar_panel("", label, names, shares, texts, [name in guilty for name in names])
-    _up_to_all(figure)
+    figure = _bars(label, names, shares, texts, [name in guilty for name in names])
     words = f"{meaning[:1].upper()}{meaning[1:]}. Orange: causes of the likeliest explanation."
     return Section("Where the gap lies", [words, [Picture("gap_where", figure, caption)]], lead=True)
 
@@ -75,7 +78,12 @@ def causes_section(material: Material) -> Section | None:
 
 def disturbances_section(material: Material) -> Section | None:
     """Random flows into the tanks that matter, estimated together with the likeliest explanation."""
-    rows = [_flow_row(tank, flow) for tank, flow in flows_that_matter(material.answer, material.plant).items()]
+    rows = []
+    for tank, flow in flows_that_matter(material.answer, material.plant).items():
+        unit, scale = shown_unit(str(flow.get("unit", "")))
+        time = as_float(flow.get("correlation_time"))
+        std = number(scale * as_float(flow.get("std")), 3)
+        rows.append([tank, std, unit, f"{number(time, 3)} s" if time else "none"])
     if not rows:
         return None
     words = (
@@ -84,12 +92,6 @@ def disturbances_section(material: Material) -> Section | None:
     )
     header = ("into", "standard deviation", "unit", "correlation time")
     return Section("Random flows", [words, table(header, rows)])
-
-
-def _flow_row(tank: str, flow: Mapping[str, Any]) -> list[str]:
-    unit, scale = shown_unit(str(flow.get("unit", "")))
-    time = as_float(flow.get("correlation_time"))
-    return [tank, number(scale * as_float(flow.get("std")), 3), unit, f"{number(time, 3)} s" if time else "none"]
 
 
 def _content(answer: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
@@ -118,8 +120,7 @@ def posterior_bars(answer: Mapping[str, Any]) -> list[list[Picture]]:
         return []
     percents = [100.0 * chance for chance in chances]
     texts = [probability_text(0.01 * percent) for percent in percents]
-    figure = bar_panel("", "probability, %", names, percents, texts, within)
-    _up_to_all(figure)
+    figure = _bars("probability, %", names, percents, texts, within)
     caption = f"All contain {explanation_words(shared)}. " if shared else ""
     return [
         [Picture("gap_posterior", figure, f"{caption}Orange: together they have at least 95 % of the probability.")]
@@ -132,15 +133,12 @@ def _beside(shared: Sequence[Mapping[str, Any]], causes: Sequence[Mapping[str, A
     return explanation_words(others) if others or not shared else "nothing else"
 
 
-def _up_to_all(figure: Figure) -> None:
-    """Remove ticks beyond 100 %: that part of the axis only makes room for the numbers beside the bars."""
+def _bars(label: str, *bars: Any) -> Figure:
+    """Bars without ticks beyond 100 %: that part of the axis only makes room for the numbers beside the bars."""
+    figure = bar_panel("", label, *bars)
     axes = figure.axes[0]
     axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= 100.0])
-
-
-def _chance(place: Mapping[str, Any]) -> str:
-    p = place.get("p_value")
-    return f"  (p {number(float(p), 2)})" if isinstance(p, int | float) else ""
+    return figure
 
 
 def _cause_rows(cause: Mapping[str, Any]) -> list[list[str]]:

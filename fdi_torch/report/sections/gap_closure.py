@@ -13,12 +13,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fdi_torch.gap.verdict_words import closed_sentence, explanation_words
-from fdi_torch.report.chart import Chart, Line
+from fdi_torch.report.chart import PLANNED, Line
+from fdi_torch.report.diagnosed_effects import has_causes, reference_models
 from fdi_torch.report.html import bullets, folded, short, table
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, as_vector, axis, number, percent, shown_unit, with_error
-from fdi_torch.report.reference_models import has_causes, reference_models
-from fdi_torch.report.section import Picture, Section, signals
+from fdi_torch.report.section import Picture, Section, channel_signals
 from fdi_torch.report.style import MARK, MODEL, SOFT, bar_panel, label_lines, panel
 
 FROZEN = {"recalibrated": "constants recalibrated without them", "nominal": "nominal constants"}
@@ -123,11 +123,10 @@ def next_input_section(material: Material) -> Section | None:
     units, end = proposal["input"].get("unit") or {}, as_float(proposal["input"].get("duration"))
     pictures = []
     for k, (name, channel) in enumerate(steps.items()):
-        unit, scale = shown_unit(str(units.get(name, "")), name)
-        time, values = as_vector(channel["at"]), scale * as_vector(channel["value"])
+        time, values = as_vector(channel["at"]), as_vector(channel["value"])
         line = Line("command", np.append(time, end), np.append(values, values[-1:]), MODEL, steps=True)
-        chart = Chart(material.channel_words(name), "time, s", axis("command", unit), [line], clock="next")
-        pictures.append(signals(f"gap_next_input_{k + 1}", chart))
+        words = f"gap_next_input_{k + 1}", material.channel_words(name), "command"
+        pictures.append(channel_signals(*words, str(units.get(name, "")), [line], name, clock=PLANNED))
     return Section("Next experiment", [_next_words(proposal), pictures])
 
 

@@ -15,8 +15,8 @@ from fdi_torch.clock import clock_text
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import Markup, table, tag
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import as_float, axis, number, rounded_number, sentence, shown_unit
-from fdi_torch.report.section import Section, signals
+from fdi_torch.report.numbers import as_float, number, rounded_number, sentence
+from fdi_torch.report.section import Section, channel_signals, signals
 from fdi_torch.report.style import MARK, MODEL
 
 RESIDUAL, ALARM = "/observer/residual", "/observer/alarm"
@@ -31,11 +31,10 @@ def residual_section(material: Material) -> Section | None:
         return None
     alarms, pictures = _alarms(material), []
     for k, name in enumerate(name for name in columns if name != "t" and not name.endswith(_SUFFIXES)):
-        unit, scale = shown_unit(material.unit(RESIDUAL, name), name)
-        line, label = Line("measured − predicted", time, scale * columns[name], MODEL), axis("residual", unit)
-        title = material.channel_words(name)
-        chart = Chart(title, "time, s", label, [line], level=0.0, events=alarms, clock="monitor", height=2.1)
-        pictures.append(signals(f"observer_residual_{k + 1}", chart))
+        unit, lines = material.unit(RESIDUAL, name), [Line("measured − predicted", time, columns[name], MODEL)]
+        about: dict[str, Any] = {"level": 0.0, "events": alarms, "clock": "monitor", "height": 2.1}
+        words = f"observer_residual_{k + 1}", material.channel_words(name), "residual"
+        pictures.append(channel_signals(*words, unit, lines, name, **about))
     return Section("Residuals", ["Vertical lines: alarms.", pictures]) if pictures else None
 
 

@@ -1,19 +1,25 @@
-"""Sections about the signals: inputs, readings, predictions and residuals."""
+"""Sections about the signals: inputs, readings, predictions and residuals; and the residuals before and after the
+causes of a gap were added, on the hold-outs and by time, level, input and flow.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
+import torch
 
 from fdi_torch.logbook import Signals
 from fdi_torch.report.chart import Chart, Line, corner_points
+from fdi_torch.report.diagnosed_effects import MODEL_NAMES, has_causes
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import axis, number, shown_unit
-from fdi_torch.report.predictions import predicted
-from fdi_torch.report.section import Column, Picture, Section, signals
-from fdi_torch.report.style import MODEL, SOFT
+from fdi_torch.report.numbers import amount, as_float, axis, number, shown_unit
+from fdi_torch.report.predictions import holdout_prefix, predicted
+from fdi_torch.report.section import Column, Picture, Section, channel_signals, signals
+from fdi_torch.report.style import MODEL, OTHER, SOFT
+from fdi_torch.sample_noise import sample_noise
 
 
 def fit_section(material: Material) -> Section | None:
@@ -42,17 +48,18 @@ def inputs_section(material: Material) -> Section | None:
         suffix = f"_{k + 1}" if several else ""
         pictures, constant = [], []
         for i, name in enumerate(map(material.channel_words, recording.input_names)):
-            unit, scale = shown_unit(recording.input_units[i], recording.input_names[i])
-            values = scale * recording.inputs[:, i]
+            unit, channel, values = recording.input_units[i], recording.input_names[i], recording.inputs[:, i]
             if np.isfinite(values).any() and np.nanmin(values) == np.nanmax(values):
-                constant.append(f"{name} at {number(float(np.nanmax(values)))} {unit}".rstrip())
+                constant.append(f"{name} at {amount(float(np.nanmax(values)), unit, name=channel)}")
                 continue
             held = recording.hold == "zero_order"
             time, corners = corner_points(recording.time, values) if held else (recording.time, values)
             line = Line("command", time, corners, MODEL, steps=held)
             title = f"{name}, {recording_name(group).lower()}" if several else name
-            chart = Chart(title, "time, s", axis("command", unit), [line], clock=clock_of(group))
-            pictures.append(signals(f"input{suffix}_{i + 1}", chart))
+            clock = clock_of(group)
+            pictures.append(
+                channel_signals(f"input{suffix}_{i + 1}", title, "command", unit, [line], channel, clock=clock)
+            )
         of = f"{recording_name(group)}, constant" if several else "Constant"
         blocks += [f"{of}: {', '.join(constant)}."] if constant else []
         blocks += [pictures] if pictures else []
@@ -78,18 +85,20 @@ def _output_panels(
     readings = np.where(recording.mask, recording.outputs, np.nan)
     time = recording.time
     for i, name in enumerate(sensors):
-        unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
-        lines = [Line("measured", time, scale * readings[:, i], SOFT, wide=model is not None)]
+        about: dict[str, Any] = {
+            "si_unit": recording.output_units[i],
+            "channel": recording.output_names[i],
+            "clock": clock,
+        }
+        lines = [Line("measured", time, readings[:, i], SOFT, wide=model is not None)]
         if model is not None:
-            lines.append(Line("estimate", time, scale * model[:, i], MODEL))
-        chart = Chart(name, "time, s", axis("reading", unit), lines, clock=clock)
-        pictures = [signals(f"output{suffix}_{i + 1}", chart)]
+            lines.append(Line("estimate", time, model[:, i], MODEL))
+        column = [channel_signals(f"output{suffix}_{i + 1}", name, "reading", lines=lines, **about)]
         if model is not None:
-            residual = Line("measured − estimate", time, scale * (readings[:, i] - model[:, i]), MODEL)
-            label = axis("residual", unit)
-            chart = Chart(f"{name}: residual", "time, s", label, [residual], level=0.0, clock=clock, height=2.1)
-            pictures.append(signals(f"residual{suffix}_{i + 1}", chart))
-        columns.append(tuple(pictures))
+            lines = [Line("measured − estimate", time, readings[:, i] - model[:, i], MODEL)]
+            words = f"residual{suffix}_{i + 1}", f"{name}: residual", "residual"
+            column.append(channel_signals(*words, lines=lines, level=0.0, height=2.1, **about))
+        columns.append(tuple(column))
     return columns
 
 
@@ -119,3 +128,126 @@ def _correlation(read: np.ndarray, estimate: np.ndarray) -> str:
     if len(read) < 2 or np.ptp(read) == 0 or np.ptp(estimate) == 0:
         return "–"
     return f"{float(np.corrcoef(read, estimate)[0, 1]):.6f}"
+
+
+BINS = 24
+COLOURS = {"recalibrated": OTHER, "augmented": MODEL}
+
+
+def _compared_models(material: Material) -> list[str]:
+    """The models whose residuals the page compares: without the causes and, if there are any, with them."""
+    return list(COLOURS) if has_causes(material.answer) else ["recalibrated"]
+
+
+def holdout_section(material: Material) -> Section | None:
+    """Residuals of the hold-outs for each model, sensor by sensor."""
+    if not material.recordings:
+        return None
+    blocks: list[str | list[Picture]] = []
+    count = 0
+    while f"{holdout_prefix(count)}_time" in material.arrays:
+        pictures = _holdout_panels(material, holdout_prefix(count))
+        blocks += [pictures] if pictures else []
+        count += 1
+    causes = len(_compared_models(material)) > 1
+    words = f"Residuals{' of each model' if causes else ''} on readings that were not used for fitting."
+    return Section("Before and after" if causes else "Hold-out", [words, *blocks]) if blocks else None
+
+
+def _holdout_panels(material: Material, prefix: str) -> list[Picture]:
+    arrays, recording, pictures = material.arrays, material.recordings[0], []
+    time, read = arrays[f"{prefix}_time"], arrays[f"{prefix}_read"]
+    title = prefix.replace("holdout", "hold-out").replace("_", " ")
+    for i, name in enumerate(recording.output_names):
+        lines: list[Line] = []
+        for model in _compared_models(material):
+            predicted = arrays.get(f"{prefix}_{model}")
+            if predicted is not None:
+                lines.append(Line(MODEL_NAMES[model], time, read[:, i] - predicted[:, i], COLOURS[model]))
+        if lines:
+            about = f"{prefix}_{i + 1}", f"{material.channel_words(name)}, {title}", "measured − model"
+            unit, clock = recording.output_units[i], clock_of(prefix)
+            pictures.append(channel_signals(*about, unit, lines, name, level=0.0, clock=clock))
+    return pictures
+
+
+def profile_section(material: Material) -> Section | None:
+    """Size of the residual in units of the sensors' noise, over each variable it may depend on."""
+    if not material.recordings:
+        return None
+    recording = material.recordings[0]
+    each = {model: _excess(material, recording, model) for model in _compared_models(material)}
+    excess = {model: residual for model, residual in each.items() if residual is not None}
+    if not excess:
+        return None
+    pictures = []
+    varied = (v for v in _variables(material, recording) if np.nanmin(v[2]) < np.nanmax(v[2]))
+    for k, (title, label, variable) in enumerate(varied):
+        lines = [Line(MODEL_NAMES[m], *_binned(variable, size), COLOURS[m]) for m, size in excess.items()]
+        chart = Chart(title, label, "residual, × noise", lines, log=True, level=1.0, from_zero=True)
+        pictures.append(signals(f"gap_by_{k + 1}", chart))
+    words = "Root mean square residual of all sensors, each divided by its noise; 1 means noise only."
+    return Section("What the gap depends on", [words, pictures])
+
+
+def _excess(material: Material, recording: Signals, model: str) -> np.ndarray | None:
+    """Squared residual over squared noise, mean over the sensors (T,)."""
+    predicted = material.arrays.get(model)
+    if predicted is None or predicted.shape != recording.outputs.shape:
+        return None
+    read = np.where(recording.mask, recording.outputs, np.nan)
+    ratio = ((read - predicted) / _noise(material, recording, read)) ** 2
+    counted = np.isfinite(ratio)
+    return np.where(counted, ratio, 0.0).sum(1) / np.maximum(counted.sum(1), 1)
+
+
+def _noise(material: Material, recording: Signals, read: np.ndarray) -> np.ndarray:
+    """Noise (N,) by which the diagnosis weighed each sensor, rounding included; of the samples where it is unknown."""
+    stated = material.answer.get("noise") or {}
+    names = {s.column: s.name for s in material.plant.sensors} if material.plant is not None else {}
+    std = [as_float((stated.get(names.get(c, c)) or {}).get("std")) for c in recording.output_names]
+    readings = torch.from_numpy(read)
+    of_samples = sample_noise(readings.nan_to_num(), torch.isfinite(readings).double()).clamp(min=1e-12)
+    return np.where(np.array(std) > 0.0, std, of_samples.numpy())
+
+
+def _variables(material: Material, recording: Signals) -> Iterator[tuple[str, str, np.ndarray]]:
+    """Title, axis label and values (T,) of each variable that the gap may depend on."""
+    yield "By time", "time, s", recording.time
+    for i, name in enumerate(map(material.channel_words, recording.output_names)):
+        unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
+        yield f"By {name}", axis(f"{name} measured", unit), scale * recording.outputs[:, i]
+    for i, name in enumerate(map(material.channel_words, recording.input_names)):
+        unit, scale = shown_unit(recording.input_units[i], recording.input_names[i])
+        yield f"By {name}", axis(f"{name} commanded", unit), scale * recording.inputs[:, i]
+    for name, head in _heads(material, recording):
+        unit, scale = shown_unit("m")
+        yield f"By the head along {name}", axis("head along the pipe", unit), scale * head
+
+
+def _heads(material: Material, recording: Signals) -> Iterator[tuple[str, np.ndarray]]:
+    """Level difference in m across each pipe between two tanks with sensors."""
+    if material.plant is None:
+        return
+    levels = {}
+    for sensor in material.plant.sensors:
+        if sensor.column in recording.output_names:
+            read = recording.outputs[:, recording.output_names.index(sensor.column)]
+            levels[sensor.tank] = (read - sensor.offset) / sensor.gain
+    for pipe in material.plant.pipes:
+        if pipe.source in levels and pipe.target in levels and not pipe.free_fall:
+            yield pipe.name, levels[pipe.source] - levels[pipe.target]
+
+
+def _binned(variable: np.ndarray, squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Root mean of `squares` by value of the variable if it has few values, otherwise in bins of equal counts."""
+    usable = np.isfinite(variable) & np.isfinite(squares)
+    variable, squares = variable[usable], squares[usable]
+    values, index = np.unique(variable, return_inverse=True)
+    if len(values) > BINS:
+        edges = np.quantile(variable, np.linspace(0.0, 1.0, BINS + 1)[1:-1])
+        index = np.searchsorted(edges, variable)
+    count = np.maximum(np.bincount(index, minlength=1), 1)
+    x, y = (np.bincount(index, weights=w) / count for w in (variable, squares))
+    kept = np.bincount(index, minlength=1) > 0
+    return x[kept], np.sqrt(y[kept])

@@ -19,6 +19,7 @@ from fdi_torch.report.html import folded, short, table
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import axis, number, percent, shown_unit
 from fdi_torch.report.section import Picture, Section
+from fdi_torch.report.sections.estimate import column
 from fdi_torch.report.style import MARK, MODEL, SOFT, logarithmic, panel
 from fdi_torch.study.estimators import ESTIMATORS, Estimator
 
@@ -77,18 +78,16 @@ def error_section(material: Material) -> Section | None:
     estimator = next((name for name in SHOWN if trials and name in trials[0]), None)
     if estimator is None:
         return None
-    groups = list(dict.fromkeys(str(m.get("group", "")) for m in trials))[:MOST_GROUPS]
-    pictures = []
+    groups, pictures = _grouped(trials), []
     for i, name in enumerate(_parameters(material, estimator, len(trials[0]["truth"]))[:MOST_PANELS]):
-        errors, bounds = [], []
-        for group in groups:
-            own = [m for m in trials if str(m.get("group", "")) == group]
-            errors.append(np.array([abs(float(m[estimator][i]) - float(m["truth"][i])) for m in own]))
-            bounds.append(np.median([float(m["bound"][i]) if "bound" in m else np.nan for m in own]))
         unit, scale = _unit_of(material, name)
-        errors, bounds = [scale * e for e in errors], [scale * b for b in bounds]
+        errors, bounds = [], []
+        for own in groups.values():
+            errors.append(scale * np.array([abs(float(m[estimator][i]) - float(m["truth"][i])) for m in own]))
+            bounds.append(scale * np.median([float(m["bound"][i]) if "bound" in m else np.nan for m in own]))
         label = axis("size of the error", unit)
-        figure = group_panel(parameter_words(name), label, groups, errors, lambda e: float(np.sqrt(np.mean(e**2))))
+        names = list(groups)
+        figure = group_panel(parameter_words(name), label, names, errors, lambda e: float(np.sqrt(np.mean(e**2))))
         if all(np.nanmax(e, initial=0.0) > 0 for e in errors):
             logarithmic(figure.axes[0])
         figure.axes[0].plot(range(len(groups)), bounds, "_", color=MARK, ms=22, mew=2.0)
@@ -131,11 +130,10 @@ def trials_section(material: Material) -> Section | None:
     trials = material.of(TRIAL)
     if not trials or material.kind in ("challenge", "rehearsal"):  # they have tables of their own
         return None
-    groups = list(dict.fromkeys(str(m.get("group", "")) for m in trials))[:MOST_GROUPS]
+    groups = _grouped(trials)
     statuses = list(dict.fromkeys(str(m.get("status", "")) for m in trials))[:6]
     rows = []
-    for group in groups:
-        own = [m for m in trials if str(m.get("group", "")) == group]
+    for group, own in groups.items():
         ends = [sum(str(m.get("status", "")) == status for m in own) / len(own) for status in statuses]
         rows.append([group, str(len(own)), *(percent(share) for share in ends)])
     names = dict.fromkeys(k for m in trials for k, v in m.items() if k not in _OWN and isinstance(v, float))
@@ -143,7 +141,8 @@ def trials_section(material: Material) -> Section | None:
     pictures = []
     for k, name in enumerate(varying[:MOST_PANELS]):
         unit, scale = shown_unit(material.unit(TRIAL, name))
-        figure = group_panel(name, axis(name, unit), groups, [scale * _column(trials, g, name) for g in groups])
+        values = [scale * column(own, name) for own in groups.values()]
+        figure = group_panel(name, axis(name, unit), list(groups), values)
         pictures.append(Picture(f"trials_{k + 1}", figure))
     ended = table(["setting", "trials", *(status or "ended" for status in statuses)], rows)
     blocks: list[Any] = [folded("How the trials ended", ended)]
@@ -177,9 +176,12 @@ def group_panel(
     return figure
 
 
-def _column(trials: Sequence[Payload], group: str, name: str) -> np.ndarray:
-    own = (m.get(name) for m in trials if str(m.get("group", "")) == group)
-    return np.array([float(v) for v in own if isinstance(v, int | float)])
+def _grouped(trials: Sequence[Payload]) -> dict[str, list[Payload]]:
+    """The trials of each setting."""
+    groups: dict[str, list[Payload]] = {}
+    for trial in trials:
+        groups.setdefault(str(trial.get("group", "")), []).append(trial)
+    return dict(list(groups.items())[:MOST_GROUPS])
 
 
 def _shown(value: Any, scale: float = 1.0) -> str | None:
@@ -214,17 +216,17 @@ def isolation_section(material: Material) -> Section | None:
     return Section("Isolation", [words, [picture], folded("The modes", listed)])
 
 
-def matrix_panel(counts: np.ndarray, labels: Sequence[str] = ()) -> Figure:
+def matrix_panel(counts: np.ndarray, labels: Sequence[str]) -> Figure:
     """Share of each row (M, M) as a heat map; right answers are on the diagonal. labels: names of the modes, written
     beside the rows if these are at most `MOST_NAMED`.
     """
-    named = 0 < len(labels) <= MOST_NAMED
+    named = len(labels) <= MOST_NAMED
     rows, height = ("", 2.9) if named else ("true mode", 4.0)  # the names leave no room for a label beside them
     figure, axes = panel("Stated against true", "stated mode", rows, height=height)
     share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
-    for row, column in np.argwhere(share > 0):
-        strength = 0.15 + 0.85 * float(share[row, column])
-        axes.add_patch(Rectangle((column + 0.5, row + 0.5), 1, 1, facecolor=MODEL, alpha=strength, edgecolor="none"))
+    for i, j in np.argwhere(share > 0):
+        strength = 0.15 + 0.85 * float(share[i, j])
+        axes.add_patch(Rectangle((j + 0.5, i + 0.5), 1, 1, facecolor=MODEL, alpha=strength, edgecolor="none"))
     axes.set_xlim(0.5, len(counts) + 0.5)
     axes.set_ylim(len(counts) + 0.5, 0.5)
     axes.set_aspect("equal")

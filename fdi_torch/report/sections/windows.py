@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from fdi_torch.amounts import parameter_words
 from fdi_torch.report.html import short, table
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import as_float, number, shown_unit, with_error
+from fdi_torch.report.numbers import amount, as_float, number, shown_unit, with_error
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.style import FAINT, MARK, panel
 
@@ -39,13 +39,12 @@ def _row(stretch: dict[str, Any]) -> list[str]:
     unit, scale = shown_unit(str(stretch.get("unit", "1")), str(stretch["name"]))
     size, std = (as_float(stretch.get(name)) * scale for name in ("size", "std"))
     shown = with_error(size, std) if math.isfinite(std) else f"> {number(size)}"
-    flow, flow_scale = shown_unit("m^3/s")
-    moved = as_float(stretch.get("flow")) * flow_scale
+    flow = as_float(stretch.get("flow"))
     return [
         parameter_words(str(stretch["name"])),
         *(number(stretch[name], 6) for name in ("start", "stop")),
         f"{shown} {unit}".rstrip(),
-        f"{number(moved, 3)} {flow}" if math.isfinite(moved) else "",
+        amount(flow, "m^3/s", 3) if math.isfinite(flow) else "",
     ]
 
 
@@ -70,13 +69,12 @@ def _bars(windows: Sequence[dict[str, Any]]) -> Figure:
 
 def logged_windows(material: Material) -> tuple[Records, Records]:
     """Windows, and the periods in which a fault was present; empty if they are missing or unreadable."""
-    windows, stretches = (_records(material, name) for name in ("windows", "stretches"))
-    return [w for w in windows if _spans(w)], [s for s in stretches if _spans(s) and isinstance(s.get("name"), str)]
+    windows, stretches = (
+        [each for each in material.listed(name) if isinstance(each, dict) and {"start", "stop"} <= _numbers_of(each)]
+        for name in ("windows", "stretches")
+    )
+    return windows, [stretch for stretch in stretches if isinstance(stretch.get("name"), str)]
 
 
-def _records(material: Material, name: str) -> Records:
-    return [each for each in material.listed(name) if isinstance(each, dict)]
-
-
-def _spans(record: dict[str, Any]) -> bool:
-    return all(isinstance(record.get(name), int | float) for name in ("start", "stop"))
+def _numbers_of(record: dict[str, Any]) -> set[str]:
+    return {name for name, value in record.items() if isinstance(value, int | float)}
