@@ -104,7 +104,7 @@ def prepare_monitor(
     monitor = Monitor(network, space, noise, detector, settings, step, len(watched), len(unlisted))
     warnings = (
         *residual_warnings(plant, noise, detector, seen),
-        *fault_warnings(learning, space, samples, believed, step, faults_of(watched), constants),
+        *fault_warnings(learning, space, samples, believed, step, faults_of(watched), noise),
     )
     text = false_alarm_rate_text(noise, detector, every)
     return PreparedMonitor(monitor, believed, values, warnings, text)
