@@ -13,7 +13,7 @@ from fdi_torch.effects import build_network, placements_for
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
-from fdi_torch.monitor.monitor_setup import with_shapes
+from fdi_torch.monitor.monitor_setup import prepare_monitor, with_shapes
 from fdi_torch.monitor.monte_carlo.simulated_runs import FaultSchedule, SimulatedRig, fault_free_schedule
 from fdi_torch.monitor.noise_model import learn_noise
 from fdi_torch.monitor.oscillation import strongest_periods
@@ -34,6 +34,14 @@ def test_the_period_of_a_weak_oscillation_is_among_the_strongest_of_a_long_windo
     # Half a swing of the window apart: periods of 7.3^2 / 4000 = 0.013 s.
     assert float((found - 7.3).abs().min()) < 0.014
     assert strongest_periods(noise[:5], 1.0, 60.0, 60.0, 8).tolist() == [60.0]
+
+
+def test_a_monitor_for_oscillations_alone_asks_nothing_about_its_fault_free_part() -> None:
+    time = torch.arange(120, dtype=torch.float64)
+    noise = 1e-3 * torch.randn(120, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    levels = equilibrium(build_network(PLANT, []), INPUTS) + noise
+    recording = PLANT.recording(time, INPUTS.expand(120, -1), levels)
+    assert prepare_monitor(PLANT, recording, ["Q1.pump_oscillation.amplitude"]).warnings == ()
 
 
 def test_an_oscillating_pump_is_isolated_a_day_after_the_start() -> None:

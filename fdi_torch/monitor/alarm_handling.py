@@ -32,7 +32,7 @@ from fdi_torch.monitor.known_faults import (
 )
 from fdi_torch.monitor.monitor_settings import REVISE
 from fdi_torch.monitor.monitor_state import DetectedChange, HiddenFault, MonitorState, PendingAlarm
-from fdi_torch.monitor.state_update import ResidualTest, adopt_change, adopt_sizes, beside_deviation
+from fdi_torch.monitor.state_update import ResidualTest, adopt, adopt_change, beside_deviation
 
 
 class AlarmHandler:
@@ -87,7 +87,7 @@ class AlarmHandler:
                     return revised, events
         resized = size_change(self.observer, state, self.explainer.search_start(state, state.now), self.faults)
         if resized is not None:
-            moved = adopt_sizes(self.observer, state, resized)
+            moved = adopt(self.observer, state, resized.value, state.believed, resized)
             moved, announced = with_new_sizes(moved, resized)
             changed = [t for t in moved.tracks if t.column in resized.hypothesis.columns]
             return moved, self.writer.followed(moved, changed, announced)

@@ -3,33 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
-import torch
 from torch import Tensor
 
 from fdi_torch.monitor.detection import DRIFT, VERY_LONG, Detector
 from fdi_torch.monitor.events import Explanation, percent_text, size_of
 from fdi_torch.monitor.hypothesis import Fault
-from fdi_torch.monitor.isolation import isolate
-from fdi_torch.monitor.law_errors import ConstantErrors
-from fdi_torch.monitor.noise_model import NoiseModel, operating_point
+from fdi_torch.monitor.hypothesis_fit import Prior
+from fdi_torch.monitor.isolation import isolate, with_flows_of_window
+from fdi_torch.monitor.noise_model import NoiseModel
 from fdi_torch.monitor.observer import Observation
 from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow
-from fdi_torch.monitor.observer_gain import kalman_gain, start_uncertainty
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.quantities import quantity_text
 
-# Process noise over reading noise that counts as no process noise.
-NO_PROCESS_NOISE = 1e-3
-# Posterior probability from which a fault in the fault-free part is reported.
+# Posterior probability from which a fault in the fault-free part is reported. Without a fault, posterior odds of 99 are
+# rarer than 1 in 99 times the prior odds of a fault.
 CONVINCING = 0.99
 # Offset of the white residual that is reported, in standard deviations: half the drift that a CUSUM allows.
 OFFSET = 0.5 * DRIFT
-SIGNIFICANT = 4.0  # standard errors of an offset or a fault size
+SIGNIFICANT = 4.0  # standard errors of an offset
 RATE_FACTOR = 2.0  # desired accuracy of the false-alarm rate, as a factor
 QUESTION = "does the recording start faulty? Name another fault_free part"
 
@@ -57,33 +54,31 @@ def fault_warnings(
     believed: Tensor,
     step: float,
     faults: Sequence[Fault],
-    constants: ConstantErrors,
+    noise: NoiseModel,
 ) -> list[str]:
-    """Warning about a single fault in the fault-free part that explains the readings down to their noise.
+    """Warning about a single sudden fault in the fault-free part, if there is one with a probability of CONVINCING.
 
-    The learnt noise model would attribute the effect of such a fault to process noise. This check therefore assumes no
-    process noise, and takes the measurement noise from second differences.
+    The random flows were learnt as if there were no fault, and hold its effect. Each plausible explanation, no fault
+    included, is therefore compared with the flows that are most likely under it.
     """
-    linear = operating_point(network, samples, space, believed, step)
-    std = noise_std_from_differences(samples.readings)
-    if not bool((std > 0.0).all()):
+    sudden, whitening = [fault for fault in faults if not fault.shape], noise.whitening
+    if not sudden:
         return []
-    start = start_uncertainty(network.description, std)
-    gain = kalman_gain(linear, NO_PROCESS_NOISE * float(std.min()) * torch.ones_like(start), std, start)
-    zeros, count = torch.zeros_like(std), len(samples)
-    whitening = Whitening(zeros, std.new_zeros(0, len(std), len(std)), torch.diag(1.0 / std), count, zeros)
-    observer = ObserverBank(network, space, gain, whitening, step, constants)
-    steady = [fault for fault in faults if not fault.shape]
-    first, _ = observer.first_state(samples, believed)
-    best = isolate(observer, ObserverWindow(samples, first, 1), believed, steady, deepest=1)[0]
-    columns = best.hypothesis.columns
-    if not best.fits or not columns or best.probability < CONVINCING or best.onset_std == 0.0:
+    if (flows := whitening.flows) is not None:  # learnt again, from the same readings
+        earlier = replace(flows, learnt=flows.learnt[:0], by_constants=flows.by_constants[:0])
+        whitening = replace(whitening, flows=earlier)
+    observer = ObserverBank(network, space, noise.gain, whitening, step, noise.constants)
+    window = ObserverWindow(samples, observer.first_state(samples, believed)[0], 1)
+    ranked = isolate(observer, window, believed, sudden, deepest=1)
+    prior = Prior(observer.space.names, len(sudden))
+    ranked = with_flows_of_window(observer, window, believed, ranked, prior)[1]
+    likeliest = next(f for f in ranked if f.hypothesis.columns)
+    if sum(f.probability for f in ranked if f.hypothesis.columns) < CONVINCING:
         return []
-    p, size, error = space.parameters[columns[0]], float(best.value[columns[0]]), float(best.std[columns[0]])
-    if abs(size - p.nominal) < SIGNIFICANT * error:
-        return []
-    fault = Explanation(best.probability, (size_of(p, size, error),)).text
-    since = f"since {best.onset:.0f} s, probability {percent_text(best.probability)}"
+    [column] = likeliest.hypothesis.columns
+    size = size_of(observer.space.parameters[column], float(likeliest.value[column]), float(likeliest.std[column]))
+    fault = Explanation(likeliest.probability, (size,)).text
+    since = f"since {likeliest.onset:.0f} s, probability {percent_text(likeliest.probability)}"
     return [f"{fault} {since}, explains the part taken for fault-free: {QUESTION}"]
 
 
@@ -114,13 +109,3 @@ def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -
         return text
     higher = 100.0 * (detector.threshold / detector.design.longer(VERY_LONG).threshold - 1.0)
     return f"{text}; the fault-free part is short, so that the threshold is {higher:.2g} % higher: lengthen fault_free"
-
-
-def noise_std_from_differences(readings: Tensor) -> Tensor:
-    """Standard deviation (sensors,) of the noise of readings (S, sensors), from their second differences.
-
-    The second difference of white noise with variance 1 has variance 6; that of a slow signal is negligible. NaN
-    readings are ignored.
-    """
-    second_difference = readings[2:] - 2.0 * readings[1:-1] + readings[:-2]
-    return second_difference.square().nanmean(dim=0).div(6.0).sqrt()

@@ -81,6 +81,7 @@ def _likeliest(
     derivatives (S, sensors, P) by the errors of constants. The search begins at the best of these correlation times,
     in sampling intervals, and that of `start`.
     """
+    segments = [segment for segment in segments if len(segment[0])]
     linear, (free, by_constants) = start.linear, map(torch.cat, zip(*segments, strict=True))
     count, tanks = len(free), len(start.start_std)
     fresh, by_levels = torch.zeros(count, dtype=torch.bool), free.new_zeros(*free.shape, len(segments) * tanks)

@@ -92,11 +92,12 @@ def with_flows_of_window(
     """The fits repeated with random flows that are learnt from the window too, because a short fault-free part leaves
     them uncertain.
 
-    First, the hypotheses are fitted again with the flows that are most likely under the likeliest one, apart from those
-    that are far from plausible with their previous values, both with the earlier flows and with these. Then the
+    First, the hypotheses are fitted again with the flows that are most likely under the likeliest change, apart from
+    those that are far from plausible with their previous values, both with the earlier flows and with these. Then the
     evidence of each plausible hypothesis is raised by the log-likelihood that flows learnt under it add.
     """
-    observer, _ = observer.learning_from(window, believed, changes_of(ranked[:1]))
+    likeliest = next(f for f in ranked if f.hypothesis.columns)
+    observer, _ = observer.learning_from(window, believed, changes_of([likeliest]))
     base = observer.white_innovations(window, believed, no_change(believed))
     blocks = observer.in_blocks(window, changes_of(ranked))
     misfits = torch.cat([0.5 * observer.white_innovations(window, believed, b).square().sum((1, 2)) for b in blocks])

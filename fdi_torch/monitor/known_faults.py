@@ -105,15 +105,12 @@ def updated_tracks(
         if column not in fit.hypothesis.columns:
             tracks += [earlier] if earlier else []
             continue
-        now = state.now, float(state.believed[column]), float(fit.std[column])
+        now, onset = (state.now, float(state.believed[column]), float(fit.std[column])), (fit.onset, fit.onset_std)
+        track = FaultTrack(column, change.number, *onset, now, now, effect_rms(column), state.now)
         if earlier is not None and earlier.number == change.number:
-            start = (fit.onset, float(change.before[column]), 0.0) if fit.hypothesis.incipient else earlier.first
-            moved = replace(earlier, onset=fit.onset, onset_std=fit.onset_std)
-            tracks.append(replace(moved, first=start, last=now, effect_rms=effect_rms(column)))
-            continue
-        start = (fit.onset, float(change.before[column]), 0.0) if fit.hypothesis.incipient else now
-        onset, effect = (fit.onset, fit.onset_std), effect_rms(column)
-        tracks.append(FaultTrack(column, change.number, *onset, start, now, effect, state.now))
+            track = replace(track, first=earlier.first, announced=earlier.announced, adjusted=earlier.adjusted)
+        start = fit.onset, float(change.before[column]), 0.0
+        tracks.append(replace(track, first=start) if fit.hypothesis.incipient else track)
     return replace(state, tracks=tuple(tracks))
 
 

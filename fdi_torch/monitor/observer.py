@@ -115,13 +115,11 @@ class Observer:
         self._expect_shape(network)
 
     def run(self, samples: Samples, levels: Tensor | None = None) -> Observation:
-        """Run along recordings. levels (*batch, tanks): initial levels; from the first readings if None."""
+        """Run along recordings with the same inputs. levels (*batch, tanks): from the first readings if None."""
         network = self.stepper.network
         lanes = self._lanes(samples)
         if levels is None:
             levels = initial_levels(network, samples, self.values)
-        if samples.inputs.dim() > 2:
-            return self._one_by_one(samples, levels.expand(*lanes, -1))
         flat = lanes.numel()
         readings = samples.readings
         if samples.batch:
@@ -139,12 +137,6 @@ class Observer:
         residual = (readings - ran.expected).reshape(*lanes, len(samples), -1)
         state = ran.state.reshape(*lanes, len(samples), -1)
         return Observation(samples.time, state, residual, self.gain.spread(0, len(samples)))
-
-    def _one_by_one(self, samples: Samples, levels: Tensor) -> Observation:
-        """Run recordings with different inputs one after the other."""
-        seen = [self.run(samples.member(i), level) for i, level in enumerate(levels)]
-        state, residual = torch.stack([s.state for s in seen]), torch.stack([s.residual for s in seen])
-        return Observation(samples.time, state, residual, seen[0].inflation)
 
     def _gains(self, count: int, lanes: torch.Size) -> Tensor:
         """Gains (S, order, sensors), or (L, S, order, sensors) if they differ by batch member."""

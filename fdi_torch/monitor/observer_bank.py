@@ -118,7 +118,7 @@ class ObserverBank:
 
     def white_innovations(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> Tensor:
         """White innovations (L, S, sensors); zero where a reading, or one that the whitening needs, is missing."""
-        white = self._as_if_exact(window, believed, changes)
+        white = self._white(window, self.run(window, believed, changes)[1])
         if not self.constants.columns:
             return white
         directions, shares, known = self._of_constants(window, believed)
@@ -131,11 +131,8 @@ class ObserverBank:
         bank.constants, bank._errors = constants, None
         return bank
 
-    def _as_if_exact(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> Tensor:
-        """The white innovations if all constants are exact."""
-        return self._white(window, self.run(window, believed, changes)[1])
-
     def _white(self, window: ObserverWindow, residual: Tensor) -> Tensor:
+        """The white innovations of residuals if all constants are exact."""
         white = self.whitening.of_innovations(self.whitening.innovations(residual, window.number, window.memory)[0])
         white[:, : self.whitening.order] = 0.0
         return torch.nan_to_num(white, nan=0.0)

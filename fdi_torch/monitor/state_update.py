@@ -78,14 +78,7 @@ def advance_observer(observer: ObserverBank, state: MonitorState, samples: Sampl
 
 def adopt_change(observer: ObserverBank, state: MonitorState, change: DetectedChange, believed: Tensor) -> MonitorState:
     """Run the observer again from the change's onset with new parameters (P,), and restart the detector."""
-    fit = change.best
-    state = replace(state, change=change, pending=None)
-    return _adopt(observer, state, believed, change.before, fit)
-
-
-def adopt_sizes(observer: ObserverBank, state: MonitorState, fit: HypothesisFit) -> MonitorState:
-    """Run the observer again from the fit's onset with new sizes of the known faults."""
-    return _adopt(observer, state, fit.value, state.believed, fit)
+    return adopt(observer, replace(state, change=change, pending=None), believed, change.before, change.best)
 
 
 def beside_deviation(state: MonitorState) -> MonitorState:
@@ -93,16 +86,15 @@ def beside_deviation(state: MonitorState) -> MonitorState:
     return replace(state, detector_memory=None, errors=state.errors.with_unknown_deviation())
 
 
-def _adopt(
+def adopt(
     observer: ObserverBank, state: MonitorState, believed: Tensor, before: Tensor, fit: HypothesisFit
 ) -> MonitorState:
     """Run the observer again from the onset of a change from `before` to `believed`, and restart the detector."""
     window = state.window(fit.onset)
     first, known = len(state.samples) - len(window), _known_columns(observer, believed, state.healthy)
-    past, time = _innovations_before(observer, state, first), state.errors.correlation_time
-    sizes = _size_errors(state, believed, known, fit)
-    known_state = window.state, state.memory[first - 1], past
-    errors = LawErrors.at_start(known, time, *known_state, sizes, state.errors.constants)
+    at_onset = window.state, state.memory[first - 1], _innovations_before(observer, state, first)
+    sizes, before_onset = _size_errors(state, believed, known, fit), state.errors
+    errors = LawErrors.at_start(known, before_onset.correlation_time, *at_onset, sizes, before_onset.constants)
     state = replace(state, believed=believed, errors=errors, detector_memory=None)
     return _run(observer, state, window, before, fit.onset, fit.hypothesis.incipient)
 
