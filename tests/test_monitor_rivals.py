@@ -64,7 +64,7 @@ def test_the_summary_of_a_growing_fault_has_its_size_at_the_last_report_and_its_
     [summary] = watch.close(state)
     last = [event for event in events if event.faults][-1]
     assert summary.growing and summary.sizes == last.sizes and summary.onset_std == last.onset_std
-    assert "leak at T3 (size 0.0" in summary.text and "; changes by 0.7" in summary.text
+    assert "leak at T3 (size 0.0" in summary.text and "; size changes by 0.7" in summary.text
 
 
 def test_the_summary_of_a_fault_that_has_gone_names_it_without_a_size() -> None:

@@ -16,7 +16,7 @@ from fdi_torch.monitor.events import (
     Kind,
     Size,
     headline,
-    rate_text,
+    rates_text,
     shares_text,
     size_of,
 )
@@ -65,10 +65,7 @@ class EventWriter:
         interval = float(torch.diff(state.samples.time).median())
         if best.onset - state.reachable <= max(2.0 * best.onset_std, interval):
             text += ", where the observer starts: it may have been there before"
-        rates = [rate_text(self.space[s.name], s.rate) for s in explanations[0].sizes if s.rate is not None]
-        text += f"; grows by {', '.join(rates)}" if rates else ""
-        if best.misfit_ratio > 1.0:
-            text += "; does not explain all of the residual"
+        text += rates_text(explanations[0].sizes, self.space) + _unexplained_text(best)
         faulty = [f for f in fits if f.hypothesis.columns]
         horizon, lookback = FORECAST_WINDOWS * self.settings.longest, self.settings.lookback
         generator = torch.Generator().manual_seed(change.number)  # the draws depend on the alarm's number only
@@ -169,6 +166,8 @@ class EventWriter:
             likeliest, *rivals = alarm.explanations
             explanations = (self._tracks_explanation(state, tracks, likeliest.mass), *rivals)
             faults = self._tracks_text(explanations, tracks)
+        if state.change is not None and state.change.number == alarm.number:
+            faults += _unexplained_text(state.change.best)
         if alarm.count > 1:
             times = f"raised {alarm.count} times, {alarm.first:g} s to {alarm.last:g} s"
         else:
@@ -224,8 +223,7 @@ class EventWriter:
     def _tracks_text(self, explanations: Sequence[Explanation], tracks: Sequence[FaultTrack]) -> str:
         """The explanations, the likeliest of which consists of known faults, with the onset and growth of these."""
         since = ", ".join(dict.fromkeys(_onset_text(t) for t in tracks))
-        rates = [rate_text(self.space[s.name], s.rate) for s in explanations[0].sizes if s.rate is not None]
-        return f"{headline(explanations)}, {since}" + (f"; changes by {', '.join(rates)}" if rates else "")
+        return f"{headline(explanations)}, {since}{rates_text(explanations[0].sizes, self.space)}"
 
     def _event(self, state: MonitorState, kind: Kind, text: str, alarm: Alarm | None = None, **more: object) -> Event:
         off = (state.believed != state.healthy).nonzero().flatten().tolist()
@@ -241,6 +239,10 @@ class EventWriter:
 def _at_any_time(explanation: Explanation, first: float, last: float) -> Explanation:
     """The explanation with an onset at any time between two, s: mean and standard deviation."""
     return replace(explanation, onset=0.5 * (first + last), onset_std=(last - first) / 12.0**0.5)
+
+
+def _unexplained_text(fit: HypothesisFit) -> str:
+    return "; does not explain all of the residual" if fit.misfit_ratio > 1.0 else ""
 
 
 def _onset_text(change: HypothesisFit | FaultTrack, growing: bool = False) -> str:

@@ -11,7 +11,7 @@ from fdi_torch.amounts import amount_words, estimate_words, parameter_words, siz
 from fdi_torch.clock import clock_text
 from fdi_torch.estimate.uncertainty import end_reached, plain_value
 from fdi_torch.monitor.alarm_state import State
-from fdi_torch.parameters import Parameter, ParameterName
+from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace
 from fdi_torch.quantities import display_unit, quantity_text, significant
 
 Kind = Literal[
@@ -249,11 +249,17 @@ def size_of(p: Parameter, size: float, std: float, rate: float | None = None) ->
     return Size(p.name, end, math.inf, p.unit, shown, at_end=True)
 
 
-def rate_text(p: Parameter, rate: float) -> str:
-    """'1.2 cm per hour', or per day for slow changes."""
-    unit, scale = display_unit(p.unit, p.name)
-    span, name = (3600.0, "hour") if abs(rate) * 86400.0 > abs(p.high - p.low) * 0.01 else (86400.0, "day")
-    return f"{scale * rate * span:.3g} {unit} per {name}".replace("  ", " ")
+def rates_text(sizes: Sequence[Size], space: ParameterSpace) -> str:
+    """'; bias changes by 1.2 cm per hour' for the sizes that grow, or per day for slow changes; each with its fault if
+    there are several."""
+    words = []
+    for s in (s for s in sizes if s.rate is not None):
+        p, rate, (unit, scale) = space[s.name], s.rate or 0.0, display_unit(s.unit, s.name)
+        span, name = (3600.0, "hour") if abs(rate) * 86400.0 > abs(p.high - p.low) * 0.01 else (86400.0, "day")
+        change = f"{significant(scale * rate * span, 3)} {unit}".rstrip()
+        whose = f" of {parameter_words(s.name)}" if len(sizes) > 1 else ""
+        words.append(f"; {ParameterName.parse(s.name).field}{whose} changes by {change} per {name}")
+    return "".join(words)
 
 
 def shares_text(shares: Sequence[tuple[str, float]]) -> str:

@@ -48,12 +48,16 @@ def isolate(
     outside = [f.size for f in unlisted]
     counts = len(faults) * len(manners), len(outside) * len(manners)
     prior = Prior(observer.space.names, counts[0], growth_times, outside, counts[1])
-    plain = [Hypothesis((f.size,), late) for late in manners for f in (*faults, *unlisted) if not f.shape]
+    plain, others = (
+        [Hypothesis((f.size,), late) for late in manners for f in group if not f.shape] for group in (faults, unlisted)
+    )
     oscillating = [Hypothesis(f.columns, shape=f.shape) for f in faults if f.shape]
     base = observer.white_innovations(window, believed, no_change(believed))
+    single_starts, pairs = signature_guesses(observer, window, believed, plain, base, len(faults))
     starts = torch.cat(
         [
-            signature_guesses(observer, window, believed, plain, base),
+            single_starts,
+            signature_guesses(observer, window, believed, others, base)[0],
             *(oscillation_guess(observer, window, believed, h, base) for h in oscillating),
         ]
     )
@@ -63,22 +67,27 @@ def isolate(
     earlier = [f for f in earlier if f.hypothesis.columns]
     if earlier:
         starts = torch.cat([starts, torch.stack([point_of(f) for f in earlier])])
-    hypotheses = [*plain, *oscillating, *recoveries, *(f.hypothesis for f in earlier)]
+    hypotheses = [*plain, *others, *oscillating, *recoveries, *(f.hypothesis for f in earlier)]
     fits = _best_of_each(fit(observer, window, believed, hypotheses, starts, misfit(base), prior))
     # Where nothing fits, the law of the plant or of a known fault is wrong: no evidence for a cause outside the list.
     fits = [f for f in fits if f.fits or f.hypothesis.columns[0] not in outside]
-    for _ in range(1, deepest):
+    for depth in range(2, deepest + 1):
         best = [f for f in fits if f.hypothesis.count < deepest and f.hypothesis.columns[0] not in outside][:2]
         origin = {b.hypothesis.with_fault(f): b for b in best for f in faults if f.size not in b.hypothesis.columns}
         wider = [h for h in origin if h not in {f.hypothesis for f in fits}]
+        points = [point_of(origin[h]) for h in wider]
+        # Two faults may mask each other, so that neither is among the best alone.
+        for pair, start in pairs if depth == 2 else ():
+            wider.append(pair)
+            points.append(start)
         if not wider:
             break
         # The best fits continue as well: otherwise the gain of further iterations would count as evidence for the
         # additional fault.
-        origin |= {b.hypothesis: b for b in best}
         wider += [b.hypothesis for b in best]
-        starts = torch.stack([point_of(origin[h]) for h in wider])
-        fits = _best_of_each([*fits, *fit(observer, window, believed, wider, starts, misfit(base), prior)])
+        points += [point_of(b) for b in best]
+        wider_fits = fit(observer, window, believed, wider, torch.stack(points), misfit(base), prior)
+        fits = _best_of_each([*fits, *wider_fits])
     ranked = with_posterior([*fits, no_change_fit(observer, window, believed, base)])
     if flows and ranked[0].hypothesis.columns and ranked[0].fits:
         observer, ranked = with_flows_of_window(observer, window, believed, ranked, prior)
@@ -144,6 +153,7 @@ def _best_of_each(fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
 
 
 ONSETS = 24  # candidate onsets in a window; the fit then varies the onset continuously
+COLLINEAR = 1e-6  # share of a signature's square that another one leaves; below, rounding decides their sizes
 TRIAL_SIZE = 0.02  # fault size for signatures, as a share of the parameter's range
 OSCILLATION_PERIODS, OSCILLATION_ONSETS = 32, 6  # candidates for an oscillation
 ALL_SETS = 4  # with more known faults than this, not every set of them is tried for recovery
@@ -198,40 +208,84 @@ def _onsets(window: ObserverWindow, count: int) -> Tensor:
 
 
 def signature_guesses(
-    observer: ObserverBank, window: ObserverWindow, believed: Tensor, hypotheses: Sequence[Hypothesis], base: Tensor
-) -> Tensor:
-    """Values and onset (H, P+1) at which each hypothesis' signature matches the residual best.
+    observer: ObserverBank,
+    window: ObserverWindow,
+    believed: Tensor,
+    hypotheses: Sequence[Hypothesis],
+    base: Tensor,
+    most: int = 0,
+) -> tuple[Tensor, list[tuple[Hypothesis, Tensor]]]:
+    """Values and onset (H, P+1) at which each hypothesis' signature matches the residual best; and the pairs of these
+    changes, `most` at most, that together match it best, each with values and onset (P+1,).
 
     Generalised likelihood ratio over faults and onsets (Willsky & Jones 1976): the signature is the change of the
     innovations by a small fault, scaled by least squares. It is computed for ONSETS onsets and shifted in time for the
-    samples between them, because a jump of a reading shows in a few samples only. base (1, S, sensors): white
-    innovations without a change.
+    samples between them, because a jump of a reading shows in a few samples only; pairs begin at one of the ONSETS.
+    hypotheses: of one column each. base (1, S, sensors): white innovations without a change.
     """
     if not hypotheses:
-        return believed.new_zeros(0, len(believed) + 1)
-    onsets = _onsets(window, ONSETS)
-    theta = believed.repeat(len(hypotheses), ONSETS, 1)
-    move = TRIAL_SIZE * observer.space_width()
-    for i, hypothesis in enumerate(hypotheses):
-        for c in hypothesis.columns:
-            theta[i, :, c] += _inward(observer, believed, c, float(move[c]))
-    late = torch.tensor([h.incipient for h in hypotheses]).repeat_interleave(ONSETS)
-    changes = ChangeHypotheses(theta.flatten(0, 1), onsets.repeat(len(hypotheses)), late)
+        return believed.new_zeros(0, len(believed) + 1), []
+    onsets, count = _onsets(window, ONSETS), len(hypotheses)
+    columns = torch.tensor([h.columns[0] for h in hypotheses])
+    rows, width = torch.arange(count), TRIAL_SIZE * observer.space_width()
+    move = believed.new_tensor([_inward(observer, believed, c, float(width[c])) for c in columns.tolist()])
+    theta = believed.repeat(count, 1)
+    theta[rows, columns] += move
+    late = torch.tensor([h.incipient for h in hypotheses])
+    changes = ChangeHypotheses(theta.repeat(ONSETS, 1), onsets.repeat_interleave(count), late.repeat(ONSETS))
     reach = len(window) // (2 * ONSETS) + 1  # samples to half-way between two onsets
-    parts = [
-        _matches(base - observer.white_innovations(window, believed, part), base, reach)
-        for part in observer.in_blocks(window, changes)
-    ]
-    match, power = (torch.cat(rows).reshape(len(hypotheses), -1) for rows in zip(*parts, strict=True))
+    matches, scores, grams = [], [], []
+    for block in observer.in_blocks(window, changes, even=count):
+        shape = base - observer.white_innovations(window, believed, block)
+        matches.append(_matches(shape, base, reach))
+        signatures = shape.flatten(1).unflatten(0, (-1, count))
+        grams.append(signatures @ signatures.mT)
+        scores.append(signatures @ base.flatten())
+    match, power = (
+        torch.cat(x).unflatten(0, (ONSETS, count)).transpose(0, 1).flatten(1) for x in zip(*matches, strict=True)
+    )
     best = (match**2 / power).argmax(dim=1)
-    rows, nearest, shift = torch.arange(len(hypotheses)), best // (2 * reach + 1), best % (2 * reach + 1) - reach
-    scale = (match / power)[rows, best].unsqueeze(-1)
-    value = believed + (theta[rows, nearest] - believed) * scale
+    nearest, shift = best // (2 * reach + 1), best % (2 * reach + 1) - reach
     space = observer.search_space(believed)
     low, high = space.low(believed), space.high(believed)
+    value = theta.clone()
+    value[rows, columns] = believed[columns] + move * (match / power)[rows, best]
     interval = (window.samples.time[-1] - window.samples.time[0]) / len(window)
     onset = (onsets[nearest] + shift * interval).clamp(window.samples.time[0], window.samples.time[-2])
-    return torch.cat([value.clamp(low, high), onset.unsqueeze(-1)], dim=-1)
+    singles = torch.cat([value.clamp(low, high), onset.unsqueeze(-1)], dim=-1)
+
+    if not most:
+        return singles, []
+    size, gain = _joint_sizes(torch.cat(grams), torch.cat(scores))
+    final = believed[columns] + move * size  # (ONSETS, H, H): value of the column's hypothesis beside the row's
+    inside = (final >= low[columns]) & (final <= high[columns])
+    possible = torch.triu(columns.unsqueeze(1) != columns, diagonal=1) & (late.unsqueeze(1) == late)
+    gain = torch.where(inside & inside.mT & possible, gain, 0.0)
+    gain, begin = gain.max(dim=0)
+    pairs = []
+    for flat in gain.flatten().argsort(descending=True)[:most].tolist():
+        i, j = divmod(flat, count)
+        if gain[i, j] > 0.0:
+            start = torch.cat([believed, onsets[begin[i, j]][None]])
+            start[columns[i]], start[columns[j]] = final[begin[i, j], j, i], final[begin[i, j], i, j]
+            both = tuple(sorted((*hypotheses[i].columns, *hypotheses[j].columns)))
+            pairs.append((replace(hypotheses[i], columns=both), start))
+    return singles, pairs
+
+
+def _joint_sizes(gram: Tensor, score: Tensor) -> tuple[Tensor, Tensor]:
+    """Least squares on two signatures at a time. gram (K, H, H), score (K, H): products of the signatures with each
+    other and with the residual.
+
+    Returns the size of each signature beside each other one, (K, H beside, H), and the reduction of the sum of squares
+    by both, (K, H, H); 0 where two are nearly collinear.
+    """
+    strength = torch.diagonal(gram, dim1=1, dim2=2)
+    determinant = strength.unsqueeze(2) * strength.unsqueeze(1) - gram**2
+    separable = determinant > COLLINEAR * strength.unsqueeze(2) * strength.unsqueeze(1)
+    size = strength.unsqueeze(2) * score.unsqueeze(1) - gram * score.unsqueeze(2)
+    size = torch.where(separable, size / determinant, 0.0)
+    return size, size * score.unsqueeze(1) + (size * score.unsqueeze(1)).mT
 
 
 def _matches(shape: Tensor, base: Tensor, reach: int) -> tuple[Tensor, Tensor]:
