@@ -30,9 +30,9 @@ def estimate_section(material: Material) -> Section | None:
         return None
     names, units = [str(name) for name in final["names"]], final.get("units") or [""] * len(final["names"])
     rows = []
-    for name, unit, value, std in zip(names, units, final["values"], final["std"], strict=True):
-        cells = estimate_cells(name, str(unit), float(value), float(std))
-        rows.append([name, _finding(material, name), *cells, _simulated(material, str(unit), (name,), (1.0,))])
+    for i, name in enumerate(names):
+        cells = estimate_cells(name, str(units[i]), float(final["values"][i]), float(final["std"][i]))
+        rows.append([name, _finding(material, name), *cells, _simulated(material, str(units[i]), (name,), (1.0,))])
     for c in combinations_of(material, "combinations"):
         deviates = c in combinations_of(material, "not_isolated") and not material.unexplained
         found = tag("span", "present", class_="bad") if deviates else ""
