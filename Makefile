@@ -19,7 +19,7 @@ EXTRAS := test$(if $(COMPILER),,$(comma)compiler)
 .PHONY: run test slow longest mutants lint paper docs lowest clean
 
 run: $(STAMP)
-	$(BIN)/python -m fdi_torch train
+	$(BIN)/python -m fdi_torch.train
 
 test: $(STAMP)
 	$(TESTS)

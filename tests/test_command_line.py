@@ -496,6 +496,13 @@ def test_access_to_a_live_job_is_stated(host: str, alone: bool) -> None:
     assert ("only users of this machine" in access_text(host)) is alone
 
 
+def test_training_is_also_a_module() -> None:
+    """`python -m fdi_torch.train` is the main job of the project, with the options of `fdi train`."""
+    line = [sys.executable, "-m", "fdi_torch.train", "--help"]
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == cli.DONE and done.stdout.startswith("usage: fdi train") and "--config" in done.stdout
+
+
 def with_streams(words: str, redirections: str) -> subprocess.CompletedProcess[str]:
     line = f"set -o pipefail; {sys.executable} -m fdi_torch {words} {redirections}"
     return subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=False, timeout=120)
