@@ -64,6 +64,10 @@ class Topics:
             channel, log_time = self.register.channel(topic, fields, message, units), log_time_of(t)
             self.put([(channel, log_time, log_time, self.register.take_numbers(topic), data)])
 
+    def samples(self, topic: str, time: Any, values: Any, names: Sequence[str], units: Sequence[str]) -> None:
+        """Write a whole signal, values (T, N) over time (T,), one message per sample."""
+        self.recording_blocks([(topic, as_array(values), names, units, None, None)], as_array(time))
+
     def recording(
         self,
         time: Any,

@@ -89,7 +89,7 @@ def test_waiting_messages_are_written_by_the_clock(tmp_path: Path) -> None:
 def test_chunks_end_anywhere_between_messages_and_attachments(tmp_path: Path, flushed: tuple[int, ...]) -> None:
     time_s = np.arange(2000.0)
     with RunLog(tmp_path / "a.mcap", "train", **FIXED) as log:
-        log.recording_blocks([("/plant/output", np.sin(time_s)[:, None], ["h1"], ["m"], None, None)], time_s)
+        log.samples("/plant/output", time_s, np.sin(time_s)[:, None], ["h1"], ["m"])
         for number in range(5000):
             log.trial(number, {"x": number**0.5})
             if number in flushed:
@@ -146,13 +146,11 @@ def test_misuse_is_told(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="expected a finite time, got nan"):
             log.write("/study/trial", {"trial": 1}, float("nan"))
         with pytest.raises(ValueError, match=r"expected values of shape \(3, 1\), got \(2, 1\)"):
-            log.recording_blocks([("/plant/output", np.zeros((2, 1)), ["h1"], ["m"], None, None)], np.arange(3.0))
+            log.samples("/plant/output", np.arange(3.0), np.zeros((2, 1)), ["h1"], ["m"])
         with pytest.raises(ValueError, match="expected a name other than t"):
-            log.recording_blocks([("/plant/output", np.zeros((2, 1)), ["t"], ["m"], None, None)], np.arange(2.0))
+            log.samples("/plant/output", np.arange(2.0), np.zeros((2, 1)), ["t"], ["m"])
         with pytest.raises(ValueError, match="expected finite times"):
-            log.recording_blocks(
-                [("/plant/output", np.zeros((2, 1)), ["h1"], ["m"], None, None)], np.array([0, np.nan])
-            )
+            log.samples("/plant/output", np.array([0.0, np.nan]), np.zeros((2, 1)), ["h1"], ["m"])
         with pytest.raises(ValueError, match="expected the time as argument, got it among the fields"):
             log.trial(0, {"t": 1.0})
         for name in ("wall", "non_finite"):
