@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import subprocess
 import sys
@@ -25,7 +26,7 @@ from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import LARGEST_BATCH, DelayWatch, LiveBatches
-from fdi_torch.jobs.monitor_rows import resumed_items, rows_until
+from fdi_torch.jobs.monitor_rows import LearningItems, resumed_items, rows_until
 from fdi_torch.jobs.replay import repeat_run
 from fdi_torch.live.row_buffer import Row
 from fdi_torch.logbook import RunLog, content_hash, follow, read_run, series
@@ -352,6 +353,25 @@ def test_arrivals_come_in_batches_and_with_their_errors() -> None:
             got += batch
     assert got == list(range(5))
     assert [item for batch in LiveBatches(iter("abc")) for item in batch] == ["a", "b", "c"]
+
+
+def test_what_comes_while_the_noise_is_learnt_is_kept_for_a_resumed_run(tmp_path: Path) -> None:
+    """Learning occupies the main thread, which has taken one batch only."""
+    rows: list[Row | str] = [(float(k), [1.0], [math.nan]) for k in range(50)]
+    learning, delivered = LearningItems(tmp_path / "watch.mcap"), threading.Event()
+
+    def source() -> Iterator[Row | str]:
+        yield from rows
+        delivered.set()
+        yield "connection lost"
+
+    batches = LiveBatches(learning.keeping(source(), lambda: 7.0))
+    taken = len(next(batches))
+    assert delivered.wait(10.0) and taken <= len(rows) + 1
+    items, zero = LearningItems(tmp_path / "watch.mcap").read()
+    assert str(items[: len(rows)]) == str(rows) and zero == 7.0 and learning.count >= len(rows)
+    learning.end()
+    assert not learning.path.exists() and sum(map(len, batches)) == len(rows) + 1 - taken
 
 
 def test_lateness_and_bursts_are_told_once_until_they_double() -> None:

@@ -136,24 +136,26 @@ def _follow(
     kept: where the items of a live source are until the log has them.
     """
     run = monitor.run
-    batches = LiveBatches(resumed_items(earlier, source) if rows_in(earlier) else source)
+    items = resumed_items(earlier, source) if rows_in(earlier) else source
+    batches = LiveBatches(items if kept is None else kept.keeping(items, lambda: source.origin))
     callbacks.tell(None, "waiting for samples")
-    received = batches if kept is None else kept.keeping(batches, lambda: source.origin)
-    first = _until_fault_free_part_ends(run, callbacks, received)
+    first = _until_fault_free_part_ends(run, callbacks, batches)
     zero = source.origin
     show_clock([zero])
     monitor.learn(fault_free_recording(rows_in(first), run))
     if zero is not None:
         monitor.log_origin(zero)
-    delay_watch = DelayWatch(time.monotonic)
+    delay_watch, processed = DelayWatch(time.monotonic), 0
     for batch in chain([first], batches):
         rows = rows_in(batch)
         notices = delay_watch.received([row[0] for row in rows]) if rows else []
         if monitor.process_items([*notices, *batch]):
             delay_watch.clock_jumped()
-        if kept is not None and batch is first:
+        processed += len(batch)
+        if kept is not None and processed >= kept.count:
             monitor.log.flush()
-            kept.remove()
+            kept.end()
+            kept = None
         if rows:
             monitor.process_items(delay_watch.processed(rows[-1][0]))
             callbacks.tell(

@@ -5,6 +5,7 @@ the samples and events in a monitor's log.
 from __future__ import annotations
 
 import math
+import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -181,14 +182,15 @@ def event_fields(event: Event) -> dict[str, Any]:
 
 
 class LearningItems:
-    """What a live source has delivered while a monitor learns, in a file beside the log, which begins with what was
-    learnt: a run that is killed while it learns, which may take hours, can be resumed.
+    """What a live source delivers while a monitor learns, which may take hours, in a file beside the log: a run that is
+    killed before the log has these items can be resumed.
 
-    Each line is a batch: time 0 of the source, s since 1970 or null, and its items.
+    Each line is time 0 of the source, s since 1970 or null, and a list of items. count: items delivered so far.
     """
 
     def __init__(self, log: Path) -> None:
         self.path = log.with_name(f"{log.name}.learning")
+        self.count, self._ended, self._writing = 0, False, threading.Lock()
 
     def read(self) -> tuple[list[Row | str], float | None]:
         """All items, and time 0; nothing without a file. A line that a killed run has not finished is left out."""
@@ -196,24 +198,31 @@ class LearningItems:
         if self.path.exists():
             with suppress(orjson.JSONDecodeError):
                 for line in self.path.read_bytes().splitlines():
-                    zero, batch = orjson.loads(line)
+                    zero, some = orjson.loads(line)
                     origin = zero if origin is None else origin
-                    items += [item if isinstance(item, str) else _without_null(*item) for item in batch]
+                    items += [item if isinstance(item, str) else _without_null(*item) for item in some]
         return items, origin
 
-    def keeping(
-        self, batches: Iterator[list[Row | str]], origin: Callable[[], float | None]
-    ) -> Iterator[list[Row | str]]:
-        """The batches, each added to the file before it is passed on. origin: time 0 of the source."""
+    def keeping(self, items: Iterator[Row | str], origin: Callable[[], float | None]) -> Iterator[Row | str]:
+        """The items, each added to the file before it is passed on, until `end`; to be read by the thread that reads
+        the source, because learning occupies the other one. origin: time 0 of the source."""
         known = len(self.read()[0])  # a resumed run begins with them
-        for batch in batches:
-            with named_errors(self.path), self.path.open("ab") as file:
-                file.write(orjson.dumps([origin(), batch[known:]]) + b"\n")
-            known = max(known - len(batch), 0)
-            yield batch
+        for item in items:
+            with self._writing:
+                self.count += 1
+                if self.count > known and not self._ended:
+                    with named_errors(self.path), self.path.open("ab") as file:
+                        file.write(orjson.dumps([origin(), [item]]) + b"\n")
+            yield item
+
+    def end(self) -> None:
+        """Keep nothing more, and remove the file, since the log has its items."""
+        with self._writing:
+            self._ended = True
+            self.remove()
 
     def remove(self) -> None:
-        """Remove the file, once the log has its items."""
+        """Remove the file of an earlier run."""
         self.path.unlink(missing_ok=True)
 
 
