@@ -53,7 +53,8 @@ def isolate(
     )
     oscillating = [Hypothesis(f.columns, shape=f.shape) for f in faults if f.shape]
     base = observer.white_innovations(window, believed, no_change(believed))
-    single_starts, pairs = signature_guesses(observer, window, believed, plain, base, len(faults))
+    most_pairs = len(faults) if deepest > 1 else 0
+    single_starts, pairs = signature_guesses(observer, window, believed, plain, base, most_pairs)
     starts = torch.cat(
         [
             single_starts,
