@@ -202,8 +202,11 @@ def test_noise_and_evidence_of_a_discrepancy_refer_to_one_trajectory(
     about = DiscrepancyRegression(fitter, fit, (), LevelFilter(noise)).linearised
     likely = estimate_disturbances(fitter, fit, about, start=noise, climb=False)
     under = with_disturbances(fitter, fit, likely.noise, about)
-    least = -0.5 * under.log_det + likely.noise.log_prior() - 0.5 * least_chi_square(under, fit, about)
-    assert likely.log_likelihood == pytest.approx(least, abs=1e-2)
+    scale, root, _ = under.priors(fit.space, fit.theta)
+    design = (under.white(about)[1][0] * scale).flatten(0, 1)
+    of_parameters = float(torch.linalg.slogdet(design.T @ design + torch.diag(root**2))[1])
+    squares = least_chi_square(under, fit, about) + of_parameters + under.log_det
+    assert likely.log_likelihood == pytest.approx(likely.noise.log_prior() - 0.5 * squares, abs=1e-2)
 
 
 def test_the_thresholds_of_a_relay_are_found_between_those_of_the_grid() -> None:
