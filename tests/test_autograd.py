@@ -145,6 +145,34 @@ def test_another_solver_gives_the_engine_s_levels(hold: str, interval: str) -> N
     assert float((levels - played.outputs).abs().max()) < 1e-6
 
 
+@pytest.mark.parametrize("effect", [{}, {"link.pipe_inertia": 5.0}, {"link.pipe_inertia": 5.0, "A.leak": 0.3}])
+@pytest.mark.parametrize("start", [None, 0.2])
+def test_an_ode_starts_where_simulate_does(start: float | None, effect: dict[str, float]) -> None:
+    """The levels of a tank without start level, and the states of effects, show in the readings of the first second."""
+    plant = fdi_torch.Plant(
+        tanks=[
+            fdi_torch.Tank("A", area="200 cm^2", height="60 cm"),
+            fdi_torch.Tank("B", area="300 cm^2", height="60 cm", start_level=start),
+        ],
+        pipes=[
+            fdi_torch.Pipe("link", "A", "B", area="0.6 cm^2", discharge_coefficient=0.6),
+            fdi_torch.Pipe("drain", "B", "outside", area="0.9 cm^2", discharge_coefficient=0.6),
+        ],
+        pumps=[fdi_torch.Pump("Q", "A", max_flow="6 l/min")],
+        sensors=[fdi_torch.Sensor("hA", "A"), fdi_torch.Sensor("hB", "B")],
+    )
+    faults = {name: f"{value} m" if "inertia" in name else value for name, value in effect.items()}
+    steps = {"steps": [["0 s", "3 l/min"], ["20 s", "5 l/min"]]}
+    played = fdi_torch.simulate(plant, inputs={"Q": steps}, duration="40 s", sample_time="1 s", faults=faults)
+    ode = plant.ode(played, effect)
+    torch.testing.assert_close(ode.start[:2], played.outputs[0], rtol=0.0, atol=1e-9)
+    levels = torchdiffeq.odeint(
+        ode, ode.start, played.time, rtol=1e-8, atol=1e-10, options={"jump_t": played.time[1:-1]}
+    )
+    assert float((levels[:, :2] - played.outputs).abs().max()) < 1e-5
+    assert float(plant.ode(played, effect | {"A.start_level": 0.31}).start[0]) == 0.31
+
+
 def test_an_ode_takes_constant_inputs_functions_and_batches() -> None:
     plant = load_plant("three_tank")
     inputs = torch.tensor([50e-6, 50e-6], dtype=torch.float64)
