@@ -126,6 +126,18 @@ class Draws(Shown):
             "warnings": list(self.warnings),
         }
 
+    def to_xarray(self) -> Any:
+        """An xarray.Dataset (extra `xarray`): one variable per parameter in SI, and `log_posterior`, over `chain` and
+        `draw`.
+        """
+        axes = ("chain", "draw")
+        variables: dict[str, Any] = {
+            name: (axes, self.values[..., i].cpu().numpy(), {"units": unit})
+            for i, (name, unit) in enumerate(zip(self.names, self.units, strict=True))
+        }
+        variables["log_posterior"] = (axes, self.log_posterior.cpu().numpy())
+        return needed("xarray").Dataset(variables)
+
     def to_arviz(self) -> Any:
         """An xarray.DataTree by ArviZ: posterior, sample_stats, observed_data and, where present, log_likelihood."""
         groups: dict[str, dict[str, Any]] = {

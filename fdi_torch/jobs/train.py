@@ -108,6 +108,10 @@ class TrainResult(Shown):
         assert drawn is not None
         return drawn
 
+    def to_arviz(self) -> Any:
+        """The draws that the run asked for, as `Estimate.to_arviz`; those of `sample` have a method of their own."""
+        return self.estimate.to_arviz()
+
     def to_xarray(self, recording: int = 0) -> Any:
         """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI."""
         return self.fitting.recordings[recording].compared(self.result.predicted[recording])
