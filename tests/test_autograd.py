@@ -247,6 +247,26 @@ def test_an_engine_prints_what_it_simulates(kind: str) -> None:
     assert f"columns of theta: {', '.join(names)}" in shown
 
 
+@pytest.mark.parametrize(
+    ("step", "text"),
+    [(10.0, "steps of 10 s"), (7.0, "steps of 5 s"), (4.0, "steps of 3.33 s"), (25.0, "steps of 20 s")],
+)
+def test_an_engine_says_the_step_that_it_takes(step: float, text: str) -> None:
+    """A step ends at every sample and switch, every 10 s and 20 s here; the given one is the longest allowed."""
+    inputs = {"Q1": {"steps": [["0 s", "50 cm^3/s"], ["20 s", "70 cm^3/s"]]}, "Q2": "40 cm^3/s"}
+    played = fdi_torch.simulate("three_tank", inputs=inputs, duration="40 s", sample_time="10 s")
+    (engine,) = fdi_torch.set_up("three_tank", played, ["T1.leak"], "equilibrium").engines(step)
+    assert f", {text}" in repr(engine)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_theta_of_either_precision_is_taken_and_a_wrong_one_is_shown_its_own(dtype: torch.dtype) -> None:
+    engine = engine_of("compiled")
+    assert engine.readings(THETA.to(dtype)).dtype == dtype
+    with pytest.raises(ValueError, match=rf"got {dtype} of shape \(1, 1\); write .*, dtype={dtype}\)"):
+        engine.readings(torch.zeros(1, 1, dtype=dtype))
+
+
 @pytest.mark.parametrize("kind", ["reference", "compiled"])
 def test_an_onset_at_a_sample_has_the_slope_of_a_later_one(kind: EngineKind) -> None:
     """Two steps meet there; the shift of the onset must not count in both."""
