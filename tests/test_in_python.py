@@ -154,6 +154,17 @@ def simulated(**faults: Any) -> Recording:
     return fdi_torch.simulate(RIG, inputs=STEPS, duration="300 s", noise=noise, faults=faults, seed=3)
 
 
+def test_a_plant_file_keeps_the_units_of_quantities_in_code() -> None:
+    """Whatever unit another quantity of that kind was given in first; a changed component has none of its own."""
+    weir = fdi_torch.Weir("over", "A", "B", crest="45 cm", width="30 mm")
+    plant = in_code(tanks=[Tank("A", area="0.1 m^2", height="1 m"), Tank("B", area=0.03, height="2 ft")], weirs=[weir])
+    written = plant_mapping(plant)
+    assert written["weirs"]["over"] | {"crest": "45 cm", "width": "30 mm"} == written["weirs"]["over"]
+    assert written["tanks"]["B"]["height"] == "2 ft" and written["sensors"]["p"]["offset"] == "2 mbar"
+    moved = plant_mapping(replace(plant, weirs=(replace(weir, crest=0.4),)))
+    assert moved["weirs"]["over"]["crest"] == "0.4 m" and plant == build_plant(written, Source("plant"))
+
+
 def test_every_job_takes_a_run_as_a_mapping_or_a_file(tmp_path: Path) -> None:
     """One run for all: simulate it, then gap, predict and refit of what it simulates equal those of the recording."""
     recording = simulated(**{"A.leak": 0.3})
