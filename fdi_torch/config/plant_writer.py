@@ -105,15 +105,19 @@ def _given(**fields: Any) -> dict[str, Any]:
 
 
 def _shares(values: dict[str, float]) -> dict[str, str | float]:
-    """Relative tolerances in one style: all as '3 %', or all as bare numbers if some would not read back exactly."""
+    """Relative tolerances as text: all in per cent, such as '3 %'. If rounding makes one of these texts read back as
+    another number than it was written from, all are written as plain numbers instead.
+    """
     percents = {n: f"{100.0 * v:.9g} %" for n, v in values.items()}
     exact = all(parse_quantity(percents[n], "1") == v for n, v in values.items())
     return {n: percents[n] if exact else v for n, v in values.items()}
 
 
 def _text(value: float, unit: str, name: str = "") -> str | float:
-    """'160 cm^2': the unit for display, or else the first customary unit, in which the number is short, at least
-    `SMALLEST`, and reads back exactly. A number that is short in none has as many digits as it needs.
+    """A quantity as text, such as '160 cm^2', that reads back as exactly the same value.
+
+    The unit is the one for display if the number in it has at most 9 digits and is at least `SMALLEST`, else the first
+    customary unit for which that holds. If it holds for none, the number gets as many digits as it needs.
     """
     if unit == "1":
         return value
