@@ -21,13 +21,18 @@ LONGEST, LARGEST = 5e9, 1e12
 class Recording(Shown):
     """Commands and readings of a rig, on one clock.
 
-    time (T,), s: strictly increasing. inputs (T, M) and outputs (T, N): in the SI units `input_units`, `output_units`.
-    mask (T, N): True for valid readings; a missing reading is NaN in outputs and False here. An unknown input is NaN;
-    `known_segments` cuts the recording there. hold: course of the inputs between samples. began: time 0 as seconds
-    since 1970, if known. zone: of the file's clock, s ahead of UTC. notes: corrections by the reader, as sentences.
-    ran: inputs that were, or may have been, on before the first sample, according to the recording from which this one
-    was cut. trusted: whether checks for wrong units, swapped channels and clock errors are skipped. written: the unit
-    of each channel, and of the time `t`, in its file.
+    - time (T,), s: strictly increasing.
+    - inputs (T, M), outputs (T, N): in the SI units `input_units` and `output_units`. An unknown input is NaN, and
+      `known_segments` cuts the recording there.
+    - mask (T, N): True for valid readings. A missing reading is False here and NaN in outputs.
+    - hold: course of the inputs between samples, held or linear.
+    - source, sha256: name and hash of the file; a recording in memory has no hash.
+    - ran: inputs that were, or may have been, on before the first sample, known where this recording was cut from a
+      longer one.
+    - notes: corrections that the reader of the file made, one sentence each.
+    - began: time 0 in seconds since 1970, if known. zone: how far the file's clock is ahead of UTC, s.
+    - trusted: whether the checks for wrong units, swapped channels and clock errors are skipped.
+    - written: the units in which the file has each channel, and the time `t`.
     """
 
     time: torch.Tensor

@@ -60,6 +60,7 @@ DOORS = {
     "scipy": (
         "recordings/matlab.py",
         "blind/statistics.py",
+        "estimate/ridge_coordinates.py",
         "estimate/state_noise.py",
         "gap/free_runs/between_runs.py",
         "gap/localization/fine_positions.py",

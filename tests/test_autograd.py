@@ -145,6 +145,34 @@ def test_another_solver_gives_the_engine_s_levels(hold: str, interval: str) -> N
     assert float((levels - played.outputs).abs().max()) < 1e-6
 
 
+@pytest.mark.parametrize("effect", [{}, {"link.pipe_inertia": 5.0}, {"link.pipe_inertia": 5.0, "A.leak": 0.3}])
+@pytest.mark.parametrize("start", [None, 0.2])
+def test_an_ode_starts_where_simulate_does(start: float | None, effect: dict[str, float]) -> None:
+    """The levels of a tank without start level, and the states of effects, show in the readings of the first second."""
+    plant = fdi_torch.Plant(
+        tanks=[
+            fdi_torch.Tank("A", area="200 cm^2", height="60 cm"),
+            fdi_torch.Tank("B", area="300 cm^2", height="60 cm", start_level=start),
+        ],
+        pipes=[
+            fdi_torch.Pipe("link", "A", "B", area="0.6 cm^2", discharge_coefficient=0.6),
+            fdi_torch.Pipe("drain", "B", "outside", area="0.9 cm^2", discharge_coefficient=0.6),
+        ],
+        pumps=[fdi_torch.Pump("Q", "A", max_flow="6 l/min")],
+        sensors=[fdi_torch.Sensor("hA", "A"), fdi_torch.Sensor("hB", "B")],
+    )
+    faults = {name: f"{value} m" if "inertia" in name else value for name, value in effect.items()}
+    steps = {"steps": [["0 s", "3 l/min"], ["20 s", "5 l/min"]]}
+    played = fdi_torch.simulate(plant, inputs={"Q": steps}, duration="40 s", sample_time="1 s", faults=faults)
+    ode = plant.ode(played, effect)
+    torch.testing.assert_close(ode.start[:2], played.outputs[0], rtol=0.0, atol=1e-9)
+    levels = torchdiffeq.odeint(
+        ode, ode.start, played.time, rtol=1e-8, atol=1e-10, options={"jump_t": played.time[1:-1]}
+    )
+    assert float((levels[:, :2] - played.outputs).abs().max()) < 1e-5
+    assert float(plant.ode(played, effect | {"A.start_level": 0.31}).start[0]) == 0.31
+
+
 def test_an_ode_takes_constant_inputs_functions_and_batches() -> None:
     plant = load_plant("three_tank")
     inputs = torch.tensor([50e-6, 50e-6], dtype=torch.float64)
@@ -217,6 +245,26 @@ def test_an_engine_prints_what_it_simulates(kind: str) -> None:
     shown = repr(engine)
     assert shown.startswith(f"{kind} engine: ") and f"{samples} samples" in shown
     assert f"columns of theta: {', '.join(names)}" in shown
+
+
+@pytest.mark.parametrize(
+    ("step", "text"),
+    [(10.0, "steps of 10 s"), (7.0, "steps of 5 s"), (4.0, "steps of 3.33 s"), (25.0, "steps of 20 s")],
+)
+def test_an_engine_says_the_step_that_it_takes(step: float, text: str) -> None:
+    """A step ends at every sample and switch, every 10 s and 20 s here; the given one is the longest allowed."""
+    inputs = {"Q1": {"steps": [["0 s", "50 cm^3/s"], ["20 s", "70 cm^3/s"]]}, "Q2": "40 cm^3/s"}
+    played = fdi_torch.simulate("three_tank", inputs=inputs, duration="40 s", sample_time="10 s")
+    (engine,) = fdi_torch.set_up("three_tank", played, ["T1.leak"], "equilibrium").engines(step)
+    assert f", {text}" in repr(engine)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_theta_of_either_precision_is_taken_and_a_wrong_one_is_shown_its_own(dtype: torch.dtype) -> None:
+    engine = engine_of("compiled")
+    assert engine.readings(THETA.to(dtype)).dtype == dtype
+    with pytest.raises(ValueError, match=rf"got {dtype} of shape \(1, 1\); write .*, dtype={dtype}\)"):
+        engine.readings(torch.zeros(1, 1, dtype=dtype))
 
 
 @pytest.mark.parametrize("kind", ["reference", "compiled"])

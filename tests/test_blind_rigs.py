@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -26,7 +26,7 @@ from fdi_torch.blind.laws_tank import STORAGE_LAWS, TANK_LAWS
 from fdi_torch.blind.named_effects import DRAWS, NominalRun, draw_effect
 from fdi_torch.blind.places import EFFECTS, canonical, effect_places
 from fdi_torch.blind.plants import Rig, Scales, cascaded_tanks, on_bench, quadruple_tank, three_tank
-from fdi_torch.blind.sensor_noise import NoiseCorrelation, autoregressive, rippling, smoothed
+from fdi_torch.blind.sensor_noise import DRAWN, LONGEST, NoiseCorrelation, autoregressive, rippling, smoothed
 from fdi_torch.blind.simulator import Drive, HiddenRigs, simulate
 from fdi_torch.effects import build_network
 from fdi_torch.parameters import ParameterSpace
@@ -206,6 +206,30 @@ def test_mean_squares_of_coloured_noise_scatter_as_said(colour: NoiseCorrelation
     squares = np.mean(colour.noise(np.random.default_rng(3), samples, np.ones(runs)) ** 2, axis=0)
     assert squares.mean() == pytest.approx(1.0, rel=0.01)
     assert squares.std() == pytest.approx(np.sqrt(2 * colour.repeats / samples), rel=0.06)
+
+
+@pytest.mark.parametrize("draw", [draw for _, draw in DRAWN], ids=range(len(DRAWN)))
+def test_each_correlation_that_is_drawn_has_the_size_and_the_correlation_that_it_declares(
+    draw: Callable[[np.random.Generator], NoiseCorrelation],
+) -> None:
+    """Of 200,000 readings, with the standard error of a correlation of such noise (Bartlett, 1946)."""
+    samples, std = 200_000, np.array([0.3, 2.0])
+    for seed in range(3):
+        colour = draw(np.random.default_rng(seed))
+        assert colour.name and len(colour.kernel) <= LONGEST
+        e = colour.noise(np.random.default_rng(100 + seed), samples, std)
+        assert e.shape == (samples, 2)
+        error = np.sqrt(colour.repeats / samples)
+        np.testing.assert_allclose(e.std(axis=0), std, rtol=4 * error)
+        middle = len(colour.kernel) - 1
+        for lag in (1, 2, 5, 10, 40):
+            declared = colour.correlations[middle + lag] if lag <= middle else 0.0
+            measured = np.mean(e[lag:] * e[:-lag], axis=0) / std**2
+            np.testing.assert_allclose(measured, declared, atol=5 * error)
+
+
+def test_the_shares_of_drawn_correlations_sum_to_one() -> None:
+    assert sum(share for share, _ in DRAWN) == pytest.approx(1.0, abs=1e-12)
 
 
 TOWER, PHIAL = Scales(time=100.0, length=10.0, area=1e4), Scales(time=0.1, length=0.1, area=0.01)

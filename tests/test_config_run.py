@@ -355,6 +355,8 @@ def test_shipped_runs_on_real_data_read_their_recordings(real_data: Path, monkey
         ("simulate: {inputs: {Q1: }}", "inputs.Q1: expected a value such as .*, got nothing$"),
         ("simulate: {duration: }", "duration: expected a quantity in s, got nothing$"),
         ("simulate: {noise: {std: 1 mm}}", "noise.std: expected keys with values, as in {NAME: 1 mm}, got '1 mm'"),
+        ("estimate: {step: 10 s}", r"estimate.step: expected keys with values \(search, refine\), got '10 s'"),
+        ("estimate: {search: de}", r"estimate.search: expected keys with values \(strategy, .*\), got 'de'"),
         ("recordings: run.csv", r"recordings: expected a list, as in \[run.csv\]"),
         ("plant: {tanks: {T: {area: 1 m^2, height: 1 m}}, pipes: {P: {source: T, area: 1 cm^2, "
          "discharge_coefficient: 60}}}\nrecordings: [run.csv]", "discharge_coefficient: expected less than or equal"),

@@ -164,11 +164,12 @@ def test_cost_that_is_not_finite_never_wins(settings: EvolutionSettings) -> None
     assert not any(torch.isnan(value).any() for search in seen for value in search.state.to_dict().values())
 
 
-def scaled_costs(targets: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
-    """Problem b: Rosenbrock about its own target; problem 2 is NaN everywhere."""
+def scaled_costs(targets: Tensor, reached: Tensor | float = 0.0) -> Callable[[Tensor, Tensor], Tensor]:
+    """Problem b: Rosenbrock about its own target, less `reached[b]`; problem 2 is NaN everywhere."""
+    less = torch.as_tensor(reached, dtype=DOUBLE).expand(len(targets))
 
     def cost(x: Tensor, lanes: Tensor) -> Tensor:
-        value = rosenbrock(x - targets[lanes][:, None] + 1.0)
+        value = rosenbrock(x - targets[lanes][:, None] + 1.0) - less[lanes][:, None]
         return torch.where((lanes == 2)[:, None], math.nan, value)
 
     return cost
@@ -176,16 +177,29 @@ def scaled_costs(targets: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
 
 @ALL
 def test_problem_is_bit_equal_alone_and_among_neighbours_that_finish_or_fail(settings: EvolutionSettings) -> None:
-    settings = replace(settings, evaluations=3000, target=1.0)
+    """However fast the strategy is: problem 0 finishes with its first generation, 1 halfway, 2 fails, the others run
+    until their budget is spent.
+    """
+    settings = replace(settings, evaluations=3000)
     count = 7
     low, high = box(3.0, (count,))
     low = low - torch.arange(count, dtype=DOUBLE)[:, None] / 7
     targets = torch.linspace(-1.0, 1.0, count, dtype=DOUBLE)[:, None].expand(count, 4)
     seeds = torch.arange(100, 100 + count)
-    together = evolve(scaled_costs(targets), low, high, settings, seeds)
-    assert len(set(together.generations.tolist())) > 1
+    best: list[float] = []
+    evolve(
+        lambda x, _: scaled_costs(targets)(x, torch.tensor([1])),
+        *(low[1], high[1]),
+        *(settings, seeds[1]),
+        on_generation=lambda search: best.append(float(search.state.cost[0, 0])),
+    )
+    settings = replace(settings, target=0.0)
+    reached = torch.tensor([1e6, best[len(best) // 2] + 1e-9, *[-1.0] * (count - 2)], dtype=DOUBLE)
+    together = evolve(scaled_costs(targets, reached), low, high, settings, seeds)
+    assert together.reasons()[:3] == ["target", "target", "failed"] and "target" not in together.reasons()[3:]
+    assert together.generations[0] == 1 < together.generations[1] < together.generations[2]
     for b in range(count):
-        cost = scaled_costs(targets)
+        cost = scaled_costs(targets, reached)
         alone = evolve(lambda x, _, b=b, f=cost: f(x, torch.tensor([b])), low[b], high[b], settings, seeds[b])
         for name, value in vars(alone).items():
             assert torch.equal(value.nan_to_num(-7.0), getattr(together, name)[b].nan_to_num(-7.0)), (b, name)
@@ -207,9 +221,9 @@ def test_large_batch_on_several_threads_changes_no_bit(settings: EvolutionSettin
 
 @ALL
 def test_interrupted_search_resumes_bit_for_bit(settings: EvolutionSettings) -> None:
-    settings = replace(settings, population=50, evaluations=3000, target=1e-2)
-    targets = torch.zeros(2, 3, 4, dtype=DOUBLE)
-    flat = scaled_costs(targets.reshape(6, 4))
+    """Problem 0 finishes with its first generation, 2 fails, the others run until their budget is spent."""
+    settings = replace(settings, population=50, evaluations=3000, target=0.0)
+    flat = scaled_costs(torch.zeros(6, 4, dtype=DOUBLE), torch.tensor([1e6, *[-1.0] * 5]))
     low, high = box(3.0, (2, 3))
     whole = evolve(flat, low, high, settings, seeds=3)
     held: list[dict[str, Tensor]] = []
@@ -227,7 +241,7 @@ def test_interrupted_search_resumes_bit_for_bit(settings: EvolutionSettings) -> 
         for name, value in vars(resumed).items():
             assert torch.equal(value.nan_to_num(-7.0), getattr(whole, name).nan_to_num(-7.0)), (generation, name)
     so_far = snapshot(search)
-    assert so_far.best.shape == (2, 3, 4) and "running" in so_far.reasons()
+    assert so_far.best.shape == (2, 3, 4) and so_far.reasons()[:2] == ["target", "running"]
 
 
 def test_parents_differ_from_each_other_and_are_uniform() -> None:

@@ -154,6 +154,17 @@ def simulated(**faults: Any) -> Recording:
     return fdi_torch.simulate(RIG, inputs=STEPS, duration="300 s", noise=noise, faults=faults, seed=3)
 
 
+def test_a_plant_file_keeps_the_units_of_quantities_in_code() -> None:
+    """Whatever unit another quantity of that kind was given in first; a changed component has none of its own."""
+    weir = fdi_torch.Weir("over", "A", "B", crest="45 cm", width="30 mm")
+    plant = in_code(tanks=[Tank("A", area="0.1 m^2", height="1 m"), Tank("B", area=0.03, height="2 ft")], weirs=[weir])
+    written = plant_mapping(plant)
+    assert written["weirs"]["over"] | {"crest": "45 cm", "width": "30 mm"} == written["weirs"]["over"]
+    assert written["tanks"]["B"]["height"] == "2 ft" and written["sensors"]["p"]["offset"] == "2 mbar"
+    moved = plant_mapping(replace(plant, weirs=(replace(weir, crest=0.4),)))
+    assert moved["weirs"]["over"]["crest"] == "0.4 m" and plant == build_plant(written, Source("plant"))
+
+
 def test_every_job_takes_a_run_as_a_mapping_or_a_file(tmp_path: Path) -> None:
     """One run for all: simulate it, then gap, predict and refit of what it simulates equal those of the recording."""
     recording = simulated(**{"A.leak": 0.3})
@@ -625,6 +636,32 @@ def test_trajectories_become_labelled_arrays() -> None:
     run = fdi_torch.predict(RIG, recording).to_xarray()
     residual = run["measured"] - run["predicted"]
     assert float(abs(residual - run["residual"]).max()) == 0.0 and str(run["unit"].values[0]) == "m"
+
+
+def test_an_estimate_becomes_a_labelled_array(tmp_path: Path) -> None:
+    pytest.importorskip("xarray")
+    found = fdi_torch.train(RIG, simulated(), ["A.leak"], output={"folder": str(tmp_path)})
+    table, estimate = found.estimate.to_xarray(), found.estimate
+    one = table.sel(parameter="A.leak.size")
+    assert float(one["value"]) == float(estimate.value[0]) and str(one["unit"].values) == "1"
+    assert float(one["high"] - one["value"]) == pytest.approx(1.96 * float(one["std"]), rel=1e-3)
+    same = table["covariance"].sel(parameter="A.leak.size", other="A.leak.size")
+    assert float(same) == pytest.approx(float(one["std"]) ** 2)
+
+
+def test_a_refit_predicts_hold_outs() -> None:
+    """The area of the drain in the plant file is wrong by 10 %: the refitted plant predicts another run better."""
+    wrong = replace(RIG, tolerances={"drain.area": 0.2})
+    wrong = replace(wrong, pipes=tuple(replace(p, area=1.1 * p.area) if p.name == "drain" else p for p in wrong.pipes))
+    noise = {"std": {"h": "1 mm"}}
+    fitted, other = simulated(), fdi_torch.simulate(RIG, inputs={"Q": "4 l/min"}, duration="200 s", noise=noise, seed=7)
+    calibration = fdi_torch.refit(wrong, fitted, other)
+    (trial,) = calibration.trials
+    assert trial.refitted["h"] < 0.5 * trial.as_is["h"]
+    assert trial.as_is["h"] == fdi_torch.predict(wrong, other).prediction.rmse["h"]
+    assert not fdi_torch.refit(wrong, fitted).trials
+    with pytest.raises(ValueError, match="expected a hold-out other than the recording"):
+        fdi_torch.refit(wrong, fitted, holdouts=[fitted])
 
 
 def test_a_library_that_is_not_there_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:

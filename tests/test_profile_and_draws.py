@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from fdi_torch.estimate.levenberg_marquardt import levenberg_marquardt
 from fdi_torch.estimate.linearisation import Linearisation
 from fdi_torch.estimate.posterior_draws import Draws, draw_posterior
 from fdi_torch.estimate.profile import Profile, profile_likelihood
+from fdi_torch.estimate.ridges import ridge_coordinates
 from fdi_torch.estimate.uncertainty import Estimate, make_estimate
 from fdi_torch.parameters import Parameter, ParameterSpace
 
@@ -42,9 +44,10 @@ class LeastSquares:
     def profile(self, name: str, confidence: float = 0.95) -> Profile:
         return profile_likelihood(self.linearise, self.space, self.fit()[0], [name], confidence)[0]
 
-    def draws(self, **settings: int) -> Draws:
+    def draws(self, **settings: Any) -> Draws:
         estimate, information = self.fit()
-        return draw_posterior(self.cost, self.space, estimate.value, information, **settings)
+        coordinates = ridge_coordinates(self.linearise, self.space, estimate.value, information)
+        return draw_posterior(self.cost, self.space, estimate.value, information, coordinates=coordinates, **settings)
 
 
 DESIGN = torch.tensor([[1.0, 0.2], [0.3, 1.5], [0.7, 0.7], [-0.4, 1.1]], dtype=DOUBLE)
@@ -191,6 +194,50 @@ def test_draws_fill_the_ridge_where_the_standard_error_is_undetermined() -> None
         # Standard error of a share from the effective number of draws.
         below = float((draws.values[..., 0] <= quantile).double().mean())
         assert below == pytest.approx(share, abs=4.0 * math.sqrt(share * (1 - share) / float(draws.ess_bulk[0])))
+
+
+def test_draws_follow_a_curved_ridge_that_is_hundreds_of_times_as_long_as_wide() -> None:
+    """c is known within 3 %, c (1 - d) within 0.01 %: the marginal density of c is its prior divided by c."""
+    pytest.importorskip("emcee")
+    space = ParameterSpace([Parameter("c", "1", 0.6, 0.06, 6.0), Parameter("d", "1", 0.1, -1.0, 1.0)])
+    problem = LeastSquares(
+        lambda t: torch.stack((1e4 * (t[..., 0] * (1.0 - t[..., 1]) / 0.48 - 1.0), (t[..., 0] - 0.6) / 0.018), -1),
+        space,
+    )
+    draws = problem.draws(draws=4000)
+    assert draws.converged and draws.steps <= 4000
+    c = torch.linspace(0.5, 0.7, 20_001, dtype=DOUBLE)
+    density = torch.exp(-0.5 * ((c - 0.6) / 0.018) ** 2) / c
+    distribution = (density / density.sum()).cumsum(0)
+    for share in (0.025, 0.5, 0.975):
+        below = float((draws.values[..., 0] <= float(c[int((distribution >= share).nonzero()[0])])).double().mean())
+        assert below == pytest.approx(share, abs=4.0 * math.sqrt(share * (1 - share) / float(draws.ess_bulk[0])))
+    product = draws.values[..., 0] * (1.0 - draws.values[..., 1])
+    assert float(product.std()) == pytest.approx(0.48e-4, rel=0.1)
+
+
+def test_ridge_coordinates_are_undone_exactly_and_have_the_information_of_their_gradient() -> None:
+    problem = ridge(1e-4)
+    estimate, information = problem.fit()
+    straight = ridge_coordinates(problem.linearise, problem.space, estimate.value, information)
+    assert len(straight.along) == 1
+    theta = torch.tensor([[0.5, 0.1], [0.7, 0.3], [0.39, 1.2]], dtype=DOUBLE)
+    torch.testing.assert_close(straight.theta(straight.phi(theta)), theta, rtol=0.0, atol=1e-12)
+    phi = straight.phi(estimate.value)
+    columns = [(straight.theta(phi + e) - straight.theta(phi - e)) / 2e-6 for e in 1e-6 * torch.eye(2, dtype=DOUBLE)]
+    jacobian = torch.stack(columns, -1)
+    assert float(torch.linalg.det(jacobian)) == pytest.approx(1.0, abs=1e-6)
+    expected = jacobian.mT @ information @ jacobian
+    difference = (straight.information(estimate.value, information) - expected).abs().max()
+    assert float(difference) < 1e-5 * float(information.abs().max())
+
+
+def test_draws_tell_the_share_of_the_steps_allowed_and_end_at_one() -> None:
+    pytest.importorskip("emcee")
+    told: list[tuple[float, str]] = []
+    linear().draws(draws=100, most_steps=1000, tell=lambda share, text: told.append((share, text)))
+    assert [share for share, _ in told[:3]] == pytest.approx([0.1, 0.2, 0.3]) and told[-1][0] == 1.0
+    assert all(f"{round(1000 * share)} steps" in text for share, text in told[:-1])
 
 
 def test_draws_that_have_not_converged_say_so() -> None:

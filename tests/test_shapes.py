@@ -28,6 +28,7 @@ RUN = (
     "test_uncertainty.py",
     "test_levenberg_marquardt.py",
     "test_state_noise.py",
+    "test_profile_and_draws.py::test_ridge_coordinates_are_undone_exactly_and_have_the_information_of_their_gradient",
     "test_shade.py",
     "test_step_control.py::test_sums_are_those_of_readings_and_jacobian",
     "test_step_control.py::test_a_lane_depends_on_no_neighbour",

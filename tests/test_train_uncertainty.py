@@ -44,7 +44,10 @@ def test_profiles_and_draws_of_a_run_agree_with_its_standard_errors(tmp_path: Pa
     assert draws is not None and draws.converged and draws.values.shape[-1] == 2
     assert float(draws.values[..., 0].std()) == pytest.approx(std, rel=0.25)
     assert float(draws.values[..., 1].max()) <= 1.0
-    tree = estimate.to_arviz()
+    tree = done.to_arviz()
+    labelled = draws.to_xarray()
+    assert labelled.sizes == {"chain": draws.values.shape[0], "draw": draws.values.shape[1]}
+    assert labelled["T1.leak.size"].values.mean() == pytest.approx(float(draws.values[..., 0].mean()), rel=1e-12)
     assert tree["posterior"]["T1.leak.size"].shape == draws.values.shape[:2]
     assert tree["observed_data"]["h1"].shape == (101,)
     total = sum(tree["log_likelihood"][name].sum(f"{name}_sample") for name in ("h1", "h2", "h3"))

@@ -219,7 +219,7 @@ class SimulatedRun:
 
 
 def simulate(rigs: HiddenRigs, drives: Sequence[Drive], step: float = STEP) -> list[SimulatedRun]:
-    """Runs all rigs together, a drive each.
+    """Simulate all rigs at once; drives[i] holds the inputs, initial levels and disturbances of rig i.
 
     Raises ValueError where a second is not a whole number of steps.
     """

@@ -39,7 +39,9 @@ STEPS = {
     "validate": "Validate the methods",
     "use": "Use elsewhere",
 }
-"""Headings of the overview in order. Each file of `cli/options` names the one of its command as `STEP`."""
+"""Headings of the list of commands that `fdi` prints, in order, by key. The constant `STEP` of each file in
+`cli/options` is the key of the heading under which its command is listed.
+"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

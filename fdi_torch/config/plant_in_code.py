@@ -118,7 +118,7 @@ class Plant(PlantDescription):
         inputs: Inputs,
         theta: Mapping[str, float | torch.Tensor] | None = None,
     ) -> PlantOde:
-        """dh/dt = f(t, h) of this plant, for `torchdiffeq.odeint`; `.start` holds the start levels.
+        """dh/dt = f(t, h) of this plant, for `torchdiffeq.odeint`; `.start` is the state at which `simulate` starts.
 
         inputs: a `Recording`, constant inputs (channels,) in SI, or a function of t in s to these. theta: parameters
         that differ from their nominal values, by name in SI, each a number or a tensor (*batch), through which

@@ -36,7 +36,9 @@ def dump_plant(plant: AnyPlant) -> str:
 
 
 def plant_mapping(plant: PlantDescription) -> dict[str, Any]:
-    """The description as the mapping that `build_plant` reads, in the plant's units where these are exact."""
+    """The description as the mapping that `build_plant` reads: quantities as text given in code, such as '45 cm', and
+    others in the plant's units where these are exact.
+    """
     with displayed_in(plant.units):
         data: dict[str, Any] = {"name": plant.name, "gravity": f"{plant.gravity!r} m/s^2"}
         data["tanks"] = {t.name: _component_mapping(t) for t in plant.tanks}
@@ -69,23 +71,26 @@ def _component_mapping(component: Component) -> dict[str, Any]:
             unit = getattr(component, f.metadata["unit_field"])
         is_default = value == f.default and unit in ("", "1", f.metadata.get("unit"))
         if not is_default:
-            mapping[f.name] = _text(value, unit, f"{component.name}.{f.name}") if unit else value
+            text = component.written.get(f.name) or (
+                _text(value, unit, f"{component.name}.{f.name}") if unit else value
+            )
+            mapping[f.name] = text
     return mapping
 
 
 def _sensor_mapping(sensor: Sensor) -> dict[str, Any]:
     gain_unit = next(gain for gain, unit in READING_UNITS.items() if unit == sensor.unit)
 
-    def reading(value: float | None) -> str | float | None:
-        return None if value is None else _text(value, sensor.unit)
+    def text(field: str, value: float | None, unit: str) -> str | float | None:
+        return None if value is None else sensor.written.get(field) or _text(value, unit)
 
     return _given(
         tank=sensor.tank,
-        gain=None if sensor.gain == 1.0 and sensor.unit == "m" else _text(sensor.gain, gain_unit),
-        offset=reading(sensor.offset) if sensor.offset else None,
+        gain=None if sensor.gain == 1.0 and sensor.unit == "m" else text("gain", sensor.gain, gain_unit),
+        offset=text("offset", sensor.offset, sensor.unit) if sensor.offset else None,
         channel=sensor.channel,
-        low=reading(sensor.low),
-        high=reading(sensor.high),
+        low=text("low", sensor.low, sensor.unit),
+        high=text("high", sensor.high, sensor.unit),
     )
 
 
@@ -100,15 +105,19 @@ def _given(**fields: Any) -> dict[str, Any]:
 
 
 def _shares(values: dict[str, float]) -> dict[str, str | float]:
-    """Relative tolerances in one style: all as '3 %', or all as bare numbers if some would not read back exactly."""
+    """Relative tolerances as text: all in per cent, such as '3 %'. If rounding makes one of these texts read back as
+    another number than it was written from, all are written as plain numbers instead.
+    """
     percents = {n: f"{100.0 * v:.9g} %" for n, v in values.items()}
     exact = all(parse_quantity(percents[n], "1") == v for n, v in values.items())
     return {n: percents[n] if exact else v for n, v in values.items()}
 
 
 def _text(value: float, unit: str, name: str = "") -> str | float:
-    """'160 cm^2': the unit for display, or else the first customary unit, in which the number is short, at least
-    `SMALLEST`, and reads back exactly. A number that is short in none has as many digits as it needs.
+    """A quantity as text, such as '160 cm^2', that reads back as exactly the same value.
+
+    The unit is the one for display if the number in it has at most 9 digits and is at least `SMALLEST`, else the first
+    customary unit for which that holds. If it holds for none, the number gets as many digits as it needs.
     """
     if unit == "1":
         return value

@@ -124,9 +124,12 @@ def _sentence(finding: Any, known: Mapping[str, str]) -> str:
         meaning = known.get(".".join(map(str, finding["loc"])), "")
         example = "" if "as in [" in meaning else f", as in [{values}]"
         return f"expected a list{example}, got {shown(given)}" + (f" ({meaning})" if meaning else "")
-    if finding["type"] in ("dict_type", "model_type"):
+    if finding["type"] in ("dict_type", "model_type", "dataclass_type"):
         given = finding["input"]
         example = f", as in {{NAME: {given}}}" if finding["type"] == "dict_type" and isinstance(given, str) else ""
+        inside = ".".join([*map(str, finding["loc"]), ""])
+        keys = [path.removeprefix(inside) for path in known if path.startswith(inside) and "NAME." not in path]
+        example = example or (f" ({', '.join(k for k in keys if '.' not in k)})" if keys else "")
         return f"expected keys with values{example}, got {shown(given)}"
     if finding["type"] == "too_long":
         return (

@@ -88,8 +88,10 @@ class Fitting:
 
     @on_its_device
     def engines(self, step: float) -> list[Engine]:
-        """A simulation engine for each recording, with its samples, in steps of at most `step` s.
+        """A simulation engine for each recording, with its samples, in equal steps of at most `step` s between samples.
 
+        Each engine's repr says its step: a sampling interval of 10 s makes 5 s of 7 s. A step longer than that interval
+        ends where inputs switch, and the readings within it are interpolated.
         Raises ValueError if step <= 0.
         """
         numbers = range(len(self.recordings))

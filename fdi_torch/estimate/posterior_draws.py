@@ -3,7 +3,8 @@
 The posterior is exp(-f) within the bounds, f being the negative log-likelihood with the Gaussian priors of the space;
 within the bounds a parameter without standard deviation has a flat prior. All walkers of half the ensemble are
 one batch of the likelihood. Moves: differential evolution and snooker (ter Braak and Vrugt 2008), in the proportion 4:1
-that the documentation of emcee advises for distributions with several modes.
+that the documentation of emcee advises for distributions with several modes. They move along straight lines, hence in
+the coordinates `RidgeCoordinates`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from fdi_torch.estimate.ridge_coordinates import UNCHANGED, RidgeCoordinates
 from fdi_torch.estimate.strategy import reflected
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.progress import Tell, silent
@@ -28,6 +30,8 @@ from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
 LARGEST_R_HAT, SMALLEST_SIZE = 1.01, 400.0
 # Steps before the first test of convergence; the number doubles until the test passes.
 FIRST_STEPS = 500
+# Steps between two reports of progress.
+TOLD_EVERY = 100
 # Largest number of values for which the log-likelihood of each reading is computed: 80 MB.
 MOST_POINTWISE = 10_000_000
 
@@ -73,8 +77,9 @@ class Draws(Shown):
         return (
             f"the draws have not converged after {self.steps} steps: R-hat {float(self.r_hat[worst]):.3f} of "
             f"{self.names[worst]} (expected at most {LARGEST_R_HAT:g}), effective sample size "
-            f"{float(self._smallest_size.min()):.0f} (expected at least {SMALLEST_SIZE:g}); allow more steps, or give "
-            "the parameters that are not determined a narrower range or a prior",
+            f"{float(self._smallest_size.min()):.0f} (expected at least {SMALLEST_SIZE:g}); allow more steps, take the "
+            "intervals of the profile likelihoods instead, or give the parameters that are not determined a narrower "
+            "range or a prior",
         )
 
     @property
@@ -122,6 +127,18 @@ class Draws(Shown):
             "warnings": list(self.warnings),
         }
 
+    def to_xarray(self) -> Any:
+        """An xarray.Dataset (extra `xarray`): one variable per parameter in SI, and `log_posterior`, over `chain` and
+        `draw`.
+        """
+        axes = ("chain", "draw")
+        variables: dict[str, Any] = {
+            name: (axes, self.values[..., i].cpu().numpy(), {"units": unit})
+            for i, (name, unit) in enumerate(zip(self.names, self.units, strict=True))
+        }
+        variables["log_posterior"] = (axes, self.log_posterior.cpu().numpy())
+        return needed("xarray").Dataset(variables)
+
     def to_arviz(self) -> Any:
         """An xarray.DataTree by ArviZ: posterior, sample_stats, observed_data and, where present, log_likelihood."""
         groups: dict[str, dict[str, Any]] = {
@@ -142,6 +159,7 @@ def draw_posterior(
     start: Tensor,
     information: Tensor,
     *,
+    coordinates: RidgeCoordinates = UNCHANGED,
     draws: int = 1000,
     seed: int = 0,
     most_steps: int = 16_000,
@@ -150,9 +168,11 @@ def draw_posterior(
     """Draw from exp(-cost) within the bounds of the space until the draws have converged, or for `most_steps` steps.
 
     cost(candidates (L, N, P), lanes (L,)) -> (L, N): negative log-likelihood with priors, such as `Problem.cost`. start
-    (P,), information (P, P): the estimate and the Fisher information there, from which the walkers start. draws: number
-    of draws that are kept, at least (the chains are thinned to it). The result repeats for a seed. Raises ImportError
-    without the extra `draws`, and ValueError for a parameter that is neither determined nor has a range.
+    (P,), information (P, P): the estimate and the Fisher information there, from which the walkers start. coordinates:
+    those of `ridges.ridge_coordinates` make draws from a narrow curved ridge many times faster. draws: number of draws
+    that are kept, at least (the chains are thinned to it). tell(share, text): the share of `most_steps`. The result
+    repeats for a seed. Raises ImportError without the extra `draws`, and ValueError for a parameter that is neither
+    determined nor has a range.
     """
     if draws < 1 or most_steps < 4:
         raise ValueError(f"expected at least 1 draw and 4 steps, got {draws} and {most_steps}; ask for more")
@@ -161,7 +181,7 @@ def draw_posterior(
     lane = torch.zeros(1, dtype=torch.int64, device=start.device)
 
     def log_posterior(walkers: np.ndarray) -> np.ndarray:
-        theta = torch.from_numpy(np.ascontiguousarray(walkers)).to(start)
+        theta = coordinates.theta(torch.from_numpy(np.ascontiguousarray(walkers)).to(start))
         inside = ((theta >= low) & (theta <= high)).all(-1)
         values = theta.new_full((len(theta),), -math.inf)
         if bool(inside.any()):
@@ -169,21 +189,26 @@ def draw_posterior(
         return torch.where(torch.isnan(values), -math.inf, values).cpu().numpy()
 
     random = np.random.RandomState(seed % 2**32)
-    walkers = first_walkers(space, start, information, random)
+    walkers = first_walkers(space, start, information, random, coordinates)
     moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)]
     sampler = emcee.EnsembleSampler(*walkers.shape, log_posterior, vectorize=True, moves=moves)
-    state, steps = emcee.State(walkers, random_state=random.get_state()), 0
+    state, steps, mixing = emcee.State(walkers, random_state=random.get_state()), 0, ""
     while True:
         more = max(min(max(FIRST_STEPS, steps), most_steps - steps), 1)
-        state = sampler.run_mcmc(state, more)
-        steps += more
-        chains = torch.from_numpy(sampler.get_chain(discard=steps // 2)).transpose(0, 1).contiguous()
+        for sampled in sampler.sample(state, iterations=more):
+            state, steps = sampled, steps + 1
+            if steps % TOLD_EVERY == 0:
+                tell(steps / most_steps, f"draws: {steps} steps{mixing}")
+        phi = torch.from_numpy(sampler.get_chain(discard=steps // 2))
+        chains = coordinates.theta(phi.to(start)).cpu().transpose(0, 1).contiguous()
         statistics = convergence(chains)
         r_hat, *sizes = statistics
-        tell(steps / most_steps, f"draws: {steps} steps, R-hat {float(r_hat.max()):.3f}")
+        largest = f"R-hat {float(r_hat.max()):.3f}"
+        mixing = f", {largest} after {steps}"
         done = bool((r_hat <= LARGEST_R_HAT).all()) and all(bool((size >= SMALLEST_SIZE).all()) for size in sizes)
         if done or steps >= most_steps:
             break
+    tell(1.0, f"draws: {'converged' if done else 'stopped'} after {steps} steps, {largest}")
     thin = max(chains.shape[0] * chains.shape[1] // draws, 1)
     log_p = torch.from_numpy(sampler.get_log_prob(discard=steps // 2)).T
     return Draws(
@@ -200,15 +225,18 @@ def draw_posterior(
 
 
 def first_walkers(
-    space: ParameterSpace, start: Tensor, information: Tensor, random: np.random.RandomState
+    space: ParameterSpace,
+    start: Tensor,
+    information: Tensor,
+    random: np.random.RandomState,
+    coordinates: RidgeCoordinates,
 ) -> np.ndarray:
     """Walkers (M, P) about the estimate, overdispersed: normal with twice its standard errors, reflected at the bounds.
 
-    A range adds the information of a uniform distribution over it, 12 / width^2, so that undetermined directions have a
-    finite spread.
+    A range adds the information of a uniform distribution over it, so that undetermined directions have a finite
+    spread. The walkers are normal, and returned, in `coordinates`.
     """
-    width = space.high(start) - space.low(start)
-    precision = information / 4.0 + torch.diag(torch.where(torch.isfinite(width), 12.0 / width**2, 0.0))
+    precision = coordinates.information(start, information) / 4.0 + torch.diag(range_information(space, start))
     unit = precision.diagonal().rsqrt()
     scaled = precision * unit[:, None] * unit[None, :]
     factor, failed = torch.linalg.cholesky_ex(0.5 * (scaled + scaled.mT))
@@ -219,11 +247,17 @@ def first_walkers(
     count = max(32, 4 * len(space))
     normal = torch.from_numpy(random.standard_normal((len(space), count))).to(start)
     spread = torch.linalg.solve_triangular(factor.mT, normal, upper=True).T * unit
-    theta = start + spread
+    theta = coordinates.theta(coordinates.phi(start) + spread)
     # A missing bound becomes one beyond all walkers, since reflection needs the width of the box.
     low = torch.where(torch.isfinite(space.low(start)), space.low(start), theta.amin(0))
     high = torch.where(torch.isfinite(space.high(start)), space.high(start), theta.amax(0))
-    return reflected(theta, low, high).cpu().numpy()
+    return coordinates.phi(reflected(theta, low, high)).cpu().numpy()
+
+
+def range_information(space: ParameterSpace, start: Float[Tensor, " P"]) -> Float[Tensor, " P"]:
+    """Information of uniform distributions over the ranges, 12 / width^2; 0 for a parameter without range."""
+    width = space.high(start) - space.low(start)
+    return torch.where(torch.isfinite(width), 12.0 / width**2, 0.0)
 
 
 def convergence(chains: Float[Tensor, "M D P"]) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"], Float[Tensor, " P"]]:

@@ -26,7 +26,7 @@ from fdi_torch.estimate.uncertainty import Estimate, chi_square_quantile, plain_
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
 
-# Points of the first grid; a grid whose end is still inside the interval is extended, each time to twice its reach.
+# Intervals of the first grid; a grid whose end is still inside the interval is extended, each time to twice its reach.
 POINTS, MOST_EXTENSIONS = 16, 30
 # The first grid reaches this multiple of the half-width that the standard error predicts.
 FIRST_REACH = 1.25
@@ -108,18 +108,25 @@ class Profile(Shown):
 
 
 def profile_likelihood(
-    linearise: Linearise, space: ParameterSpace, estimate: Estimate, names: Iterable[str], confidence: float = 0.95
+    linearise: Linearise,
+    space: ParameterSpace,
+    estimate: Estimate,
+    names: Iterable[str],
+    confidence: float = 0.95,
+    *,
+    points: int = POINTS,
 ) -> tuple[Profile, ...]:
     """Profiles of the named parameters about an estimate.
 
     linearise: negative log-likelihood (L,) with gradient and curvature at theta (L, P), such as `Problem.linearise`.
+    points: intervals of the first grid.
     Raises ValueError for an unknown name, a confidence outside (0, 1), and a parameter without scale: an undetermined
     one that has neither a range nor a prior.
     """
     if not 0.0 < confidence < 1.0:
         raise ValueError(f"expected a confidence between 0 and 1, got {confidence:g}; write 0.95 for 95 %")
     indices = [space.index(name) for name in names]
-    return tuple(_Profiler(linearise, space, estimate, index, confidence).profile() for index in indices)
+    return tuple(_Profiler(linearise, space, estimate, index, confidence).profile(points) for index in indices)
 
 
 class _Profiler:
@@ -156,9 +163,9 @@ class _Profiler:
     def ratio(self) -> Tensor:
         return 2.0 * (self.cost - self.cost.min())
 
-    def profile(self) -> Profile:
+    def profile(self, points: int) -> Profile:
         p, centre = self.parameter, float(self.x[0])
-        offsets = self.scale * torch.linspace(-1.0, 1.0, POINTS + 1, dtype=self.x.dtype, device=self.x.device)
+        offsets = self.scale * torch.linspace(-1.0, 1.0, points + 1, dtype=self.x.dtype, device=self.x.device)
         self._fit_from_centre((centre + offsets).clamp(p.low, p.high).unique())
         for side in (-1, 1):
             self._extend(side)

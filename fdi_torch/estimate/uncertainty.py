@@ -15,7 +15,7 @@ from fdi_torch.estimate.combinations import Combination, undetermined_groups
 from fdi_torch.estimate.information import certainty
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.quantities import quantity_text
-from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
+from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
 
 if TYPE_CHECKING:
     from fdi_torch.estimate.posterior_draws import Draws
@@ -88,6 +88,17 @@ class Estimate(Shown):
                 "expected an estimate with draws, got none; set estimate.draws, or call TrainResult.sample()"
             )
         return self.draws.to_arviz()
+
+    def to_xarray(self) -> Any:
+        """An xarray.Dataset (extra `xarray`) over `parameter` in SI: value, std, low and high of the 95 % interval, and
+        covariance over `parameter` and `other`.
+        """
+        columns = dict(zip(("value", "std", "low", "high"), (self.value, self.std, *self.interval()), strict=True))
+        variables: dict[str, Any] = {name: ("parameter", column.cpu().numpy()) for name, column in columns.items()}
+        variables["covariance"] = (("parameter", "other"), self.covariance.cpu().numpy())
+        names = list(self.names)
+        coordinates = {"parameter": names, "other": names, "unit": ("parameter", list(self.units))}
+        return needed("xarray").Dataset(variables, coordinates, {"status": self.status})
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON. A number that is not finite becomes None; in `std` this means "not determined".

@@ -1,4 +1,5 @@
-"""First-order screening: which chi-square each effect of the library could explain in addition to a fit.
+"""First-order screening of effects: by how much each effect of the library, added to a fit, would reduce the fit's
+chi-square if the plant were linear about the fitted trajectory.
 
 An effect changes the level rates by w_k = f(with effect) - f(without) along the fitted trajectory (`forcing.py`). The
 size of the effect is that of a start, not a slope at zero, so that dead zones and thresholds are visible. The

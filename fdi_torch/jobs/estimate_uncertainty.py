@@ -17,6 +17,7 @@ from fdi_torch.estimate.hybrid import HybridResult
 from fdi_torch.estimate.objectives import Problem
 from fdi_torch.estimate.posterior_draws import MOST_POINTWISE, draw_posterior
 from fdi_torch.estimate.profile import Profile, profile_likelihood
+from fdi_torch.estimate.ridges import ridge_coordinates
 from fdi_torch.names import unknown
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.progress import Tell, silent
@@ -59,11 +60,11 @@ def with_draws(
         fitting.space,
         theta,
         information,
+        coordinates=ridge_coordinates(likelihood.linearise, fitting.space, theta, information),
         draws=draws,
         seed=seed,
         most_steps=most_steps,
-        # The draws follow search and refinement, which report up to 0.9.
-        tell=lambda share, text: tell(0.9 + 0.1 * (share or 0.0), text),
+        tell=tell,
     )
     observed, log_likelihood = readings_and_their_likelihood(fitting, likelihood, drawn.values.to(theta))
     drawn = replace(drawn, observed=observed, log_likelihood=log_likelihood)

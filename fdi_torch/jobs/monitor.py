@@ -133,7 +133,8 @@ def _follow(
 ) -> None:
     """Process samples as they come, after waiting for the end of the fault-free part.
 
-    kept: where the items of a live source are until the log has them.
+    kept: the file that holds the samples of a live source while the monitor learns, because the log gets them only
+    after the fault-free part has ended; a monitor that is killed before then resumes from this file.
     """
     run = monitor.run
     items = resumed_items(earlier, source) if rows_in(earlier) else source

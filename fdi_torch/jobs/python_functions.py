@@ -21,9 +21,10 @@ from fdi_torch.effects.catalogue import Catalogue
 from fdi_torch.effects.catalogue import effects as catalogue_of
 from fdi_torch.estimate.misfit import misfit_of
 from fdi_torch.gap.diagnose import Settings
-from fdi_torch.gap.free_runs.prediction import START_SAMPLES
+from fdi_torch.gap.free_runs.prediction import START_SAMPLES, left_out_run
 from fdi_torch.gap.free_runs.prediction import predict as run_freely
 from fdi_torch.gap.free_runs.refit import refit as refitted
+from fdi_torch.gap.problem import check_holdout_differs
 from fdi_torch.jobs import study as study_job
 from fdi_torch.jobs import train as train_job
 from fdi_torch.jobs.gap import library_entries, one_thread, run_gap
@@ -233,21 +234,30 @@ def predict(
 def refit(
     plant: AnyPlant | AnyRun,
     recordings: AnyRecording | Sequence[AnyRecording] | None = None,
+    holdouts: AnyRecording | Sequence[AnyRecording] = (),
     *,
     step: float | None = None,
+    start_samples: int = START_SAMPLES,
+    settle: float | None = None,
     tell: Tell = silent,
     **choices: Any,
 ) -> RefitResult:
     """Fit all constants with a tolerance and all effects of a plant to recordings, as `fdi refit` does: calibrate it.
 
     plant, recordings: without recordings, plant is a run: its file or its keys, as of `train`.
+    holdouts: recordings that both plants predict freely, `RefitResult.trials`; start_samples, settle: as of `predict`.
     step: of the simulation, s. choices: leave_out, hold, vary (names or patterns), as the options of `fdi refit`.
-    tell(share, text): as of `gap`.
+    tell(share, text): as of `gap`. Raises ValueError for a hold-out that is one of the recordings.
     """
     plant, segments = _plant_and_recordings(plant, recordings, "refit")
+    held_out = recordings_of(holdouts, plant)
+    for recording in held_out:
+        check_holdout_differs(recording, segments)
     with one_thread():
         fit = refitted(plant, segments, step=step, tell=rounded(tell), **choices)
-    return RefitResult(fit, misfit_of(fit.rmse, segments, plant), doubts_about(segments, plant))
+        trials = [left_out_run(plant, fit.plant, recording, start_samples, settle) for recording in held_out]
+    doubts = doubts_about([*segments, *held_out], plant)
+    return RefitResult(fit, misfit_of(fit.rmse, segments, plant), doubts, tuple(trials))
 
 
 def study(

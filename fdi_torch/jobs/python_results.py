@@ -11,7 +11,7 @@ from fdi_torch.amounts import effect_words
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import Misfit, misfit_of
 from fdi_torch.gap.answer import Answer, adopted
-from fdi_torch.gap.free_runs.prediction import Prediction
+from fdi_torch.gap.free_runs.prediction import LeftOutRun, Prediction
 from fdi_torch.gap.free_runs.refit import Refit, narrowed
 from fdi_torch.gap.verdict_words import MEAN_FLOW, explanation_words, verdict_sentence
 from fdi_torch.logbook import read_run
@@ -169,11 +169,13 @@ class FreeRun(Shown):
 @dataclass(frozen=True, repr=False)
 class RefitResult(Shown):
     """plant: the plant with fitted constants and effects. fit: errors, values and standard errors, SI.
-    misfit: of all recordings. doubts: what limits the trust in these, one sentence each."""
+    misfit: of all recordings. doubts: what limits the trust in these and in the hold-outs, one sentence each. trials:
+    errors (SI) of free runs along the hold-outs, of the plant as given and as refitted."""
 
     fit: Refit
     misfit: Misfit
     doubts: tuple[str, ...] = ()
+    trials: tuple[LeftOutRun, ...] = ()
 
     @property
     def plant(self) -> PlantDescription:

@@ -41,6 +41,8 @@ from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
 
 STATE = "/estimator/de/population"
 GENERATION, ITERATION = "/estimator/de/generation", "/estimator/refine/iteration"
+# Share of the progress at which draws begin: they take most of the time.
+ESTIMATED_BEFORE_DRAWS = 0.3
 
 
 @dataclass(frozen=True, repr=False)
@@ -106,6 +108,10 @@ class TrainResult(Shown):
         assert drawn is not None
         return drawn
 
+    def to_arviz(self) -> Any:
+        """The draws that the run asked for, as `Estimate.to_arviz`; those of `sample` have a method of their own."""
+        return self.estimate.to_arviz()
+
     def to_xarray(self, recording: int = 0) -> Any:
         """An xarray.Dataset (extra `xarray`) of measured, predicted and residual over time and sensor, SI."""
         return self.fitting.recordings[recording].compared(self.result.predicted[recording])
@@ -152,11 +158,16 @@ def estimate_logged(
     profiled = profiled_names(run, fitting.space)
     if config.draws:
         needed("emcee", "draws")
-    watch = SearchLogger(log, fitting.space, settings, tell)
+    until = ESTIMATED_BEFORE_DRAWS if config.draws else 1.0
+    watch = SearchLogger(log, fitting.space, settings, lambda share, text: tell(until * share, text))
     result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration, resume)
     profiles = profiles_of(fitting, result, profiled, config.confidence) if profiled else ()
     if config.draws:
-        result = with_draws(fitting, result, config.draws, run.config.seed, tell=tell)
+
+        def tell_draws(share: float, text: str) -> None:
+            tell(until + (1.0 - until) * share, text)
+
+        result = with_draws(fitting, result, config.draws, run.config.seed, tell=tell_draws)
     log_result(log, result, fitting.space, profiles, doubts)
     for k, (recording, predicted) in enumerate(zip(fitting.recordings, result.predicted, strict=True)):
         group = group_of(k, len(fitting.recordings))

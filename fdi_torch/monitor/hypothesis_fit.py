@@ -54,8 +54,8 @@ class Prior:
     def growth(self, shares: Tensor, age: float) -> float:
         """Log density of the shares of their ranges that growing faults have reached at this age (s); 0 if uniform.
 
-        share = age / T, and the time T in which a fault passes through its range is log-uniform. Where T would be
-        longer than the longest time, the density is constant.
+        share = age / T, and the time T in which a fault passes through its range is log-uniform. A smaller share, which
+        means a T beyond the longest time, has the density at the longest time.
         """
         assert self.growth_times is not None, "expected times of growth for a growing fault"
         shortest, longest = self.growth_times

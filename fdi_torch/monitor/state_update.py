@@ -82,7 +82,11 @@ def adopt_change(observer: ObserverBank, state: MonitorState, change: DetectedCh
 
 
 def beside_deviation(state: MonitorState) -> MonitorState:
-    """Restart the detector beside a deviation that no fault explains: it is steady, and of unknown size."""
+    """Restart the detector after an alarm whose deviation no fault explains.
+
+    From now on the residuals may contain a constant offset of unknown size at each sensor, which is estimated with the
+    other errors. The deviation itself therefore raises no second alarm; a further change does.
+    """
     return replace(state, detector_memory=None, errors=state.errors.with_unknown_deviation())
 
 

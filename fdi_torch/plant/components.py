@@ -99,7 +99,8 @@ class Tank(Component):
     """A tank with vertical walls: area m^2; height of the rim above the floor, m.
 
     start_level: level at t = 0, m; None for the equilibrium under the first inputs. overflow_to: the tank that
-    receives the overflow, or outside. leak_reference: the pipe or outlet whose capacity is a leak of size 1.
+    receives the overflow, or outside. leak_reference: the pipe or outlet whose capacity is a leak of size 1; None for
+    the first pipe of the plant that begins or ends at the tank (see `plant.constants.leak_pipe`).
     """
 
     name: str
@@ -109,7 +110,9 @@ class Tank(Component):
         "m", "level at t = 0, m, or equilibrium (of the first inputs)", none="equilibrium", default=None
     )
     overflow_to: str = word_field("the tank that receives the overflow", default=OUTSIDE)
-    leak_reference: str | None = word_field("the pipe whose capacity is a leak of size 1", default=None)
+    leak_reference: str | None = word_field(
+        "the pipe whose capacity is a leak of size 1; by default the first one at the tank", default=None
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -60,12 +60,14 @@ def _positive(component: str, field: str, unit: str, value: float, tolerances: d
 
 
 def leak_pipe(plant: PlantDescription, tank: str) -> Pipe:
-    """The pipe or outlet that defines a leak of size 1: the tank's `leak_reference`, or else the first one attached."""
+    """The pipe or outlet that defines a leak of size 1: the tank's `leak_reference`, else the first one that begins or
+    ends at the tank, else the plant's first one.
+    """
     reference = plant.tank(tank).leak_reference
     attached = [p for p in plant.pipes if p.name == reference or (reference is None and tank in (p.source, p.target))]
     if attached:
         return attached[0]
-    # A tank without pipes: the reference is a hole of a thousandth of the floor's area.
+    # A plant without pipes: the reference is a hole of a thousandth of the floor's area.
     return plant.pipes[0] if plant.pipes else Pipe(f"{tank}.hole", tank, OUTSIDE, 1e-3 * plant.tank(tank).area, 0.6)
 
 

@@ -81,10 +81,13 @@ def limit_spill(
 ) -> torch.Tensor:
     """Flow over a crest (m^3/s), limited so that the tank is stable at a step of `resolution` (s).
 
-    The law has the flow w = `flow` and the derivative w' = `slope` (m^2/s) at the excess (m) above the crest. The time
-    constant A / w' of the overflow is much shorter than that of the tank. Where w' r / A, with r = `resolution`,
-    exceeds its stable limit by a > 0, the flow is taken linearly implicitly (Rosenbrock, 1963): (w + a q) / (1 + a),
-    with the net inflow q = `inflow` (m^3/s) of the tank. The steady state is w = q for every step.
+    w = flow: the flow by the law at this excess (m), the level's height above the crest. w' = slope (m^2/s): its
+    derivative by the excess. q = inflow (m^3/s): net inflow of the tank without this flow. r = resolution (s).
+
+    The overflow brings the level back with the time constant A / w', which may be shorter than a step of an explicit
+    method allows. With a = w' r / A - STABLE_SPILL_TIMES_STEP, the flow is w where a <= 0, and else
+    (w + a q) / (1 + a), one step of a linearly implicit method (Rosenbrock, 1963). In steady state both are w = q,
+    whatever the step.
     """
     stiffness = torch.clamp(slope * resolution / tank_area - STABLE_SPILL_TIMES_STEP, min=0.0)
     spill = torch.clamp((flow + stiffness * inflow) / (1.0 + stiffness), min=0.0)

@@ -45,9 +45,11 @@ class Bound:
 
 
 def bind_clock(path: Path, header: Sequence[str], source: ClockSource) -> Bound:
-    """The column of time: the mapped one, or else one with such a name, if possible with a unit, or of time stamps.
+    """The column that holds the time of each row.
 
-    Without a column, time is the number of rows above times the period, which is the factor.
+    In order of preference: the column that the configuration names; a column whose header means time and has a unit,
+    such as 't_s'; a column whose header means time and has none, which must hold time stamps. If the configuration
+    gives a period instead, no column is read, and row k (from 0) has the time k times the period.
     """
     if source.period is not None:
         return Bound("t", "t", None, source.period, "s")

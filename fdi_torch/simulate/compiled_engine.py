@@ -164,8 +164,8 @@ class CompiledEngine(Engine):
     def _lanes(self, theta: Tensor) -> Tensor:
         if theta.dtype not in _REALS or theta.device.type != "cpu":
             raise ValueError(
-                f"expected theta in float64 or float32 on the CPU, got {theta.dtype} on {theta.device}; "
-                "use the traced engine there"
+                f"expected theta in float64 or float32 on the CPU, got {theta.dtype} on {theta.device}; the compiled "
+                "engine computes there only, so move theta with .to('cpu'), or choose engine='traced' in set_up"
             )
         return theta.detach().reshape(theta.shape[:-1].numel(), len(self.space)).contiguous()
 

@@ -80,8 +80,8 @@ class Engine:
         sensors, samples = len(self.network.description.sensors), len(self.experiment.sample_times)
         reason = f" ({self.why})" if self.why else ""
         return (
-            f"{self.name} engine: {self.network.description.name}, {sensors} sensors, {samples} samples{reason}; "
-            f"columns of theta: {', '.join(self.space.names)}"
+            f"{self.name} engine: {self.network.description.name}, {sensors} sensors, {samples} samples, "
+            f"{self.experiment.steps_text}{reason}; columns of theta: {', '.join(self.space.names)}"
         )
 
     def readings(self, theta: Float[Tensor, "*batch P"]) -> Float[Tensor, "*batch S C"]:
@@ -137,9 +137,10 @@ def expect_columns(engine: Engine, theta: object) -> None:
         got = type(theta).__name__
     columns = f"the {len(names)} columns {', '.join(map(str, names))}" if len(names) > 1 else f"the column {names[0]}"
     example = f"[[{', '.join(['0.1'] * len(names))}]]" if len(names) < 5 else "rows"
+    dtype = theta.dtype if isinstance(theta, Tensor) and theta.is_floating_point() else torch.float64
     raise ValueError(
         f"theta: expected a tensor of floating-point numbers with {columns}, got {got}; "
-        f"write torch.tensor({example}, dtype=torch.float64)"
+        f"write torch.tensor({example}, dtype={dtype})"
     )
 
 

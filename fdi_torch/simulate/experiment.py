@@ -42,6 +42,13 @@ class Experiment:
     def steps(self) -> Tensor:
         return torch.diff(self.nodes)
 
+    @property
+    def steps_text(self) -> str:
+        """The length of the steps in words, such as 'steps of 5 s' or 'steps of 3.33 to 5 s'."""
+        shortest, longest = (f"{float(end):.3g}" for end in torch.aminmax(self.steps))
+        length = longest if shortest == longest else f"{shortest} to {longest}"
+        return f"steps of {length} s" + ("" if self.step_control is None else ", divided where accuracy needs it")
+
     def mapped(self, make: Callable[[Tensor], Tensor]) -> Experiment:
         """The same experiment with all tensors that enter a plant's equations mapped by `make`."""
         return replace(

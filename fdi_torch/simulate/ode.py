@@ -12,6 +12,7 @@ from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.plant.signals import Clock
 from fdi_torch.recording import Recording
+from fdi_torch.simulate.equilibrium import equilibrium
 
 # In units of the plant's time scale.
 RESOLUTION = 0.01  # smoothing of square roots and rims
@@ -47,6 +48,7 @@ class PlantOde(nn.Module):
         space = space or ParameterSpace()
         self.network = network.to(_device_of(inputs, theta, network))
         like = self.network.nominal
+        self._given = frozenset(space.names)
         self._values = network.bind(space, like.new_zeros(0) if theta is None else theta)
         delayed = bool(network.command_delays(self._values))
         if network.command_memory or delayed:
@@ -61,8 +63,16 @@ class PlantOde(nn.Module):
 
     @property
     def start(self) -> Tensor:
-        """The state at t = 0 (*batch, order), m: the plant's start levels, and the effects in steady state."""
+        """The state at t = 0 (*batch, order), m, at which `fdi_torch.simulate` starts: the start levels of theta and of
+        the plant, for other tanks the equilibrium at nominal constants under the first inputs; effects in steady state.
+        """
         levels = self.network.start_levels(self._values)
+        tanks = self.network.description.tanks
+        at_rest = [t.start_level is None and f"{t.name}.start_level" not in self._given for t in tanks]
+        if any(at_rest):
+            first = self._inputs(self.network.nominal.new_zeros(())).detach()
+            rest = equilibrium(self.network, first).unbind(-1)
+            levels = [r if is_at_rest else h for r, h, is_at_rest in zip(rest, levels, at_rest, strict=True)]
         state = self.network.with_steady_states(levels, *self._driven(levels[0].new_zeros(())), self._values)
         return torch.stack(torch.broadcast_tensors(*state), dim=-1)
 

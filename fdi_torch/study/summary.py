@@ -84,7 +84,11 @@ class Summary:
 
 
 def summarise(plan: Plan, setting: Setting, trials: Sequence[Trial], tolerance: float = 1e-5) -> Summary:
-    """Summarise the trials of one setting. tolerance: largest error without noise, as a share of the range."""
+    """Statistics of the estimates in all trials of one setting.
+
+    tolerance: in trials without noise, an estimate that misses the truth by more than this share of the parameter's
+    range counts as a failure.
+    """
     space = plan.fitting.space
     names: list[str] = [name for name in ESTIMATORS if name in trials[0].numbers]
     truth = column(trials, "truth")

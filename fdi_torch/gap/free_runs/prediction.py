@@ -192,7 +192,7 @@ def _starts(plant: PlantDescription, measured: Mapping[str, float]) -> list[dict
 class LeftOutRun:
     """A free run along one recording from start to stop (s): root mean square errors by sensor (SI).
 
-    as_is: of the plant file as given. refitted: of the plant fitted to all files but that of this recording.
+    as_is: of the plant file as given. refitted: of the plant fitted to other recordings.
     """
 
     source: str
@@ -226,7 +226,13 @@ def leave_one_file_out(
             if not others:
                 raise ValueError(f"{run.source}: expected recordings of another file to fit to, got none; give more")
             refitted[run.sha256] = fit(others)
-        plants = plant, refitted[run.sha256]
-        as_is, without = (predict(p, run, start_samples, settle=settle).rmse for p in plants)
-        runs.append(LeftOutRun(run.source, float(run.time[0]), float(run.time[-1]), as_is, without))
+        runs.append(left_out_run(plant, refitted[run.sha256], run, start_samples, settle))
     return runs
+
+
+def left_out_run(
+    plant: PlantDescription, refitted: PlantDescription, run: Recording, start_samples: int, settle: float | None = None
+) -> LeftOutRun:
+    """Predict a recording by a plant as given and by the plant refitted to others. settle: as in `predict`, s."""
+    as_is, without = (predict(p, run, start_samples, settle=settle).rmse for p in (plant, refitted))
+    return LeftOutRun(run.source, float(run.time[0]), float(run.time[-1]), as_is, without)

@@ -109,7 +109,10 @@ class EvaluatedDiscrepancy:
 
     @property
     def _quantities(self) -> frozenset[str]:
-        """Quantities that the regressors in use change. Those that change a tank's cross-section come first."""
+        """What the selected regressors change: 'area' (the cross-section of a tank), 'flow', or both.
+
+        `regressed.used` lists the regressors that act on the area before those that act on a flow.
+        """
         areas = self.regression.at(self.location)[0][0].areas
         of_area, of_flow = self.regressed.used.tensor_split([0 if areas is None else len(areas)])
         return frozenset(name for name, used in (("area", of_area), ("flow", of_flow)) if bool(used.any()))

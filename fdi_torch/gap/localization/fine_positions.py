@@ -1,4 +1,5 @@
-"""Positions of regressors where they explain most: of kinks, jumps, relays and steps in time; frequency of sinusoids.
+"""Fine search for the position of the next regressor of a discrepancy: the level of a kink, jump or relay, the time of
+a step, or the frequency of a sinusoid at which it explains most.
 
 The grids of `regressors.py` are coarse. Where a discrepancy is many times the noise, a law with a kink between two
 nodes, or a change between two steps in time, would need many regressors of the grid. As in orthogonal matching pursuit

@@ -180,7 +180,12 @@ def _other_readings(recording: Recording, stuck: StuckSegment) -> Tensor:
 
 
 def _may_be_clipped(plant: PlantDescription, recording: Recording, stuck: StuckSegment) -> bool:
-    """Whether the stuck value may be a limit: an extreme of the readings or, without others, of the tank or sensor."""
+    """Whether the readings may repeat one value because the sensor or the tank is at a limit, not because the sensor is
+    stuck.
+
+    That is possible if no other reading is above the value, or none below it. If the sensor has no other readings: if
+    the value lies at a limit of the sensor, or at or beyond the floor or rim of the tank.
+    """
     sensor, rest = stuck.sensor, _other_readings(recording, stuck)
     if len(rest):
         return not float(rest.min()) < stuck.value < float(rest.max())
