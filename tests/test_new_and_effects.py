@@ -276,6 +276,21 @@ def test_the_fault_free_part_of_a_new_monitor_fits_the_recording(
         assert last - first == 500.0 if short else last - first <= 0.5 * lasts
 
 
+def test_the_fault_free_part_of_a_new_monitor_ends_before_a_fault_begins(here: Path) -> None:
+    """Otherwise the monitor would learn the fault as noise, and never raise an alarm."""
+    faults = "{T1.leak: 0.3, T1.leak.onset: 500 s, P13.plugging: 0.25, P13.plugging.onset: 500 s}"
+    changes = {"sample_time": "1 s", "duration": "1400 s", "noise": "{std: {h1: 1 mm, h2: 1 mm, h3: 1 mm}}"}
+    words = [
+        word for key, value in (changes | {"faults": faults}).items() for word in ("--set", f"simulate.{key}={value}")
+    ]
+    fdi("simulate", "--out", ".", *words, "--set", "output.name=run")
+    fdi("new", "monitor", "--recording", "run.csv", "--out", "watch.yaml")
+    first, last = load_monitor("watch.yaml").config.fault_free
+    assert first == 0.0 and 400.0 < last < 505.0  # the first seconds of a leak do not show in the noise
+    (line,) = (line for line in Path("watch.yaml").read_text().splitlines() if line.startswith("fault_free"))
+    assert "# what follows deviates from the plant file: a fault, or constants to calibrate" in line
+
+
 def test_a_new_monitor_of_a_live_source_has_a_tag_of_every_channel(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

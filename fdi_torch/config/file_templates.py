@@ -100,7 +100,9 @@ def _usual_part(plant: PlantDescription) -> str:
 
 
 def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
-    """The fault-free part for the entry of a recording: as long as the monitor needs, and at most half of it."""
+    """The fault-free part for the entry of a recording: as long as the monitor needs, but at most half of it, and only
+    as long as the plant explains it.
+    """
     entry = parse_yaml(reading.encode(), "recording").get("recording")
     if entry is None or " ..." in reading:  # a live source, or columns that the user must write
         return _usual_part(plant)
@@ -108,14 +110,33 @@ def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
 
     read = read_recording(entry, plant)
     first, last = float(read.time[0]), float(read.time[-1])
-    until, remark = 0.5 * (last - first), "the noise is learnt from it"
+    half = until = 0.5 * (last - first)
+    remark = "the noise is learnt from it"
     try:
-        until, needed = _learning_time(plant, read, every, until)
-        if needed > until:
+        explained = _explained_time(plant, read, half)
+        until, needed = _learning_time(plant, read, every, min(half, explained))
+        if explained < half and until == explained:
+            remark = "what follows deviates from the plant file: a fault, or constants to calibrate"
+            if needed > until:
+                remark += f"; too short: the noise needs some {needed:.10g} s, and the threshold is higher"
+        elif needed > until:
             remark = f"half of the recording; the noise needs some {needed:.10g} s; until then the threshold is higher"
     except ValueError as error:
         remark = f"half of the recording, which the monitor will refuse: {str(error).partition(chr(10))[0]}"
     return f"[{first:.10g} s, {first + until:.10g} s]    # {remark}"
+
+
+def _explained_time(plant: PlantDescription, recording: Recording, longest: float) -> float:
+    """How long the plant explains the recording from its beginning, s, of its first `longest` seconds.
+
+    Raises ValueError for a recording that cannot be monitored.
+    """
+    from fdi_torch.monitor.explained_beginning import explained_until  # takes a while to load
+
+    first, learnt = float(recording.time[0]), FEWEST * recording.interval
+    if learnt >= longest:
+        return longest
+    return explained_until(plant, recording.window(first, first + longest), first + learnt) - first
 
 
 def _learning_time(
