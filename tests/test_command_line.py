@@ -241,6 +241,7 @@ def test_a_file_without_its_option_is_told_the_option(capsys: pytest.CaptureFixt
             "gap --plant three_tank --recordng a.csv",
             "unrecognized argument: --recordng; the nearest is '--recording'",
         ),
+        ("predict --plant rig.yaml --recording a.csv --from 3072 s", "s; quote a time with its unit: --from '3072 s'"),
         ("train --confg=a.yaml", "unrecognized argument: --confg; the nearest is '--config'"),
         ("train --plant a.yaml", "--plant; name it in the file for --config, which fdi new run --plant ... writes"),
         (

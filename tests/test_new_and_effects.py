@@ -300,7 +300,10 @@ def test_a_new_monitor_of_a_live_source_has_a_tag_of_every_channel(
     assert source is not None and source.url == "mqtt://localhost/rig"
     assert list(source.tags) == ["Q1", "Q2", "h1", "h2", "h3"] and source.tags["Q1"].unit == "cm^3/s"
     assert cli.main(["monitor", "--config", "monitor.yaml"]) == cli.MISUSE
-    assert "source: tags.Q1: expected either tag or constant, got none" in capsys.readouterr().err
+    assert (
+        "source: tags: expected either tag or constant of each channel, got none of Q1, Q2, h1, h2, h3;"
+        in capsys.readouterr().err
+    )
     assert cli.main(["new", "run", "--recording", "mqtt://localhost/rig"]) == cli.MISUSE
     assert "--recording: expected a file for a run, got mqtt://localhost/rig" in capsys.readouterr().err
 
@@ -491,6 +494,8 @@ def test_a_recording_without_a_header_is_mapped_by_numbers(here: Path, capsys: p
     fdi("new", "run", *words)
     fdi("new", "monitor", *words, "--out", "watch.yaml")
     assert "run.yaml; next: complete the columns, then fdi train" in capsys.readouterr().out
+    assert cli.main(["train", "--config", "run.yaml"]) == cli.MISUSE
+    assert "got ... for Q, hA, hB; replace each ...\n" in capsys.readouterr().err
     numbers = {"Q": (2, "l/min"), "hA": (3, "cm"), "hB": (4, "cm")}
     for path in (Path("run.yaml"), Path("watch.yaml")):
         text = path.read_text()
