@@ -10,7 +10,9 @@ from urllib.parse import urlsplit
 
 from fdi_torch.config.channels import mapped
 from fdi_torch.config.yaml_files import find_data, parse_yaml
+from fdi_torch.effects.usual_faults import usual_faults
 from fdi_torch.live.values import PORTS
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.quantities import display_unit, quantity_text, rounded_up
@@ -56,6 +58,7 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str, rec
         fault_free=_fault_free(plant, "\n".join(reading), every) if recording else _usual_part(plant),
         leak=f"{plant.tanks[0].name}.leak",
         plugging=plugging,
+        suspected="\n".join(_suspected(plant)),
         constant=constant,
         inputs=_inputs(plant, sampling),
         simulated="\n".join(f"# {line}" for line in _inputs(plant, sampling).splitlines()),
@@ -159,6 +162,20 @@ def _learning_time(
     needed = asked + length - learnt
     wanted = rounded_up(MARGIN * needed) if asked > learnt else length
     return min(wanted, longest), rounded_up(needed)
+
+
+def _suspected(plant: PlantDescription) -> list[str]:
+    """Entries of a run file for the usual faults other than leaks, as a monitor watches for: those of pipes and weirs
+    for all of a kind, and the others commented out, because few recordings determine all of them at once.
+    """
+    full = [name for name in usual_faults(plant) if not name.endswith(".leak.size")]
+    effects = list(dict.fromkeys(ParameterName.parse(name).effect for name in full))
+    metered = {c.name for c in plant.metered_flows()}
+    places = {e: [n.place for n in map(ParameterName.parse, full) if n.effect == e] for e in effects}
+    usual = [e for e in effects if not (metered | {s.name for s in plant.sensors}) & {*places[e]}]
+    lines = [f'    - "*.{effect}"' for effect in usual]
+    lines += [f"    # - {place}.{effect}" for effect in effects if effect not in usual for place in places[effect]]
+    return [*lines, f"    # - {plant.tanks[0].name}.leak.onset     # when it begins, if that is within the recording"]
 
 
 def _inputs(plant: PlantDescription, sampling: float) -> str:
