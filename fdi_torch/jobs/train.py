@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from fdi_torch.config.loaded_recordings import LoadedRecording
 from fdi_torch.config.problems import ConfigError
@@ -164,7 +165,7 @@ def estimate_logged(
         result = with_draws(fitting, result, config.draws, run.config.seed, tell=tell)
     if run.config.recordings and not result.diagnosis.misfit.explained:
         tell(0.95, "examining the recordings")
-        doubts = (*thorough_findings(run.plant, [r.to("cpu") for r in fitting.recordings]), *doubts)
+        doubts = (*thorough_findings(run.plant, [r.to(torch.device("cpu")) for r in fitting.recordings]), *doubts)
     log_result(log, result, fitting.space, profiles, doubts)
     for k, (recording, predicted) in enumerate(zip(fitting.recordings, result.predicted, strict=True)):
         group = group_of(k, len(fitting.recordings))
