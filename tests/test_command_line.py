@@ -9,6 +9,7 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -241,6 +242,7 @@ def test_a_file_without_its_option_is_told_the_option(capsys: pytest.CaptureFixt
             "gap --plant three_tank --recordng a.csv",
             "unrecognized argument: --recordng; the nearest is '--recording'",
         ),
+        ("predict --plant rig.yaml --recording a.csv --from 3072 s", "s; quote a time with its unit: --from '3072 s'"),
         ("train --confg=a.yaml", "unrecognized argument: --confg; the nearest is '--config'"),
         ("train --plant a.yaml", "--plant; name it in the file for --config, which fdi new run --plant ... writes"),
         (
@@ -384,6 +386,20 @@ def test_progress_is_plain_lines_on_standard_error_when_nobody_watches(capsys: p
     shown = capsys.readouterr()
     assert shown.err.splitlines() == ["searching ...", "searching  50% best 1.0", "searching 100% best 0.5"]
     assert shown.out == ""
+
+
+def test_progress_that_does_not_move_is_not_repeated(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = iter(range(0, 1000, 3))
+    monkeypatch.setattr(time, "monotonic", lambda: float(next(clock)))
+    with Screen().progress("gap") as advance:
+        for _ in range(8):
+            advance(0.591, "which effects, so far Q.pump_lag")
+        advance(0.594, "which effects, so far Q.pump_lag")
+        advance(0.6, "which effects, so far Q.pump_lag")
+    line = "gap  59% which effects, so far Q.pump_lag"
+    assert capsys.readouterr().err.splitlines() == ["gap ...", line, line.replace("59", "60")]
 
 
 def test_quiet_shows_no_progress_but_complaints(capsys: pytest.CaptureFixture[str]) -> None:

@@ -257,7 +257,7 @@ def test_one_topic_per_value_without_a_clock_gives_a_row_per_period(tmp_path: Pa
         ({"tags": {"h9": {"tag": "h9", "unit": "cm"}}}, "source: tags.h9: expected a channel of the plant"),
         ({"tags": {"Q1": {"tag": "q", "unit": "cm"}}}, "Q1: expected a unit of flow such as l/min"),
         ({"tags": {"Q1": {"tag": "q"}}}, "tags.Q1: expected a unit, got none"),
-        ({"tags": {"Q1": {"unit": "cm"}}}, "tags.Q1: expected either tag or constant, got none"),
+        ({"tags": {"Q1": {"unit": "cm"}}}, "tags: expected either tag or constant of each channel, got none of Q1"),
         ({"tags": {"h1": {"constant": "1 cm"}}}, "expected a tag for each channel, got none for Q1"),
         ({"period": "0 s"}, "source.period"),
     ],

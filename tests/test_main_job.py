@@ -150,7 +150,11 @@ def test_the_command_prints_a_table_with_units_as_do_inspect_and_the_page(
         ("device=cuda:99", "device: expected one that torch can use here, got 'cuda:99'; write device: cpu"),
         ("estimate.parameters=[]", "estimate.parameters: expected at least one, got none"),
         ("estimate.parameters=[T1.leek]", "the nearest is 'T1.leak'"),
-        ("estimate.parameters=[T9.leak]", "estimate.parameters: plant three_tank: expected one of T1, T2"),
+        ("estimate.parameters=[T1.leek, T9.leak]", "got 'T1.leek'; the nearest is 'T1.leak'\n"),
+        ("estimate.parameters=[T1.leek, T9.leak]", "h3 or a pair of tanks such as T1-T2, got T9"),
+        ("output.name=off", "got False, as YAML reads yes, no, on and off; quote it, as in 'off'"),
+        ("output.name=3", "output.name: expected text, got 3; quote it, as in '3'"),
+        ("estimate.parameters=[T9.leak]", "T9.leak: plant three_tank: expected one of T1, T2"),
     ],
 )
 def test_misuse_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str], change: str, sentence: str) -> None:

@@ -19,6 +19,7 @@ from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, place
+from fdi_torch.effects.usual_faults import usual_faults
 from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import run_monitor
@@ -33,7 +34,7 @@ from fdi_torch.monitor.law_errors import ConstantErrors, prior_std
 from fdi_torch.monitor.level_forecast import DRAWS, limit_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
-from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor, usual_faults
+from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
 from fdi_torch.monitor.monitor_state import MonitorState
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.observer import Observation

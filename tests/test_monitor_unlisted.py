@@ -10,11 +10,12 @@ import pytest
 import torch
 
 from fdi_torch.effects import build_network, placements_for
+from fdi_torch.effects.usual_faults import usual_faults
 from fdi_torch.estimate.evidence import ODDS
 from fdi_torch.monitor.events import Event
 from fdi_torch.monitor.hypothesis import UNLISTED, Hypothesis, HypothesisFit, with_unlisted_as_one
 from fdi_torch.monitor.hypothesis_fit import Prior
-from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor, usual_faults
+from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
 from fdi_torch.monitor.samples import samples_of_recording
 from fdi_torch.parameters import ParameterSpace
 from tests.test_monitor import NAMES, PLANT, recorded

@@ -38,13 +38,43 @@ def fdi(*words: str) -> None:
     assert cli.main([*words]) == cli.DONE
 
 
+def correct(plant: str | Path) -> None:
+    """Delete the marks of a new plant file, as if its placeholders were those of the rig."""
+    Path(plant).write_text(Path(plant).read_text().replace("# !", "#"))
+
+
+def test_all_commands_refuse_a_plant_file_with_placeholders_in_the_words_of_check(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fdi("new", "plant", "--out", "rig.yaml")
+    Path("run.yaml").write_text("plant: rig.yaml\nrecordings: [{file: run.csv}]\nestimate: {parameters: [A.leak]}\n")
+    Path("watch.yaml").write_text("plant: rig.yaml\nrecording: {file: run.csv}\nfault_free: [0 s, 9 s]\n")
+    assert cli.main(["check", "--plant", "rig.yaml"]) == cli.NOT_EXPLAINED
+    sentence, *lines = capsys.readouterr().out.partition("rig.yaml: ")[2].splitlines()[:5]
+    assert sentence == "these entries are still placeholders; correct each, and delete its !"
+    named = "; ".join(line.removeprefix("- ") for line in lines)
+    data = ["--plant", "rig.yaml", "--recording", "run.csv"]
+    for words in (
+        ["gap", *data],
+        ["predict", *data],
+        ["refit", *data],
+        ["plan", *data],
+        ["new", "run", "--plant", "rig.yaml"],
+        ["train", "--config", "run.yaml"],
+        ["check", "--config", "run.yaml"],
+        ["monitor", "--config", "watch.yaml"],
+    ):
+        assert cli.main(words) == cli.MISUSE, words
+        assert f"rig.yaml: {sentence}: {named}\n" in capsys.readouterr().err, words
+
+
 def test_from_nothing_to_a_diagnosis_with_new_files_alone(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fdi("new", "plant", "--out", "rig.yaml")
     assert cli.main(["check", "--plant", "rig.yaml"]) == cli.NOT_EXPLAINED
     said = capsys.readouterr().out
     assert [f", {part}: " in said for part in ("tanks", "pipes", "pumps", "sensors")] == [True] * 4
     assert "- line 5, tanks: which there are; cross-section, and height from the floor to the rim" in said
-    Path("rig.yaml").write_text(Path("rig.yaml").read_text().replace("# !", "#"))
+    correct("rig.yaml")
     fdi("check", "--plant", "rig.yaml")
     assert "placeholders" not in capsys.readouterr().out
     for kind in ("run", "monitor", "study"):
@@ -65,7 +95,7 @@ def test_every_template_is_a_file_of_its_kind_for_every_shipped_plant(name: str,
     for kind, path in paths.items():
         path.write_text(template(kind, plant, name, kind))
         assert "${" not in path.read_text()
-    assert load_plant(paths["plant"]).name == "rig"
+    assert load_plant(paths["plant"], unfinished=True).name == "rig"
     assert load_run(paths["run"]).plant == plant and load_monitor(paths["monitor"]).plant == plant
     head, _, rest = paths["run"].read_text().partition("recordings:")
     _, _, described = rest.partition("# simulate:")
@@ -166,7 +196,7 @@ def test_a_new_plant_file_does_not_wait_for_the_library_of_units(tmp_path: Path)
     words = ["-X", "importtime", "-m", "fdi_torch", "new", "plant", "--out", str(tmp_path / "rig.yaml")]
     imported = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True).stderr
     assert "fdi_torch.cli.screen" in imported and "fdi_torch.units" not in imported
-    assert load_plant(tmp_path / "rig.yaml").name == "rig"
+    assert load_plant(tmp_path / "rig.yaml", unfinished=True).name == "rig"
 
 
 LOGS = Path(__file__).parent / "data"
@@ -246,6 +276,21 @@ def test_the_fault_free_part_of_a_new_monitor_fits_the_recording(
         assert last - first == 500.0 if short else last - first <= 0.5 * lasts
 
 
+def test_the_fault_free_part_of_a_new_monitor_ends_before_a_fault_begins(here: Path) -> None:
+    """Otherwise the monitor would learn the fault as noise, and never raise an alarm."""
+    faults = "{T1.leak: 0.3, T1.leak.onset: 500 s, P13.plugging: 0.25, P13.plugging.onset: 500 s}"
+    changes = {"sample_time": "1 s", "duration": "1400 s", "noise": "{std: {h1: 1 mm, h2: 1 mm, h3: 1 mm}}"}
+    words = [
+        word for key, value in (changes | {"faults": faults}).items() for word in ("--set", f"simulate.{key}={value}")
+    ]
+    fdi("simulate", "--out", ".", *words, "--set", "output.name=run")
+    fdi("new", "monitor", "--recording", "run.csv", "--out", "watch.yaml")
+    first, last = load_monitor("watch.yaml").config.fault_free
+    assert first == 0.0 and 400.0 < last < 505.0  # the first seconds of a leak do not show in the noise
+    (line,) = (line for line in Path("watch.yaml").read_text().splitlines() if line.startswith("fault_free"))
+    assert "# what follows deviates from the plant file: a fault, or constants to calibrate" in line
+
+
 def test_a_new_monitor_of_a_live_source_has_a_tag_of_every_channel(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -255,7 +300,10 @@ def test_a_new_monitor_of_a_live_source_has_a_tag_of_every_channel(
     assert source is not None and source.url == "mqtt://localhost/rig"
     assert list(source.tags) == ["Q1", "Q2", "h1", "h2", "h3"] and source.tags["Q1"].unit == "cm^3/s"
     assert cli.main(["monitor", "--config", "monitor.yaml"]) == cli.MISUSE
-    assert "source: tags.Q1: expected either tag or constant, got none" in capsys.readouterr().err
+    assert (
+        "source: tags: expected either tag or constant of each channel, got none of Q1, Q2, h1, h2, h3;"
+        in capsys.readouterr().err
+    )
     assert cli.main(["new", "run", "--recording", "mqtt://localhost/rig"]) == cli.MISUSE
     assert "--recording: expected a file for a run, got mqtt://localhost/rig" in capsys.readouterr().err
 
@@ -325,7 +373,7 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
         in capsys.readouterr().out
     )
     assert "# Left out, as their header has no unit of a level or command: operator\n" in Path("rig.yaml").read_text()
-    plant = load_plant(Path("rig.yaml"))
+    plant = load_plant(Path("rig.yaml"), unfinished=True)
     assert [sensor.column for sensor in plant.sensors] == ["LT-101", "PT 7", "level"]
     assert list(plant.channels()) == ["FIC-101 PV", "valve"] and [p.target for p in plant.pipes] == [
         "B",
@@ -334,6 +382,7 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
     ]
     assert plant.pumps[0].max_flow == pytest.approx(4e-3 / 60)
     assert cli.main(["check", "--plant", "rig.yaml", "--recording", "trend.csv"]) == cli.NOT_EXPLAINED
+    correct("rig.yaml")
     fdi("new", "monitor", "--plant", "rig.yaml", "--recording", "trend.csv")
     fdi("new", "run", "--plant", "rig.yaml", "--recording", "trend.csv")
     assert load_monitor("monitor.yaml").config.recording.file == "trend.csv"
@@ -346,18 +395,18 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
         "Datum/Uhrzeit;Zulauf [l/h];Füllstand B1 [%]\n29.3.2026 08:30:00;3000;40,5\n29.3.2026 08:31:00;3000;41\n"
     )
     fdi("new", "plant", "--recording", "german.csv", "--out", "german.yaml")
-    plant = load_plant(Path("german.yaml"))
+    plant = load_plant(Path("german.yaml"), unfinished=True)
     assert [s.column for s in plant.sensors] == ["Füllstand B1"] and list(plant.channels()) == ["Zulauf"]
     Path("duty.csv").write_text("t_s,pwm_duty,u_pump_V,y_lower_V,pulses_per_s,mass (s)\n0,1,2,1,0,2\n1,1,2,1,0,2\n")
     fdi("new", "plant", "--recording", "duty.csv", "--out", "duty.yaml")
     assert "or command: pulses_per_s, mass (s)\n" in Path("duty.yaml").read_text()
-    plant = load_plant(Path("duty.yaml"))
+    plant = load_plant(Path("duty.yaml"), unfinished=True)
     assert [s.column for s in plant.sensors] == ["y_lower"] and list(plant.channels()) == ["pwm", "u_pump"]
     Path("tags.csv").write_text("t_s,P101.OUT [V],PT-7 [V],LI101 [mm],PK [V]\n0,3.6,1,120,4\n1,3,1,121,5\n")
     fdi("new", "plant", "--recording", "tags.csv", "--out", "tags.yaml")
     assert cli.main(["check", "--plant", "tags.yaml", "--recording", "tags.csv"]) == cli.NOT_EXPLAINED
     assert "asks for up to" not in capsys.readouterr().out
-    plant = load_plant(Path("tags.yaml"))
+    plant = load_plant(Path("tags.yaml"), unfinished=True)
     assert [s.column for s in plant.sensors] == ["PT-7", "LI101"] and list(plant.channels()) == ["P101.OUT", "PK"]
     Path("none.csv").write_text("t_s,a,b\n0,1,2\n1,1,2\n")
     assert cli.main(["new", "plant", "--recording", "none.csv", "--out", "none.yaml"]) != cli.DONE
@@ -367,6 +416,7 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
 
 def test_a_recording_with_a_row_per_value_is_mapped_by_tags(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fdi("new", "plant", "--out", "rig.yaml", "--quiet")
+    correct("rig.yaml")
     levels = {"FIC1": 20, "LI101": 155, "LI102": 153}
     rows = [f"{tag};{k};{value + k % 3};Good" for k in range(60) for tag, value in levels.items()]
     Path("long.csv").write_text("\n".join(["Tag Name;t_s;Value;Quality", *rows]) + "\n")
@@ -404,6 +454,7 @@ def test_columns_of_the_right_names_without_units_are_mapped_to_themselves(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     fdi("new", "plant", "--out", "rig.yaml", "--quiet")
+    correct("rig.yaml")
     Path("run.csv").write_text(
         "t_s;Q;hA_inch.;hB_mm\n" + "".join(f"{k};3,1;{20 + k % 2};{155 + k % 3}\n" for k in range(60))
     )
@@ -415,7 +466,7 @@ def test_columns_of_the_right_names_without_units_are_mapped_to_themselves(
     )
     lines = message.partition("recordings:\n")[2].replace('"Q", unit: ...', '"Q", unit: l/min')
     Path("runs.yaml").write_text("recordings:\n" + lines.replace('"hA_inch.", unit: ...', '"hA_inch.", unit: cm'))
-    assert cli.main(["check", "--plant", "rig.yaml", "--recording", "runs.yaml"]) == cli.NOT_EXPLAINED
+    fdi("check", "--plant", "rig.yaml", "--recording", "runs.yaml")
     assert "run.csv: 60 samples" in capsys.readouterr().out
     fdi("new", "run", *words)
     assert "run.yaml; next: complete the columns, then fdi train" in capsys.readouterr().out
@@ -424,12 +475,13 @@ def test_columns_of_the_right_names_without_units_are_mapped_to_themselves(
 def test_the_output_of_a_controller_is_a_command(here: Path) -> None:
     Path("loop.csv").write_text("t_s,LIC-101.PV (%),LIC-101.OUT (%),PC 7 OP [%]\n0,40,36,10\n1,41,35,10\n")
     fdi("new", "plant", "--recording", "loop.csv", "--out", "loop.yaml")
-    plant = load_plant(Path("loop.yaml"))
+    plant = load_plant(Path("loop.yaml"), unfinished=True)
     assert [s.column for s in plant.sensors] == ["LIC-101.PV"] and list(plant.channels()) == ["LIC-101.OUT", "PC 7 OP"]
 
 
 def test_a_recording_without_a_header_is_mapped_by_numbers(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fdi("new", "plant", "--out", "rig.yaml", "--quiet")
+    correct("rig.yaml")
     rows = [f"{k},0E+0\t3,{k % 2}\t20,1\t{15 + k % 3},5" for k in range(60)]
     Path("lab.txt").write_text("\r\n".join(rows) + "\r\n")
     assert cli.main(["new", "plant", "--recording", "lab.txt", "--out", "b.yaml"]) == cli.MISUSE
@@ -442,6 +494,8 @@ def test_a_recording_without_a_header_is_mapped_by_numbers(here: Path, capsys: p
     fdi("new", "run", *words)
     fdi("new", "monitor", *words, "--out", "watch.yaml")
     assert "run.yaml; next: complete the columns, then fdi train" in capsys.readouterr().out
+    assert cli.main(["train", "--config", "run.yaml"]) == cli.MISUSE
+    assert "got ... for Q, hA, hB; replace each ...\n" in capsys.readouterr().err
     numbers = {"Q": (2, "l/min"), "hA": (3, "cm"), "hB": (4, "cm")}
     for path in (Path("run.yaml"), Path("watch.yaml")):
         text = path.read_text()

@@ -114,6 +114,22 @@ def test_effects_and_tolerances_are_added_and_wildcards_stay() -> None:
     assert changed.endswith("# the end\n") and '"*.discharge_coefficient": 3 %  # all of them' in changed
 
 
+def test_an_effect_that_begins_within_a_recording_says_for_which_recordings_it_holds() -> None:
+    leak = PlacedEffect("leak", "B", {"size": 0.2, "onset": 499.5})
+    steady = PlacedEffect("evaporation", "A", {"rate": 1e-7})
+    comment = "  # onset within run.xlsx: delete it for recordings made later"
+    for text in (TEXT, TEXT.partition("effects:")[0]):
+        before = read(text)
+        after = replace(before, effects=(*before.effects, leak, steady))
+        changed, kept = patched_plant(text, before, after, recording="run.xlsx")
+        (line,) = (line for line in changed.splitlines() if "leak, location: B" in line)
+        assert kept and line.endswith("parameters: {size: 0.2, onset: 499.5 s}}" + comment)
+        assert changed.count("delete it") == 1 and len(read(changed).effects) == len(after.effects)
+    flow = TEXT.replace("effects:\n- {", "effects: [{").replace("500 ms}}", "500 ms}}]")
+    changed, kept = patched_plant(flow, read(flow), replace(BEFORE, effects=(*BEFORE.effects, leak)), recording="a.csv")
+    assert kept and "#" not in changed.partition("effects:")[2].partition("\n")[0], "a comment would hide what follows"
+
+
 def test_a_file_without_effects_gets_them_at_its_end() -> None:
     text = TEXT.partition("tolerances:")[0]
     before = read(text)

@@ -87,6 +87,16 @@ def in_file(old: str, new: str) -> Callable[[str], str]:
     ("name", "change", "sentence"),
     [
         ("rig.yaml", in_file("200 cm^2", "200 m^2"), "tanks.A.area is 10000 times too large"),
+        (
+            "rig.yaml",
+            in_file("200 cm^2", "20 cm^2"),
+            "tanks.A.area is 10 times too small (write 200 cm^2 in place of 20 cm^2)",
+        ),
+        (
+            "rig.yaml",
+            in_file("150 cm^2", "1500 cm^2"),
+            "tanks.B.area is 10 times too large (write 150 cm^2 in place of 1500 cm^2)",
+        ),
         ("rig.yaml", in_file("0.8 cm^2", "0.8 mm^2"), "the areas of all pipes are 100 times too small"),
         (
             "rig.yaml",
@@ -128,6 +138,22 @@ def test_check_names_what_is_wrong_and_what_to_write(
 def test_a_faulty_plant_is_no_wrong_unit(folder: Path, faults: dict[str, float | str]) -> None:
     plant = load_plant(folder / "rig.yaml")
     assert wrong_units(plant, recorded(plant, faults)) == ""
+
+
+def test_a_wrong_unit_beside_a_fault_is_said_first_by_train_as_by_check(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The faults may explain the recording as well as the unit does; only a thorough examination fits both."""
+    faults: dict[str, float | str] = {"A.leak": 0.3, "AB.plugging": 0.3}
+    faults |= {"A.leak.onset": "300 s", "AB.plugging.onset": "300 s"}
+    run = recorded(load_plant(folder / "rig.yaml"), faults)
+    run = replace(run, inputs=0.1 * run.inputs)
+    (folder / "run.csv").write_text("t_s,Q_l/min,hA_mm,hB_mm\n" + rows(run))
+    assert main(["check", "run.csv", "--plant", "rig.yaml"]) == NOT_EXPLAINED
+    wrong = "Q: its unit seems wrong: its values are 10 times too small"
+    assert f"- {wrong}" in capsys.readouterr().out
+    assert main(["train", "--config", "train.yaml"]) == NOT_EXPLAINED
+    assert capsys.readouterr().out.startswith(f"Doubts about the recording:\n- {wrong}")
 
 
 def test_a_recording_without_metered_flows_or_too_short_says_nothing(folder: Path) -> None:

@@ -77,12 +77,17 @@ def test_a_run_ends_where_a_command_is_unknown_and_begins_anew(
 
 
 def test_table_and_picture_have_both_plants(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (folder / "before.yaml").write_text(PLANT.replace("100 cm^2", "80 cm^2"))
+    (folder / "before.yaml").write_text("name: cellar" + PLANT.replace("100 cm^2", "80 cm^2"))
     words = ["predict", "--plant", "rig.yaml", "novalve.csv", "--picture", "run.svg", "--beside", "before.yaml"]
     assert main(words) == DONE
     assert (folder / "run.svg").stat().st_size > 5000
     rows = [line.split() for line in capsys.readouterr().out.splitlines() if " novalve.csv " in line]
     assert [row[0] for row in rows] == ["rig", "before"] and float(rows[0][4]) < 0.1 * float(rows[1][4])
+    (folder / "today").mkdir()
+    (folder / "today" / "rig.yaml").write_text(PLANT)
+    assert main(["predict", "--plant", "rig.yaml", "novalve.csv", "--beside", "today/rig.yaml"]) == DONE
+    shown = capsys.readouterr().out
+    assert "\nrig.yaml  " in shown and "\ntoday/rig.yaml  " in shown, "files of one name have their folders"
 
 
 def test_a_plant_that_does_not_explain_the_recording_is_said_first(
@@ -103,6 +108,13 @@ def test_a_plant_that_does_not_explain_the_recording_is_said_first(
     (folder / "uncertain.yaml").write_text((folder / "rig.yaml").read_text() + 'tolerances: {"*.area": 10 %}\n')
     assert main([*words, "--plant", "uncertain.yaml"]) == NOT_EXPLAINED
     assert "have the values of the plant file here; fdi refit --adopt fits them" in capsys.readouterr().out
+    leak = "{effect: leak, location: T, parameters: {size: 0.1, onset: 20 s}}"
+    (folder / "adopted.yaml").write_text((folder / "rig.yaml").read_text() + f"effects: [{leak}]\n")
+    assert main([*words, "--plant", "adopted.yaml"]) == NOT_EXPLAINED
+    told = (
+        "- leak at T has its onset at 20 s, a time of the recording that it was found in: if this one was made later, "
+    )
+    assert told + "delete the onset in the plant file\n" in capsys.readouterr().out
     run = fdi_torch.predict("rig.yaml", "novalve.csv", start_samples=3)
     doubt = "t: the sampling interval of 1 s varies by up to 1 s"
     assert shown.startswith(f"Doubts about the recording:\n- {doubt}\n\n") and run.doubts == (doubt,)

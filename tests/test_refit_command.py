@@ -49,6 +49,18 @@ def test_a_refit_adopts_the_effect_and_predicts_each_file_by_the_other(
         assert sum(trial["refitted"].values()) < sum(trial["as_is"].values())
 
 
+def test_a_hold_out_is_predicted_before_and_after_the_refit(
+    here: Path, rig: PlantDescription, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["refit", "--plant", "rig.yaml", "--recording", "day3.csv", "--holdout", "day5.csv", "--quiet"]
+    assert cli.main(words) == cli.DONE
+    title, header, row = capsys.readouterr().out.partition("root mean square error of free runs")[2].splitlines()[:3]
+    assert title == "; refitted: to the recordings above" and "h1 as is" in header and row.startswith("day5.csv ")
+    assert cli.main([*words, "--json"]) == cli.DONE
+    (run,) = json.loads(capsys.readouterr().out)["holdout"]
+    assert Path(run["source"]).name == "day5.csv" and sum(run["refitted"].values()) < sum(run["as_is"].values())
+
+
 def test_a_calibration_reports_how_far_constants_moved_and_writes_what_was_learnt_as_tolerances(
     here: Path, rig: PlantDescription, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from pkgutil import iter_modules
 from types import ModuleType
 from typing import Any, NoReturn
 
+from fdi_torch.cli.options import seconds
 from fdi_torch.disk import sentence
 from fdi_torch.interruption import Terminated, catch_signals
 from fdi_torch.names import nearest, unknown
@@ -30,6 +32,8 @@ from fdi_torch.names import nearest, unknown
 DONE, MISUSE, NOT_CONVERGED, NOT_EXPLAINED, INTERRUPTED, TERMINATED = 0, 2, 3, 4, 130, 143
 
 COMMANDS = tuple(sorted(module.name for module in iter_modules([str(Path(__file__).with_name("options"))])))
+TIME_UNITS = ("ms", "s", "min", "h", "d")
+NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
 STEPS = {
     "describe": "Describe a rig and its recordings",
     "diagnose": "Diagnose a recording",
@@ -183,6 +187,7 @@ class _Parser(argparse.ArgumentParser):
         for option in options:  # before an argument is missed that it was meant to be
             if option not in self._option_string_actions:
                 self.error(f"unrecognized argument: {option}{self._instead(option)}")
+        self._expect_quoted_units(args)
         known, others = super().parse_known_args(args, namespace)
         file = others[0] if others else ""
         option = "--config" if Path(file).suffix in (".yaml", ".yml") else "--recording"
@@ -191,6 +196,13 @@ class _Parser(argparse.ArgumentParser):
         if Path(file).suffix and "--config" in self._option_string_actions:
             self.error(f"unrecognized argument: {file}; name it in the file for --config (fdi new writes one)")
         return known, others
+
+    def _expect_quoted_units(self, words: Sequence[str]) -> None:
+        """Error for a unit that the shell has cut off a time, before it counts as the name of a recording."""
+        for option, value, unit in zip(words, words[1:], words[2:], strict=False):
+            action = self._option_string_actions.get(option)
+            if action and action.type is seconds and NUMBER.fullmatch(value) and unit in TIME_UNITS:
+                self.error(f"unrecognized argument: {unit}; quote a time with its unit: {option} '{value} {unit}'")
 
     def error(self, message: str) -> NoReturn:
         lacks_file = message.endswith("required: --config")

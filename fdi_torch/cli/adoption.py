@@ -31,12 +31,14 @@ def write_adopted(
     target: Path,
     screen: Screen,
     errors: Mapping[str, float] | None = None,
+    recording: str = "",
 ) -> list[str]:
     """Write the plant file `name` (a file or a shipped plant, read as `before`) changed to `after`. Returns the diff,
-    line by line. errors: standard errors of fitted values, which determine their digits.
+    line by line. errors: standard errors of fitted values, which determine their digits. recording: as of
+    `patched_plant`.
     """
     text = find_plant(name, Path.cwd()).read_text(encoding="utf-8")
-    changed, kept = patched_plant(text, before, after, errors)
+    changed, kept = patched_plant(text, before, after, errors, recording)
     write_text(target, changed)
     if not kept:
         screen.note(f"{target}: rewritten without the comments of {name}, because components share values in it")

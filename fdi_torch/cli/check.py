@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from fdi_torch.cli import DONE, NOT_EXPLAINED
 from fdi_torch.cli.screen import Screen
-from fdi_torch.config.plant_file import chosen_plant, placeholders
+from fdi_torch.config.plant_file import PLACEHOLDERS, chosen_plant, placeholders
 from fdi_torch.config.yaml_files import find_plant
 from fdi_torch.names import counted
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     checks = []
     guesses = [] if arguments.plant is None else placeholders(find_plant(arguments.plant, Path.cwd()))
     if guesses:
-        screen.say(f"{arguments.plant}: these entries are still placeholders; correct each, and delete its !")
+        screen.say(f"{arguments.plant}: {PLACEHOLDERS}")
         screen.points(guesses)
         screen.say()
     _show_plant(plant, screen)
@@ -83,7 +83,7 @@ def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[Recor
             "expected --plant, --plant and --recording, or --config; without a plant file, "
             "fdi new plant --recording FILE writes one from the columns of a recording"
         )
-    plant, folder = chosen_plant(arguments.plant), Path.cwd()
+    plant, folder = chosen_plant(arguments.plant, unfinished=True), Path.cwd()
     if recording is None:
         return plant, [], folder
     from fdi_torch.config.loaded_recordings import listed_recordings

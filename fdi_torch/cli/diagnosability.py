@@ -16,8 +16,8 @@ from fdi_torch.config.loaded_recordings import planned_recordings
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.simulation import reading_noise
 from fdi_torch.effects import full_name
+from fdi_torch.effects.usual_faults import usual_faults
 from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
-from fdi_torch.monitor.monitor_setup import usual_faults
 from fdi_torch.plant.description import PlantDescription, uncertain_constants
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.quantities import display_unit, parse_quantity, significant

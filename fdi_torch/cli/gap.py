@@ -101,7 +101,8 @@ def _adopt(
             "nothing adopted: the plant with the causes has a larger free-run error than the plant file; "
             "--with-constants also writes the constants that were fitted together with the causes"
         )
-    diff = write_adopted(arguments.plant, plant, better, Path(arguments.adopt), screen, errors)
+    sources = ", ".join(dict.fromkeys(Path(r.source).name for r in recordings))
+    diff = write_adopted(arguments.plant, plant, better, Path(arguments.adopt), screen, errors, sources)
     constants = (
         "as fitted with them" if arguments.with_constants else "unchanged (--with-constants writes the fitted ones)"
     )

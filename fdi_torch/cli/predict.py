@@ -17,6 +17,7 @@ import torch
 from fdi_torch.cli.explained import exit_code, say_doubts, say_first
 from fdi_torch.cli.gap_text import MOVED
 from fdi_torch.cli.screen import Screen
+from fdi_torch.clock import MOMENTS
 from fdi_torch.config.channels import expect_columns
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings
 from fdi_torch.config.plant_file import chosen_plant, load_plant
@@ -52,16 +53,17 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     name = Path(recordings[misfits.index(worst)].source).name
     which = [f"of {len(recordings)} free runs, that along {name} is the worst"] if len(recordings) > 1 else []
     calibrate = ["constants with a tolerance have the values of the plant file here; fdi refit --adopt fits them"]
+    hints = [*_moments_of_another_recording(plant), *(calibrate if plant.tolerances else [])]
     doubts = doubts_about(recordings, plant)
     say_doubts(doubts, screen)
-    say_first(worst, screen, *(calibrate if plant.tolerances else []), about=which)
+    say_first(worst, screen, *hints, about=which)
     settle = arguments.settle
     first = f"the first {arguments.start_samples} samples" if settle is None else f"the first {settle:g} s"
     if settle is None and max(map(len, recordings)) <= arguments.start_samples:
         first = "all samples: a longer recording would test the prediction"
     screen.say(f"free run of {plant.name}, initial levels from {first}")
     before = [_predict(other, recording, arguments, vary=()) for recording in recordings] if other else []
-    own_name, other_name = _names(plant, other, arguments)
+    own_name, other_name = _names(plant.name, arguments)
     rows = [[own_name, *_row(plant, recording, prediction)] for recording, prediction in predictions]
     rows += [[other_name, *_row(plant, *each)] for each in zip(recordings, before, strict=bool(other))]
     units = (f"{s.name}, {display_unit(s.unit, s.column)[0] or 'share'}" for s in plant.sensors)
@@ -102,11 +104,24 @@ def _recordings(name: str, plant: PlantDescription, arguments: argparse.Namespac
     return [part.recording for part in load_recordings([config], plant, Path.cwd())]
 
 
-def _names(plant: PlantDescription, other: PlantDescription | None, arguments: argparse.Namespace) -> tuple[str, str]:
-    """Names of the plant and of the one beside it; those of their files if both plants have one name."""
-    if other is None or other.name != plant.name:
-        return plant.name, other.name if other else ""
-    return Path(arguments.plant).stem, Path(arguments.beside).stem
+def _names(name: str, arguments: argparse.Namespace) -> tuple[str, str]:
+    """Names of the plant and of the one beside it: those of their files, with folders if they have one name, since the
+    key `name` of copied plant files is often the same. Alone, the name of the plant."""
+    if not arguments.beside:
+        return name, ""
+    stems = Path(arguments.plant).stem, Path(arguments.beside).stem
+    return stems if stems[0] != stems[1] else (arguments.plant, arguments.beside)
+
+
+def _moments_of_another_recording(plant: PlantDescription) -> list[str]:
+    """For each effect that begins within a recording, what to do with the plant file if this is another one."""
+    return [
+        f"{effect.effect} at {effect.location} has its {moment} at {quantity_text(effect.parameters[moment], 's')}, a "
+        f"time of the recording that it was found in: if this one was made later, delete the {moment} in the plant file"
+        for effect in plant.effects
+        for moment in MOMENTS
+        if effect.parameters.get(moment)
+    ]
 
 
 def _constants(arguments: argparse.Namespace, plant: PlantDescription) -> dict[str, dict[str, Any]]:

@@ -24,7 +24,7 @@ from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import misfit_of
 from fdi_torch.estimate.uncertainty import parameters_at_bounds
 from fdi_torch.gap.free_runs.between_runs import between_run_spread
-from fdi_torch.gap.free_runs.prediction import LeftOutRun, leave_one_file_out
+from fdi_torch.gap.free_runs.prediction import LeftOutRun, leave_one_file_out, predicted_beside
 from fdi_torch.gap.free_runs.refit import Refit, refit
 from fdi_torch.jobs.gap import one_thread
 from fdi_torch.names import counted
@@ -49,6 +49,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     fitted_to = partial(refit, plant, leave_out=a.leave_out, step=a.step, hold=a.hold, white=white, vary=a.vary)
 
     trials: list[LeftOutRun] = []
+    held_out: list[LeftOutRun] = []
     with one_thread():
         with screen.progress("refit") as advance:
             fitted = fitted_to(recordings, tell=advance)
@@ -69,6 +70,12 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
                     f"- next: {arguments.adopt} keeps the tolerances of {arguments.plant}; --narrow replaces them by "
                     "the standard errors of this fit, which suits constants that do not drift from day to day"
                 )
+        if holdouts and not arguments.leave_one_file_out:
+            with screen.progress("hold-out") as advance:
+                held_out = predicted_beside(
+                    (plant, fitted.plant), holdouts, arguments.start_samples, advance, arguments.settle
+                )
+            _show_trials(held_out, plant, screen, "refitted: to the recordings above")
         if arguments.leave_one_file_out:
             with screen.progress("leave-one-file-out validation") as advance:
                 trials = leave_one_file_out(
@@ -80,7 +87,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
                     advance,
                     arguments.settle,
                 )
-            _show_trials(trials, plant, screen)
+            _show_trials(trials, plant, screen, "refitted: without the file of the run")
     screen.result(
         {
             "format": "fdi_torch.refit/1",
@@ -92,6 +99,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             "fitted": {n: {"value": v, "std": s} for n, (v, s) in fitted.fitted.items()},
             "own": fitted.own,
             "leave_one_file_out": trials,
+            "holdout": held_out,
         }
     )
     return exit_code(misfit)
@@ -148,8 +156,8 @@ def _show_run_specific(result: Refit, screen: Screen) -> None:
         screen.table("values of each recording", header, rows)
 
 
-def _show_trials(trials: Sequence[LeftOutRun], plant: PlantDescription, screen: Screen) -> None:
-    """One line per free run: error of the plant file, and of the plant refitted without the run's file."""
+def _show_trials(trials: Sequence[LeftOutRun], plant: PlantDescription, screen: Screen, refitted: str) -> None:
+    """One line per free run: error of the plant file, and of the refitted plant. refitted: to what, in words."""
     units = {s.name: display_unit(s.unit, s.column) for s in plant.sensors}
     header = ["run", "from, s", "to, s"]
     header += [f"{name} {of}, {unit}" for of in ("as is", "refitted") for name, (unit, _) in units.items()]
@@ -158,4 +166,4 @@ def _show_trials(trials: Sequence[LeftOutRun], plant: PlantDescription, screen: 
         both = (trial.as_is, trial.refitted)
         errors = [f"{scale * of[name]:.3g}" for of in both for name, (_, scale) in units.items()]
         rows.append([Path(trial.source).name, f"{trial.start:g}", f"{trial.stop:g}", *errors])
-    screen.table("root mean square error of free runs; refitted: without the file of the run", header, rows)
+    screen.table(f"root mean square error of free runs; {refitted}", header, rows)

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from fdi_torch.tables import Table as Shown  # loads the library of units, for which quick commands do not wait
 
 SECONDS_BETWEEN_LINES = 2.0
+SECONDS_BETWEEN_EQUAL_LINES = 60.0  # a line that repeats the last one says only that the job still runs
 ENDLESS = 1 << 16  # characters per line of a pipe or a file
 
 
@@ -178,13 +179,15 @@ class Screen:
 
     def _lines(self, title: str) -> Tell:
         self.note(f"{title} ...")
-        last = -math.inf  # the first step of a job is shown at once
+        last, shown = -math.inf, ""  # the first step of a job is shown at once
 
         def advance(share: float | None, text: str) -> None:
-            nonlocal last
-            if share == 1.0 or time.monotonic() - last >= SECONDS_BETWEEN_LINES:
-                last = time.monotonic()
-                percent = "" if share is None else f" {share:4.0%}"
-                self.note(f"{title}{percent} {text}".rstrip())
+            nonlocal last, shown
+            percent = "" if share is None else f" {share:4.0%}"
+            line = f"{title}{percent} {text}".rstrip()
+            wait = SECONDS_BETWEEN_LINES if line != shown else SECONDS_BETWEEN_EQUAL_LINES
+            if share == 1.0 or time.monotonic() - last >= wait:
+                last, shown = time.monotonic(), line
+                self.note(line)
 
         return advance

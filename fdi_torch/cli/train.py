@@ -20,6 +20,7 @@ from fdi_torch.cli.options import live, overrides
 from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.clock import clock_unit, show_clock
 from fdi_torch.config.run_file import load_run
+from fdi_torch.estimate.fitting import FIRST_READINGS
 from fdi_torch.estimate.windows import Stretch, WindowFault
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.jobs.windowed_fit import WindowedFit, fit_windows
@@ -75,6 +76,8 @@ def show(done: TrainResult, screen: Screen) -> None:
         rows.append([p.name, clock_unit(unit, ParameterName.parse(p.name).field, value), *cells])
     header = ("parameter", *HEADER, "nominal", *(["simulated"] if done.truth else []))
     screen.table("", header, rows, left=2)
+    if any(ParameterName.parse(name).field == "start_level" for name in space.names):
+        screen.say(f"nominal of a start level: the median of the first {FIRST_READINGS} readings")
     if final.combinations:
         combined = [(c.formula, (c.parameters[0], c.unit), c) for c in final.combinations]
         rows = [[name, *estimate_cells(*of, c.value, c.std), _plain(*of, c.nominal)] for name, of, c in combined]

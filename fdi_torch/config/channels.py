@@ -26,6 +26,8 @@ KINDS = {
     "1": "a share or %",
 }
 """SI unit of a channel -> its units in words."""
+TO_REPLACE = "..."
+"""What stands in a new file for a column or a unit that the user must write."""
 ONLY_CLOCK = ("stamps", "zone", "shift", "sort", "period")
 ONLY_FOR = dict.fromkeys(ONLY_CLOCK, "t") | {"held": "an input"}
 ONLY_FOR |= dict.fromkeys(("constant", "recorded", "words", "quality", "good", "plus"), "a channel")
@@ -35,6 +37,11 @@ ONLY_FOR |= dict.fromkeys(("constant", "recorded", "words", "quality", "good", "
 def channel_mapping(config: FileConfig, plant: PlantDescription) -> dict[str, ChannelSource]:
     """The source of each channel mentioned; time is `t`. Raises ValueError for unknown channels and keys."""
     units = _units(plant)
+    if unfinished := [name for name, column in config.columns.items() if TO_REPLACE in (column.column, column.unit)]:
+        raise ValueError(
+            f"{config.file}: columns: expected a column and a unit for each channel, got {TO_REPLACE} for "
+            f"{', '.join(unfinished)}; replace each {TO_REPLACE}"
+        )
     mapping: dict[str, ChannelSource] = {}
     for name, column in config.columns.items():
         place = f"{config.file}: columns.{name}"

@@ -125,8 +125,23 @@ def names_in_full(names: Iterable[str], plant: PlantDescription, field: str) -> 
 
 
 def placements_of(names: Iterable[str], plant: PlantDescription) -> tuple[Placement, ...]:
-    """The distinct effects to which the names belong."""
-    return placements_for(full for name in names for full in matching_names(name, plant))
+    """The distinct effects to which the names belong. Raises ConfigError with a sentence for each unknown name, if the
+    place or the effect of one is.
+    """
+    full: list[str] = []
+    problems = []
+    for name in names:
+        try:
+            full += matching_names(name, plant)
+        except ValueError as error:
+            problems += [f"{name}: {sentence}" for sentence in getattr(error, "problems", (str(error),))]
+    placements = placements_for(full)
+    if problems:
+        constants = build_network(plant, placements).constants
+        raise ConfigError(
+            [*(unknown_parameter(name, constants, plant) for name in full if name not in constants), *problems]
+        )
+    return placements
 
 
 def estimated_space(

@@ -10,7 +10,9 @@ from urllib.parse import urlsplit
 
 from fdi_torch.config.channels import mapped
 from fdi_torch.config.yaml_files import find_data, parse_yaml
+from fdi_torch.effects.usual_faults import usual_faults
 from fdi_torch.live.values import PORTS
+from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.quantities import display_unit, quantity_text, rounded_up
@@ -56,6 +58,7 @@ def template(kind: str, plant: PlantDescription, plant_file: str, name: str, rec
         fault_free=_fault_free(plant, "\n".join(reading), every) if recording else _usual_part(plant),
         leak=f"{plant.tanks[0].name}.leak",
         plugging=plugging,
+        suspected="\n".join(_suspected(plant)),
         constant=constant,
         inputs=_inputs(plant, sampling),
         simulated="\n".join(f"# {line}" for line in _inputs(plant, sampling).splitlines()),
@@ -100,7 +103,9 @@ def _usual_part(plant: PlantDescription) -> str:
 
 
 def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
-    """The fault-free part for the entry of a recording: as long as the monitor needs, and at most half of it."""
+    """The fault-free part for the entry of a recording: as long as the monitor needs, but at most half of it, and only
+    as long as the plant explains it.
+    """
     entry = parse_yaml(reading.encode(), "recording").get("recording")
     if entry is None or " ..." in reading:  # a live source, or columns that the user must write
         return _usual_part(plant)
@@ -108,14 +113,33 @@ def _fault_free(plant: PlantDescription, reading: str, every: float) -> str:
 
     read = read_recording(entry, plant)
     first, last = float(read.time[0]), float(read.time[-1])
-    until, remark = 0.5 * (last - first), "the noise is learnt from it"
+    half = until = 0.5 * (last - first)
+    remark = "the noise is learnt from it"
     try:
-        until, needed = _learning_time(plant, read, every, until)
-        if needed > until:
+        explained = _explained_time(plant, read, half)
+        until, needed = _learning_time(plant, read, every, min(half, explained))
+        if explained < half and until == explained:
+            remark = "what follows deviates from the plant file: a fault, or constants to calibrate"
+            if needed > until:
+                remark += f"; too short: the noise needs some {needed:.10g} s, and the threshold is higher"
+        elif needed > until:
             remark = f"half of the recording; the noise needs some {needed:.10g} s; until then the threshold is higher"
     except ValueError as error:
         remark = f"half of the recording, which the monitor will refuse: {str(error).partition(chr(10))[0]}"
     return f"[{first:.10g} s, {first + until:.10g} s]    # {remark}"
+
+
+def _explained_time(plant: PlantDescription, recording: Recording, longest: float) -> float:
+    """How long the plant explains the recording from its beginning, s, of its first `longest` seconds.
+
+    Raises ValueError for a recording that cannot be monitored.
+    """
+    from fdi_torch.monitor.explained_beginning import explained_until  # takes a while to load
+
+    first, learnt = float(recording.time[0]), FEWEST * recording.interval
+    if learnt >= longest:
+        return longest
+    return explained_until(plant, recording.window(first, first + longest), first + learnt) - first
 
 
 def _learning_time(
@@ -138,6 +162,20 @@ def _learning_time(
     needed = asked + length - learnt
     wanted = rounded_up(MARGIN * needed) if asked > learnt else length
     return min(wanted, longest), rounded_up(needed)
+
+
+def _suspected(plant: PlantDescription) -> list[str]:
+    """Entries of a run file for the usual faults other than leaks, as a monitor watches for: those of pipes and weirs
+    for all of a kind, and the others commented out, because few recordings determine all of them at once.
+    """
+    full = [name for name in usual_faults(plant) if not name.endswith(".leak.size")]
+    effects = list(dict.fromkeys(ParameterName.parse(name).effect for name in full))
+    metered = {c.name for c in plant.metered_flows()}
+    places = {e: [n.place for n in map(ParameterName.parse, full) if n.effect == e] for e in effects}
+    usual = [e for e in effects if not (metered | {s.name for s in plant.sensors}) & {*places[e]}]
+    lines = [f'    - "*.{effect}"' for effect in usual]
+    lines += [f"    # - {place}.{effect}" for effect in effects if effect not in usual for place in places[effect]]
+    return [*lines, f"    # - {plant.tanks[0].name}.leak.onset     # when it begins, if that is within the recording"]
 
 
 def _inputs(plant: PlantDescription, sampling: float) -> str:

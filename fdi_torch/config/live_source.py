@@ -127,6 +127,12 @@ def _channels(
         if name not in (*inputs, *outputs):
             raise ValueError(f"tags.{name}: {unknown('a channel of the plant', name, [*inputs, *outputs])}")
 
+    if unfinished := [name for name, tag in config.tags.items() if tag.tag is None and tag.constant is None]:
+        raise ValueError(
+            f"tags: expected either tag or constant of each channel, got none of {', '.join(unfinished)}; write the "
+            "address of each value"
+        )
+
     def channel(name: str, held: float) -> LiveChannel:
         if name not in config.tags and name in openings:
             return LiveChannel(name, None, constant=float(openings[name]))
@@ -139,8 +145,8 @@ def _channels(
 
 def _channel(name: str, tag: TagConfig, plant: PlantDescription, address: Address, held: float) -> LiveChannel:
     place = f"tags.{name}"
-    if (tag.tag is None) == (tag.constant is None):
-        raise ValueError(f"{place}: expected either tag or constant, got {'none' if tag.tag is None else 'both'}")
+    if tag.tag is not None and tag.constant is not None:
+        raise ValueError(f"{place}: expected either tag or constant, got both; drop one")
     if tag.constant is not None:
         if name not in plant.channels():
             raise ValueError(f"{place}.constant: expected this key of an input only; leave it out")

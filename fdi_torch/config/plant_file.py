@@ -13,7 +13,7 @@ import pydantic
 from pydantic import Field
 
 from fdi_torch.config.plant_in_code import Plant, effect_in_si, effect_parameters, si_value, tolerances_in_si
-from fdi_torch.config.problems import Source, naming, validated
+from fdi_torch.config.problems import ConfigError, Source, naming, validated
 from fdi_torch.config.strict import Acceleration, Amount, Strict, quantity, quantity_of
 from fdi_torch.config.written_units import written_units
 from fdi_torch.config.yaml_files import expect_kind, find_plant, read_yaml
@@ -81,6 +81,7 @@ def _key(field: dataclasses.Field[Any], hint: Any) -> tuple[Any, Any]:
 
 MARK = re.compile(r"\s*([\w.-]+):[^#]*#\s*!\s*(.*\S)\s*")
 """An entry whose comment begins with an exclamation mark."""
+PLACEHOLDERS = "these entries are still placeholders; correct each, and delete its !"
 
 
 class SensorConfig(Strict):
@@ -129,26 +130,34 @@ class PlantConfig(component_sections(_NamedPlant)):  # type: ignore[misc]
     )
 
 
-def load_plant(name: str | Path, base: Path | None = None) -> Plant:
-    """The plant in a file, or a shipped one by its name ('three_tank'). Raises ConfigError."""
+def load_plant(name: str | Path, base: Path | None = None, unfinished: bool = False) -> Plant:
+    """The plant in a file, or a shipped one by its name ('three_tank').
+
+    unfinished: also with entries that are still placeholders. Raises ConfigError.
+    """
     path = find_plant(str(name), base or Path.cwd())
     data = read_yaml(path)
     expect_kind(data, "plant", path)
+    if not unfinished and (guesses := placeholders(path)):
+        raise ConfigError([f"{path}: {PLACEHOLDERS}: {'; '.join(guesses)}"])
     return build_plant({"name": path.stem, **data}, str(path))
 
 
-def given_plant(plant: AnyPlant) -> PlantDescription:
-    """The plant itself, or that of a file or of a shipped name. Raises ConfigError, and TypeError for another type."""
+def given_plant(plant: AnyPlant, unfinished: bool = False) -> PlantDescription:
+    """The plant itself, or that of a file or of a shipped name; unfinished as of `load_plant`.
+
+    Raises ConfigError, and TypeError for another type.
+    """
     if isinstance(plant, str | Path):
-        return load_plant(plant)
+        return load_plant(plant, unfinished=unfinished)
     if not isinstance(plant, PlantDescription):
         raise TypeError(f"plant: expected a Plant or the name of a plant file, got a {type(plant).__name__}")
     return plant
 
 
-def chosen_plant(plant: AnyPlant) -> PlantDescription:
+def chosen_plant(plant: AnyPlant, unfinished: bool = False) -> PlantDescription:
     """As `given_plant`, for the plant that a command is about: from now on quantities are displayed in its units."""
-    chosen = given_plant(plant)
+    chosen = given_plant(plant, unfinished)
     display_in(units_for_display(chosen))
     return chosen
 

@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from fdi_torch.amounts import decimals
+from fdi_torch.clock import MOMENTS
 from fdi_torch.config.plant_file import build_plant
 from fdi_torch.config.plant_in_code import absolute_units
 from fdi_torch.config.plant_writer import dump_plant, plant_mapping
@@ -20,6 +21,7 @@ from fdi_torch.effects import units_for_display
 from fdi_torch.plant.description import FLOW_KINDS, PlacedEffect, PlantDescription
 from fdi_torch.quantities import display_unit, displayed_in, si_unit_of
 from fdi_torch.units import UnitError, in_unit, number_and_unit, si_factor
+from fdi_torch.untrusted_input import printable
 
 DIGITS = 7
 """Significant digits of numbers without a standard error."""
@@ -29,18 +31,22 @@ Path = tuple[str | int, ...]
 
 
 def patched_plant(
-    text: str, before: PlantDescription, after: PlantDescription, errors: Mapping[str, float] | None = None
+    text: str,
+    before: PlantDescription,
+    after: PlantDescription,
+    errors: Mapping[str, float] | None = None,
+    recording: str = "",
 ) -> tuple[str, bool]:
     """The text of a plant file changed to describe `after`, and whether its format could be kept.
 
     text: the file from which `before` was read. errors: standard errors by full name, SI. Numbers are written in the
-    unit of the text with as many digits as show two digits of the error, those without an error with `DIGITS`. If the
-    changes cannot be located in the text (anchors shared by several components), they are made in the plant written
-    anew.
+    unit of the text with as many digits as show two digits of the error, those without an error with `DIGITS`. If
+    the changes cannot be located in the text (anchors shared by several components), they are made in the plant written
+    anew. recording: in which new effects begin, for the comment of their lines.
     """
     for source in (text, dump_plant(before)):
         if _describes(_edited(source, before, after, {}), after):
-            return _edited(source, before, after, errors or {}), source == text
+            return _edited(source, before, after, errors or {}, recording), source == text
     return dump_plant(after), False
 
 
@@ -52,7 +58,9 @@ def _describes(text: str, plant: PlantDescription) -> bool:
         return False
 
 
-def _edited(text: str, before: PlantDescription, after: PlantDescription, errors: Mapping[str, float]) -> str:
+def _edited(
+    text: str, before: PlantDescription, after: PlantDescription, errors: Mapping[str, float], recording: str = ""
+) -> str:
     edits = _Edits(text)
     with displayed_in(units_for_display(after)):
         for path, value in _changes(before, after):
@@ -60,8 +68,17 @@ def _edited(text: str, before: PlantDescription, after: PlantDescription, errors
         known = {(e.effect, e.location) for e in before.effects}
         for placed in after.effects:
             if (placed.effect, placed.location) not in known:
-                edits.append(("effects",), _rounded(placed, after, errors))
+                edits.append(("effects",), _rounded(placed, after, errors), _validity(placed, recording))
     return edits.applied()
+
+
+def _validity(placed: PlacedEffect, recording: str) -> str:
+    """For which recordings an effect that begins at a moment of one recording holds, as a comment; empty for others."""
+    moments = [name for name in MOMENTS if placed.parameters.get(name)]
+    if not (moments and recording):
+        return ""
+    (them, it) = " and ".join(moments), "it" if len(moments) == 1 else "them"
+    return f"  # {them} within {printable(recording)}: delete {it} for recordings made later"
 
 
 def _full_name(path: Path, plant: PlantDescription) -> str:
@@ -117,6 +134,7 @@ class _Edits:
         self._root = compose_yaml(self._text)
         self._replaced: list[tuple[int, int, str]] = []
         self._added: dict[Path, list[str]] = {}
+        self._comments: dict[str, str] = {}  # of added items that have a line of their own
 
     def set(self, path: Path, value: str | float, unit: str, std: float | None) -> None:
         """Replace the value at a path, or add its key. It is written in the unit of the value that stands there, or of
@@ -132,9 +150,10 @@ class _Edits:
             new = _in_display_unit(value, unit, std) if pattern is None else _in_unit_of(value, pattern, std)
             self._added.setdefault(path[:-1], []).append(_flow({path[-1]: new})[1:-1])
 
-    def append(self, path: Path, item: Mapping[str, Any]) -> None:
-        """Add an item to a list."""
+    def append(self, path: Path, item: Mapping[str, Any], comment: str = "") -> None:
+        """Add an item to a list, with the comment if it gets a line of its own."""
         self._added.setdefault(path, []).append(_flow(dict(item)))
+        self._comments[_flow(dict(item))] = comment
 
     def applied(self) -> str:
         """The edited text; edits are applied from the end, so that positions remain valid."""
@@ -169,7 +188,7 @@ class _Edits:
         if node is None or isinstance(node, yaml.ScalarNode):  # the collection is not in the file yet
             whole = f"[{', '.join(items)}]" if is_list else f"{{{', '.join(items)}}}"
             if len(path) == 1 and not self._root.flow_style:
-                lines = "".join(f"  - {item}\n" if is_list else f"  {item}\n" for item in items)
+                lines = "".join(f"  {self._line(item, is_list)}\n" for item in items)
                 return len(self._text), len(self._text), f"\n{path[0]}:\n{lines}"
             return self._inserted(path[:-1], [f"{path[-1]}: {whole}"])
         if node.flow_style:
@@ -178,7 +197,10 @@ class _Edits:
         first = node.value[0] if is_list else node.value[0][0]
         column = node.start_mark.column if is_list else first.start_mark.column
         end = self._text.index("\n", _end(node))
-        return end, end, "".join(f"\n{' ' * column}{'- ' if is_list else ''}{item}" for item in items)
+        return end, end, "".join(f"\n{' ' * column}{self._line(item, is_list)}" for item in items)
+
+    def _line(self, item: str, is_list: bool) -> str:
+        return f"{'- ' if is_list else ''}{item}{self._comments.get(item, '')}"
 
 
 def _end(node: Any) -> int:

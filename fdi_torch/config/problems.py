@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import date
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -97,7 +98,7 @@ def naming(place: str) -> Iterator[None]:
     try:
         yield
     except ValueError as error:
-        raise ConfigError([str(error)], place) from None
+        raise ConfigError(getattr(error, "problems", (str(error),)), place) from None
 
 
 @contextmanager
@@ -131,6 +132,12 @@ def _sentence(finding: Any, known: Mapping[str, str]) -> str:
         keys = [path.removeprefix(inside) for path in known if path.startswith(inside) and "NAME." not in path]
         example = example or (f" ({', '.join(k for k in keys if '.' not in k)})" if keys else "")
         return f"expected keys with values{example}, got {shown(given)}"
+    if finding["type"] == "string_type" and isinstance(finding["input"], bool | int | float | date):
+        value = finding["input"]
+        read, example = f"{value}", f"{value}"
+        if isinstance(value, bool):
+            read, example = f"{value}, as YAML reads yes, no, on and off", "on" if value else "off"
+        return f"expected text, got {read}; quote it, as in '{example}'"
     if finding["type"] == "too_long":
         return (
             f"expected {finding['ctx']['max_length']} values, got {shown(finding['input'])}{_comma(finding['input'])}"

@@ -21,7 +21,7 @@ from fdi_torch.effects.catalogue import Catalogue
 from fdi_torch.effects.catalogue import effects as catalogue_of
 from fdi_torch.estimate.misfit import misfit_of
 from fdi_torch.gap.diagnose import Settings
-from fdi_torch.gap.free_runs.prediction import START_SAMPLES, left_out_run
+from fdi_torch.gap.free_runs.prediction import START_SAMPLES, predicted_beside
 from fdi_torch.gap.free_runs.prediction import predict as run_freely
 from fdi_torch.gap.free_runs.refit import refit as refitted
 from fdi_torch.gap.problem import check_holdout_differs
@@ -255,7 +255,7 @@ def refit(
         check_holdout_differs(recording, segments)
     with one_thread():
         fit = refitted(plant, segments, step=step, tell=rounded(tell), **choices)
-        trials = [left_out_run(plant, fit.plant, recording, start_samples, settle) for recording in held_out]
+        trials = predicted_beside((plant, fit.plant), held_out, start_samples, settle=settle)
     doubts = doubts_about([*segments, *held_out], plant)
     return RefitResult(fit, misfit_of(fit.rmse, segments, plant), doubts, tuple(trials))
 

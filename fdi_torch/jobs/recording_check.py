@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -41,6 +42,12 @@ def checked(config: RecordingConfig, plant: PlantDescription, base: Path) -> tup
     beyond = [f for f in doubts if f.kind in ("range", "unit")]
     problems = [p for p in problems if not any(f.text in p.text for f in beyond)]
     return whole, replace(check, findings=(*beyond, *problems, *(f for f in doubts if f not in beyond)))
+
+
+def thorough_findings(plant: PlantDescription, recordings: Iterable[Recording]) -> tuple[str, ...]:
+    """What is probably wrong with recordings beside an effect of the plant, as `fdi check` says it."""
+    faults = [examined(plant, recording, thorough=True).fault for recording in recordings]
+    return tuple(dict.fromkeys(fault.text for fault in faults if fault))
 
 
 def usable_spans(recording: Recording, config: RecordingConfig, plant: PlantDescription) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from fdi_torch.config.loaded_recordings import LoadedRecording
 from fdi_torch.config.problems import ConfigError
@@ -24,6 +25,7 @@ from fdi_torch.estimate.uncertainty import Estimate
 from fdi_torch.jobs.estimate_uncertainty import profiled_names, profiles_of, with_draws
 from fdi_torch.jobs.log_paths import RESUMES, log_to_write, unfinished_search
 from fdi_torch.jobs.logged_recordings import log_prediction, log_recording
+from fdi_torch.jobs.recording_check import thorough_findings
 from fdi_torch.jobs.run_setup import (
     fitting_of,
     hybrid_settings,
@@ -139,7 +141,7 @@ def train(run: Run, tell: Tell = silent, resume: bool = False, listener: Listene
         if not log.carry_over(before):
             log_recordings(log, loaded, truth)
         doubts = doubts_about([part.recording for part in loaded], run.plant)
-        result, profiles = estimate_logged(run, fitting, log, tell, search, doubts)
+        result, profiles, doubts = estimate_logged(run, fitting, log, tell, search, doubts)
         pictures = draw(run, fitting, result, path)
     tell(1.0, "done")
     return TrainResult(result, fitting, truth, path, pictures, profiles, doubts)
@@ -152,8 +154,12 @@ def estimate_logged(
     tell: Tell,
     resume: Search | None = None,
     doubts: Sequence[str] = (),
-) -> tuple[HybridResult, tuple[Profile, ...]]:
-    """Estimate the parameters, with the profiles and draws asked for, and log each step and the result."""
+) -> tuple[HybridResult, tuple[Profile, ...], tuple[str, ...]]:
+    """Estimate the parameters, with the profiles and draws asked for, and log each step and the result.
+
+    Returns also the doubts about the recordings: those given, after what a thorough examination finds in recordings
+    that the model does not explain. It takes too long to precede every fit.
+    """
     config, settings = run.config.estimate, hybrid_settings(run.config.estimate)
     profiled = profiled_names(run, fitting.space)
     if config.draws:
@@ -164,15 +170,18 @@ def estimate_logged(
     profiles = profiles_of(fitting, result, profiled, config.confidence) if profiled else ()
     if config.draws:
 
-        def tell_draws(share: float, text: str) -> None:
-            tell(until + (1.0 - until) * share, text)
+        def tell_draws(share: float | None, text: str) -> None:
+            tell(None if share is None else until + (1.0 - until) * share, text)
 
         result = with_draws(fitting, result, config.draws, run.config.seed, tell=tell_draws)
+    if run.config.recordings and not result.diagnosis.misfit.explained:
+        tell(0.95, "examining the recordings")
+        doubts = (*thorough_findings(run.plant, [r.to(torch.device("cpu")) for r in fitting.recordings]), *doubts)
     log_result(log, result, fitting.space, profiles, doubts)
     for k, (recording, predicted) in enumerate(zip(fitting.recordings, result.predicted, strict=True)):
         group = group_of(k, len(fitting.recordings))
         log_prediction(log, recording, predicted, group, result.estimate.noise_std)
-    return result, profiles
+    return result, profiles, tuple(doubts)
 
 
 class SearchLogger:

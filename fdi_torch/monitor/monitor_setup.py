@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.effects import build_network, placements_for, without_startup_effects
+from fdi_torch.effects.usual_faults import usual_faults
 from fdi_torch.estimate.fitting import StartLevels, set_up
 from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_marquardt
 from fdi_torch.monitor.detection import Chart, make_detector
@@ -27,7 +28,7 @@ from fdi_torch.monitor.samples import samples_of_recording, usual_interval
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.monitor.whitening import FEWEST_SAMPLES
 from fdi_torch.parameters import ParameterName, ParameterSpace
-from fdi_torch.plant.description import FLOW_KINDS, PlantDescription, uncertain_constants
+from fdi_torch.plant.description import PlantDescription, uncertain_constants
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.step_length import commensurate_step
 
@@ -169,19 +170,6 @@ def calibration(
     nominal = space.nominal().unsqueeze(0)
     result = levenberg_marquardt(problem.linearise, nominal, space.low(), space.high(), RefineSettings(iterations=100))
     return {name: float(result.theta[0, space.index(name)]) for name in names}
-
-
-def usual_faults(plant: PlantDescription) -> list[str]:
-    """A leak of each tank, the usual faults of each flow component, and bias, gain and freezing of each sensor."""
-    leaks = [f"{tank.name}.leak.size" for tank in plant.tanks]
-    flows = [
-        f"{component.name}.{fault}"
-        for kind in FLOW_KINDS
-        for fault in kind.usual_faults
-        for component in getattr(plant, kind.part())
-    ]
-    wrong = ("sensor_bias.bias", "sensor_gain.factor", "sensor_stuck.size")
-    return leaks + flows + [f"{sensor.name}.{fault}" for fault in wrong for sensor in plant.sensors]
 
 
 def fault_free_part(recording: Recording, start: float, stop: float) -> Recording:

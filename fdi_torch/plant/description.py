@@ -151,7 +151,11 @@ class PlantDescription:
             if component.name == name:
                 return component
         near = nearest(name, (component.name for component in self.components()))
-        raise ValueError(f"{self.title}: expected one of {', '.join(self.locations())}, got {name}{near}")
+        places, pair = (
+            (c.name for c in self.components()),
+            next((f" or a pair of tanks such as {a}-{b}" for a, b in self.tank_pairs()), ""),
+        )
+        raise ValueError(f"{self.title}: expected one of {', '.join(places)}{pair}, got {name}{near}")
 
     def tank(self, name: str) -> Tank:
         return self._of_kind(Tank, name)

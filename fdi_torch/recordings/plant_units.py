@@ -1,4 +1,5 @@
-"""Units that are wrong for a whole kind of number: all areas, flows, levels, pressures or times, or the area of a tank.
+"""Units that are wrong for a whole kind of number: all areas, flows, levels, pressures or times, or the area of a tank,
+whose decimal point may be misplaced too.
 
 A correction divides these numbers by the ratio of the unit in which they were written to another usual unit. By Bayes'
 theorem, the likelihoods of the unchanged plant file and of each correction, which follow from the volume balance of the
@@ -21,7 +22,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from fdi_torch.plant.description import PlantDescription, Sensor
-from fdi_torch.quantities import display_unit, unit_factor
+from fdi_torch.quantities import display_unit, quantity_text, unit_factor
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.volume_balance import DEVIATION, UNRELATED, Balance, balance_along
 from fdi_torch.units import same_kind
@@ -34,6 +35,9 @@ UNITS = {
     "s": ("ms", "s", "min", "h"),
 }
 """The usual units of each kind of number."""
+DECIMAL_SLIPS = (0.1, 10.0)
+"""Ratios of the area of a tank to the right one where its decimal point is misplaced. Both flows of a tank change by
+this ratio, which an effect of the plant seldom does; areas of usual units differ by 100."""
 PRIOR = 0.01
 """Probability that a unit is wrong before the recording is seen, shared equally by all corrections."""
 CONFIDENCE = 0.95
@@ -133,6 +137,11 @@ def _corrections(plant: PlantDescription, recording: Recording, as_is: Balance) 
         for names, tanks, pipes in areas:
             smaller = as_is.scaled(metered=ratio**tanks, by_laws=ratio ** (tanks - pipes))
             yield Correction(names, area, right, ratio, smaller)
+    for tank, one in zip(plant.tanks, all_tanks.diag(), strict=True):
+        for ratio in DECIMAL_SLIPS:
+            written, right = (quantity_text(each, "m^2") for each in (tank.area, tank.area / ratio))
+            smaller = as_is.scaled(metered=ratio**one, by_laws=ratio**one)
+            yield Correction(f"tanks.{tank.name}.area is", written, right, ratio, smaller)
     channels = [component.channel for component in plant.metered_flows()]
     written = _written("m^3/s", channels[0], recording)
     for right, ratio in _other_units("m^3/s", written):

@@ -24,7 +24,8 @@ examples:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(parser, "--plant", "--recording", required=True)
-    add(parser, "--holdout", "--leave-out")
+    add(parser, "--holdout", help="other recordings of the same rig, whose error before and after the fit is shown")
+    add(parser, "--leave-out")
     add(parser, "--step", help="integration step (default: half the sampling interval)")
     parser.add_argument(
         "--hold", metavar="NAME,...", type=names, default=(), help="do not fit these (* matches any name)"

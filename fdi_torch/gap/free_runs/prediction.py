@@ -226,13 +226,21 @@ def leave_one_file_out(
             if not others:
                 raise ValueError(f"{run.source}: expected recordings of another file to fit to, got none; give more")
             refitted[run.sha256] = fit(others)
-        runs.append(left_out_run(plant, refitted[run.sha256], run, start_samples, settle))
+        runs += predicted_beside((plant, refitted[run.sha256]), [run], start_samples, settle=settle)
     return runs
 
 
-def left_out_run(
-    plant: PlantDescription, refitted: PlantDescription, run: Recording, start_samples: int, settle: float | None = None
-) -> LeftOutRun:
-    """Predict a recording by a plant as given and by the plant refitted to others. settle: as in `predict`, s."""
-    as_is, without = (predict(p, run, start_samples, settle=settle).rmse for p in (plant, refitted))
-    return LeftOutRun(run.source, float(run.time[0]), float(run.time[-1]), as_is, without)
+def predicted_beside(
+    plants: tuple[PlantDescription, PlantDescription],
+    trials: Sequence[Recording],
+    start_samples: int,
+    progress: Tell = silent,
+    settle: float | None = None,
+) -> list[LeftOutRun]:
+    """Predict each trial by the plant file as given, and by the refitted one; settle: as in `predict`, s."""
+    runs = []
+    for k, run in enumerate(trials):
+        progress(k / len(trials), run.source)
+        as_is, refitted = (predict(p, run, start_samples, settle=settle).rmse for p in plants)
+        runs.append(LeftOutRun(run.source, float(run.time[0]), float(run.time[-1]), as_is, refitted))
+    return runs
