@@ -263,7 +263,7 @@ def test_runs_are_compared_in_python_as_by_the_command(tmp_path: Path) -> None:
         scale = 1000.0 if wanted == "mm" else 1.0
         numbers = [scale * x for pair in zip(result.values, result.std, strict=True) for x in pair]
         assert estimates[name] == (name, wanted, *map(pytest.approx, numbers), result.p_value, result.agree)
-    assert found.headline.startswith("seed3: Fault: leak at A") and found.headline.endswith("the results agree.")
+    assert found.headline.startswith("seed3: Fault: leak at A") and found.headline.endswith("there they agree at 95 %.")
     assert "They read different recordings" in found.headline and not found.comparison.same_data
     shown = re.search(r"A.leak.size +1 +(\S+ ± \S+) +(\S+ ± \S+) +\S+ +yes", repr(found))
     assert repr(found).startswith("ComparisonResult: seed3: ") and shown

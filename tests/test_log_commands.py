@@ -162,7 +162,7 @@ def test_compare_says_what_differs_and_whether_results_agree(
     words = ["compare", *map(str, logs), "--csv", str(table), "--pictures", str(pictures)]
     assert cli.main(words) == cli.DONE
     shown = capsys.readouterr().out
-    assert "At 95 % these differ: T1.leak.size." in shown and "0.300 ± 0.010" in shown
+    assert "at 95 % these differ: T1.leak.size." in shown and "0.300 ± 0.010" in shown
     with table.open(newline="") as file:
         rows = {(row[0], row[1]): row[2:5] for row in csv.reader(file)}
     assert rows["config", "b"] == ["0", "1", "2"] and ("config", "a") not in rows
@@ -174,7 +174,7 @@ def test_runs_of_different_kinds_are_compared_without_their_settings(
 ) -> None:
     assert cli.main(["compare", str(trained), str(study)]) == cli.DONE
     shown = capsys.readouterr().out
-    assert "the kind of run (Fault diagnosis; Study)" in shown and "settings\n" not in shown
+    assert "the kind of run (default: Fault diagnosis; table3_noise: Study)" in shown and "settings\n" not in shown
     assert "estimates\n" in shown and "agree" not in shown
 
 
@@ -182,7 +182,7 @@ def test_a_page_of_several_runs_compares_them(tmp_path: Path) -> None:
     logs = [write_estimate(tmp_path / f"{k}.mcap", v) for k, v in enumerate((0.30, 0.31))]
     assert cli.main(["report", *map(str, logs), "--quiet", "--out", str(tmp_path / "both.html")]) == cli.DONE
     text = (tmp_path / "both.html").read_text(encoding="utf-8")
-    assert "At 95 % the results agree." in text and text.index("Comparison") < text.index("<article")
+    assert "; there they agree at 95 %." in text and text.index("Comparison") < text.index("<article")
 
 
 def test_equal_logs_are_said_to_be_equal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
