@@ -114,8 +114,9 @@ def estimate_tables(result: Mapping[str, str]) -> list[ShownTable]:
     """Tables of the estimates, of their correlations if they are few, and of the draws; none if one is unreadable."""
     try:
         names, units, values, std, covariance = (orjson.loads(result.get(key, "[]")) for key in ESTIMATE[:5])
+        at_bounds = orjson.loads(result.get("at_bounds", "{}"))
         drawn = [orjson.loads(result.get(key, "[]")) for key in DRAWS]
-        tables = [("estimates", ["parameter", *HEADER], _rows(names, units, values, std))]
+        tables = [("estimates", ["parameter", *HEADER], _rows(names, units, values, std, at_bounds))]
         matrix = np.array(covariance, dtype=float).reshape(len(names), -1)
         if matrix.shape == (len(names),) * 2 and len(names) > 1:
             tables += [("correlations of the estimates", *correlation_table(names, matrix))]
@@ -126,11 +127,19 @@ def estimate_tables(result: Mapping[str, str]) -> list[ShownTable]:
 
 
 def _rows(
-    names: Sequence[str], units: Sequence[str], values: Sequence[float | None], std: Sequence[float | None]
+    names: Sequence[str],
+    units: Sequence[str],
+    values: Sequence[float | None],
+    std: Sequence[float | None],
+    at_bounds: Mapping[str, str] | None = None,
 ) -> list[list[str]]:
-    """The estimates; a value without a standard error is not determined."""
+    """The estimates; a value without a standard error is not determined. at_bounds: 'low' or 'high' by name."""
+    ends = at_bounds or {}
     numbers = ((np.nan if v is None else v, np.inf if s is None else s) for v, s in zip(values, std, strict=True))
-    return [[name, *estimate_cells(name, unit, *pair)] for name, unit, pair in zip(names, units, numbers, strict=True)]
+    return [
+        [name, *estimate_cells(name, unit, *pair, ends.get(name, ""))]
+        for name, unit, pair in zip(names, units, numbers, strict=True)
+    ]
 
 
 def result_text(text: str) -> str:

@@ -74,9 +74,14 @@ class Estimate(Shown):
         return self.covariance / (self.std[:, None] * self.std[None, :])
 
     def interval(self, confidence: float = 0.95) -> tuple[torch.Tensor, torch.Tensor]:
-        """Lower and upper limits (P,) of each parameter's confidence interval, from the normal distribution."""
+        """Lower and upper limits (P,) of each parameter's confidence interval, from the normal distribution.
+
+        An estimate at an end of its range is that limit of its interval.
+        """
         half_width = NormalDist().inv_cdf(0.5 + 0.5 * confidence) * self.std
-        return self.value - half_width, self.value + half_width
+        ends = [self.at_bounds.get(name) for name in self.names]
+        low, high = (torch.tensor([end == side for end in ends], device=self.std.device) for side in ("low", "high"))
+        return self.value - half_width.where(~low, 0.0), self.value + half_width.where(~high, 0.0)
 
     def to_arviz(self) -> Any:
         """The draws as an xarray.DataTree by ArviZ (extra `draws`), see `Draws.to_arviz`.

@@ -53,7 +53,8 @@ AXES = {
 
 @dataclass(frozen=True)
 class Result:
-    """One estimated parameter in all runs; NaN if a run lacks it.
+    """One estimated parameter in all runs; NaN if a run lacks it. ends: 'low' or 'high' where a run's estimate lies at
+    that end of its range, otherwise ''.
 
     p_value: of the hypothesis that all runs estimate one true value with independent errors, by Cochran's Q = sum w (x
     - mean)^2, w = 1 / std^2, against chi^2; for two runs Q = z^2. Runs whose model does not explain their recording are
@@ -65,6 +66,7 @@ class Result:
     values: tuple[float, ...]
     std: tuple[float, ...]
     p_value: float
+    ends: tuple[str, ...] = ()
 
     @property
     def agree(self) -> bool | None:
@@ -167,8 +169,9 @@ def _results(runs: Sequence[Run]) -> tuple[Result, ...]:
     failing = [run.about("result").get("explained") == "false" for run in runs]
     for name in dict.fromkeys(name for each in estimates for name in each):
         values, std, units = zip(*(each.get(name, (math.nan, math.nan, "")) for each in estimates), strict=True)
+        ends = tuple(run.at_bounds.get(name, "") for run in runs)
         counted = [math.nan if unreliable else error for unreliable, error in zip(failing, std, strict=True)]
-        results.append(Result(name, next(filter(None, units), ""), values, std, chi2_p_value(values, counted)))
+        results.append(Result(name, next(filter(None, units), ""), values, std, chi2_p_value(values, counted), ends))
     return tuple(results)
 
 

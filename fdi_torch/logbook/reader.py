@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import orjson
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment as AttachmentRecord
@@ -104,6 +105,15 @@ class Run:
     def about(self, record: str) -> dict[str, str]:
         """A metadata record of this program, such as "status"; empty if the log has none."""
         return self.metadata.get(f"fdi_torch.{record}", {})
+
+    @property
+    def at_bounds(self) -> dict[str, str]:
+        """The end of its range, 'low' or 'high', of each parameter whose estimate lies there."""
+        try:
+            ends = orjson.loads(self.about("result").get("at_bounds", "{}"))
+        except ValueError:
+            return {}
+        return {str(name): str(end) for name, end in ends.items()} if isinstance(ends, dict) else {}
 
     @property
     def ours(self) -> bool:

@@ -124,7 +124,9 @@ def result_table(compared: Comparison) -> tuple[list[str], list[list[str]]]:
     rows = []
     for result in compared.results:
         unit, scale = plain_unit(result.unit, result.name)
-        values = [with_error(scale * v, scale * s) for v, s in zip(result.values, result.std, strict=True)]
+        ends = result.ends or [""] * len(result.values)
+        numbers = zip(result.values, result.std, ends, strict=True)
+        values = [with_error(scale * v, scale * s, end) for v, s, end in numbers]
         p_value = "< 0.0001" if result.p_value < 1e-4 else number(result.p_value, 2)
         rows.append([result.name, unit or "1", *values, p_value, verdicts[result.agree]])
     header = ["parameter", "unit", *compared.labels, "p", "agree"]

@@ -9,7 +9,8 @@ import pytest
 from sample_runs import material_of, write_study
 
 from fdi_torch.config.plant_file import load_plant
-from fdi_torch.logbook import RunLog
+from fdi_torch.logbook import RunLog, compare
+from fdi_torch.report.comparison import result_table
 from fdi_torch.report.page import page, report_of
 from fdi_torch.report.sections.monitor import _texts
 from fdi_torch.report.verdict import headline
@@ -29,6 +30,20 @@ def test_an_interval_has_the_digits_of_its_estimate(tmp_path: Path) -> None:
         log.estimate(["T1.area"], [0.015441], [0.0002], [[0.0002**2]], "converged", units=["m^2"])
     text = page([report_of(material_of(tmp_path / "run.mcap"))])
     assert "154.4 ± 2.0" in text and ">150.5 … 158.3<" in text
+
+
+def test_an_estimate_at_an_end_of_its_range_has_a_one_sided_interval(tmp_path: Path) -> None:
+    for name, end in (("a", "low"), ("b", "high")):
+        with RunLog(tmp_path / f"{name}.mcap", "train", env={}, git={}) as log:
+            value = 0.0 if end == "low" else 1.0
+            names = ["B.leak.size"]
+            log.estimate(names, [value], [0.026], [[0.026**2]], "converged", units=["1"], at_bound=names)
+            log.result({"at_bounds": {"B.leak.size": end}})
+    text = page([report_of(material_of(tmp_path / "a.mcap"))])
+    assert ">0.000<" in text and ">below 0.051<" in text and "±" not in text.split("</article>")[0].split("<article")[1]
+    assert "B.leak.size lies at the low end of its range" in text
+    compared = result_table(compare([tmp_path / "a.mcap", tmp_path / "b.mcap"]))
+    assert compared[1][0][2:4] == ["below 0.051", "above 0.949"]
 
 
 def test_the_headline_of_a_monitor_is_set_as_the_rest_of_its_page(tmp_path: Path) -> None:
