@@ -17,6 +17,7 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import named_errors, write_text
 from fdi_torch.logbook import Inspection, export, export_attachment, foxglove_layout, inspect_log, read_run
+from fdi_torch.logbook.reader import AT_BOUNDS
 from fdi_torch.names import counted
 from fdi_torch.report.numbers import HEADER, correlation_table, estimate_cells
 
@@ -114,7 +115,7 @@ def estimate_tables(result: Mapping[str, str]) -> list[ShownTable]:
     """Tables of the estimates, of their correlations if they are few, and of the draws; none if one is unreadable."""
     try:
         names, units, values, std, covariance = (orjson.loads(result.get(key, "[]")) for key in ESTIMATE[:5])
-        at_bounds = orjson.loads(result.get("at_bounds", "{}"))
+        at_bounds = {key.removeprefix(AT_BOUNDS): end for key, end in result.items() if key.startswith(AT_BOUNDS)}
         drawn = [orjson.loads(result.get(key, "[]")) for key in DRAWS]
         tables = [("estimates", ["parameter", *HEADER], _rows(names, units, values, std, at_bounds))]
         matrix = np.array(covariance, dtype=float).reshape(len(names), -1)

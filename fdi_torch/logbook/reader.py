@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import orjson
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment as AttachmentRecord
@@ -28,6 +27,8 @@ from fdi_torch.logbook.schemas import conforming
 from fdi_torch.logbook.sink import EPOCH_NS
 from fdi_torch.logbook.topic_definitions import Channel
 from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_UNPACKED
+
+AT_BOUNDS = "at_bounds."  # before the parameters in the result
 
 # Outside chunks these records have no CRC. Logs of this program have none there; one found there is a damaged record.
 _LOOSE = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
@@ -109,11 +110,8 @@ class Run:
     @property
     def at_bounds(self) -> dict[str, str]:
         """The end of its range, 'low' or 'high', of each parameter whose estimate lies there."""
-        try:
-            ends = orjson.loads(self.about("result").get("at_bounds", "{}"))
-        except ValueError:
-            return {}
-        return {str(name): str(end) for name, end in ends.items()} if isinstance(ends, dict) else {}
+        ends = self.about("result").items()
+        return {key.removeprefix(AT_BOUNDS): end for key, end in ends if key.startswith(AT_BOUNDS)}
 
     @property
     def ours(self) -> bool:
