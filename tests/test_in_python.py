@@ -196,9 +196,11 @@ def test_a_rig_in_code_from_simulation_to_report(here: Path) -> None:
     assert abs(estimate_of - 0.3) < 4.0 * error_of < 0.2
     assert found.headline.startswith("single fault: leak at A (size 0.") and "A.leak.size" in repr(found)
     assert "<table>" in found._repr_html_()
+    assert "<b>Estimate of 3 parameters: converged</b>" in found.estimate._repr_html_()
     assert repr(found.estimate).startswith("Estimate: converged\nparameter") and "A.leak.size" in repr(found.estimate)
     # 200 cm^2 x 60 cm are 12 l, which leave in 2 A sqrt(H) / (0.6 * 0.5e-4 * sqrt(2 g)) = 233.17 s
-    assert "<td>A</td><td>12</td><td>233.1" in RIG._repr_html_()
+    sides = '<td style="text-align: left">A</td><td style="text-align: right">12</td>'
+    assert f'{sides}<td style="text-align: right">233</td>' in RIG._repr_html_()
     for html in (found._repr_html_(), RIG._repr_html_(), fdi_torch.predict(RIG, recording)._repr_html_()):
         assert "<svg" in html and "var(--" not in html  # a notebook does not define the variables of our pages
         assert "max-width" in html

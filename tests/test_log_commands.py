@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -89,7 +90,7 @@ def test_inspect_shows_estimates_and_correlations_as_tables_with_units(
     assert ["T1.start_level", "cm", "40.00", "±", "0.20", "39.61", "…", "40.39"] in rows
     assert ["link.plugging.size", "1", "not", "determined", "–"] in rows
     assert ["2", "T1.start_level", "−0.50", "1.00"] in rows
-    assert ["result", "noise_std", "0.001015,", "0.001014"] in rows and ["result", "status", "converged"] in rows
+    assert ["result", "noise_std,", "SI", "0.001015,", "0.001014"] in rows and ["result", "status", "converged"] in rows
     assert "covariance" not in shown and "[" not in shown and "undetermined" not in shown
 
 
@@ -146,6 +147,16 @@ def test_inspect_of_an_unknown_topic_leaves_no_file(tmp_path: Path, capsys: pyte
     log, out = write_estimate(tmp_path / "run.mcap", 0.3), tmp_path / "out"
     assert cli.main(["inspect", str(log), "--topic", "/nothing", "--out", str(out)]) == cli.MISUSE
     assert "expected one of the topics" in capsys.readouterr().err and not out.exists()
+
+
+def test_inspect_gives_each_topic_its_own_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = write_estimate(tmp_path / "run.mcap", 0.3)
+    assert cli.main(["inspect", str(log)]) == cli.DONE
+    shown = capsys.readouterr().out
+    rows = {line.split()[0]: line for line in shown.splitlines() if line.startswith("/")}
+    assert re.search(r"iteration \d+ +iteration \d+", rows["/estimator/refine/iteration"])
+    assert re.search(r" 0 s +\S+ s ", rows["/plant/output"]) and " s " not in rows["/estimate/final"]
+    assert not re.search(r"T\d\d:\d\d:\d\d\.\d", shown)
 
 
 def test_inspect_writes_an_attachment(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from fdi_torch.estimate.combinations import Combination, undetermined_groups
 from fdi_torch.estimate.information import certainty
+from fdi_torch.names import counted
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.quantities import quantity_text
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
@@ -54,6 +55,10 @@ class Estimate(Shown):
     def headline(self) -> str:
         """Whether the estimate has converged."""
         return self.warning or self.status.replace("_", " ")
+
+    @property
+    def heading(self) -> str:
+        return f"Estimate of {counted(len(self.names), 'parameter')}: {self.headline}"
 
     @in_its_units
     def table(self) -> Table:
