@@ -154,7 +154,7 @@ def test_inspect_gives_each_topic_its_own_unit(tmp_path: Path, capsys: pytest.Ca
     assert cli.main(["inspect", str(log)]) == cli.DONE
     shown = capsys.readouterr().out
     rows = {line.split()[0]: line for line in shown.splitlines() if line.startswith("/")}
-    assert re.search(r"iteration \d+ +iteration \d+", rows["/estimator/refine/iteration"])
+    assert re.search(r"generation \d+ +generation \d+", rows["/estimator/de/generation"])
     assert re.search(r" 0 s +\S+ s ", rows["/plant/output"]) and " s " not in rows["/estimate/final"]
     assert not re.search(r"T\d\d:\d\d:\d\d\.\d", shown)
 
