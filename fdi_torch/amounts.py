@@ -58,13 +58,19 @@ def estimate_words(name: str, si_unit: str, value: float, std: float = 0.0) -> s
     return amount_words(name, with_error(scale * value, scale * std), unit)
 
 
-def with_error(value: float, std: float) -> str:
+AT_95 = 1.96
+
+
+def with_error(value: float, std: float, end: str = "") -> str:
     """'0.3000 ± 0.0020', '(2.44 ± 0.24)·10⁻⁷': the error with two digits, the value with as many decimals.
 
-    A value with an infinite error is not determined.
+    A value with an infinite error is not determined. end: 'low' or 'high' for an estimate at an end of its range, which
+    has a limit on one side only, 'below 0.051'.
     """
     if std == math.inf:
         return "not determined"
+    if end and math.isfinite(value) and std > 0.0:
+        return one_sided(value, std, end)
     if not (math.isfinite(value) and math.isfinite(std) and std > 0.0):
         return significant(value, 4) if math.isfinite(value) else "unknown"
     if (largest := max(abs(value), std)) < 1e-3:
@@ -74,6 +80,19 @@ def with_error(value: float, std: float) -> str:
         return f"{significant(value, 4)} ± {std:.2g}"
     digits = decimals(std)
     return f"{value:.{max(digits, 0)}f} ± {std:.{max(digits, 0)}f}"
+
+
+def one_sided(value: float, std: float, end: str) -> str:
+    """'below 0.051': the 95 % interval of an estimate at the 'low' or 'high' end of its range, where its probability is
+    the half of a normal distribution that lies within the range.
+    """
+    reach = AT_95 * std
+    return f"below {rounded(value + reach, std)}" if end == "low" else f"above {rounded(value - reach, std)}"
+
+
+def end_words(name: str, end: str) -> str:
+    """The sentence about an estimate at the 'low' or 'high' end of its range."""
+    return f"{name} lies at the {end} end of its range" if end else f"{name} lies at an end of its range"
 
 
 def rounded(value: float, std: float) -> str:

@@ -5,6 +5,7 @@ Numbers are shown in the units of the plant file and of the recording from which
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import wraps
@@ -20,6 +21,8 @@ MOST_ROWS = 60
 ERRORS = ("std error", "std")
 WITH_ERROR = ("value", "estimate", "median", *ERRORS, "95 % low", "95 % high")
 """Columns whose displayed digits follow from the standard error in the same row."""
+LEFT, RIGHT = ' style="text-align: left"', ' style="text-align: right"'
+_NUMBER = re.compile(r"\(?[-−]?\d")
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 
@@ -62,10 +65,13 @@ class Table:
         return "\n".join([*shown, *self._rest()])
 
     def html(self) -> str:
-        head = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
-        body = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in self.rows())
+        sides = [RIGHT if _is_numeric(column) else LEFT for column in self.columns.values()]
+        head = "".join(f"<th{side}>{escape(name)}</th>" for side, name in zip(sides, self.columns, strict=True))
+        cells = [[f"<td{side}>{escape(c)}</td>" for side, c in zip(sides, row, strict=True)] for row in self.rows()]
+        body = "".join(f"<tr>{''.join(row)}</tr>" for row in cells)
         remark = "".join(f"<p>{line}</p>" for line in self._rest())
-        return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{remark}" if len(self) else ""
+        table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        return f'<div style="overflow-x: auto">{table}</div>{remark}' if len(self) else ""
 
     def to_pandas(self) -> Any:
         """A pandas.DataFrame. Raises ImportError, with the command to install pandas, if it is missing."""
@@ -73,6 +79,15 @@ class Table:
 
     def _rest(self) -> list[str]:
         return [f"... and {len(self) - MOST_ROWS} more rows"] if len(self) > MOST_ROWS else []
+
+
+def _is_numeric(column: Sequence[Any]) -> bool:
+    """Whether a column holds numbers, also ones with their errors as text, such as '0.30 ± 0.01'."""
+    given = [value for value in column if value not in (None, "", "–")]
+    texts = (value if isinstance(value, str) else None for value in given)
+    plain = (isinstance(v, int | float) and not isinstance(v, bool) for v in given)
+    written = (text is not None and bool(_NUMBER.match(text)) for text in texts)
+    return bool(given) and all(a or b for a, b in zip(plain, written, strict=True))
 
 
 def in_its_units(method: Method) -> Method:
@@ -112,6 +127,11 @@ class Shown:
         """The result in one sentence."""
         raise NotImplementedError
 
+    @property
+    def heading(self) -> str:
+        """The headline with what the result is, for notebooks."""
+        return self.headline
+
     def table(self) -> Table:
         """The numbers behind the headline; a column `unit` names the unit of each row."""
         raise NotImplementedError
@@ -125,7 +145,7 @@ class Shown:
 
     def _repr_html_(self) -> str:
         """Headline, table and picture for notebooks."""
-        return f"<div><p><b>{escape(self.headline)}</b></p>{self.brief().html()}{self.picture()}</div>"
+        return f"<div><p><b>{escape(self.heading)}</b></p>{self.brief().html()}{self.picture()}</div>"
 
     def picture(self) -> str:
         """The picture below the table as HTML; empty if there is none."""

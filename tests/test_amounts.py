@@ -5,7 +5,15 @@ from __future__ import annotations
 import pytest
 
 from fdi_torch import Plant, Pump, Sensor, Tank, Transfer
-from fdi_torch.amounts import estimate_words, faults_in_words, parameter_words, rounded, sized_words, with_error
+from fdi_torch.amounts import (
+    end_words,
+    estimate_words,
+    faults_in_words,
+    parameter_words,
+    rounded,
+    sized_words,
+    with_error,
+)
 from fdi_torch.effects import units_for_display
 from fdi_torch.monitor.events import Event, Explanation, Size, headline
 from fdi_torch.quantities import displayed_in
@@ -78,6 +86,13 @@ def test_parameters_of_one_effect_and_several_effects_stand_together() -> None:
 )
 def test_an_error_has_two_digits_and_the_value_its_decimals(value: float, std: float, text: str) -> None:
     assert with_error(value, std) == text
+
+
+def test_an_estimate_at_an_end_of_its_range_has_a_limit_on_one_side() -> None:
+    """Half of a normal distribution has 95 % of its probability within 1.96 standard deviations."""
+    assert with_error(0.0, 0.026, "low") == "below 0.051" and with_error(1.0, 0.026, "high") == "above 0.949"
+    assert with_error(0.0, float("inf"), "low") == "not determined" and with_error(0.0, 0.0, "low") == "0"
+    assert end_words("B.leak.size", "low") == "B.leak.size lies at the low end of its range"
 
 
 def test_numbers_of_a_table_have_the_digits_of_their_error() -> None:

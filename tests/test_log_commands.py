@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -89,7 +90,7 @@ def test_inspect_shows_estimates_and_correlations_as_tables_with_units(
     assert ["T1.start_level", "cm", "40.00", "±", "0.20", "39.61", "…", "40.39"] in rows
     assert ["link.plugging.size", "1", "not", "determined", "–"] in rows
     assert ["2", "T1.start_level", "−0.50", "1.00"] in rows
-    assert ["result", "noise_std", "0.001015,", "0.001014"] in rows and ["result", "status", "converged"] in rows
+    assert ["result", "noise_std,", "SI", "0.001015,", "0.001014"] in rows and ["result", "status", "converged"] in rows
     assert "covariance" not in shown and "[" not in shown and "undetermined" not in shown
 
 
@@ -148,6 +149,16 @@ def test_inspect_of_an_unknown_topic_leaves_no_file(tmp_path: Path, capsys: pyte
     assert "expected one of the topics" in capsys.readouterr().err and not out.exists()
 
 
+def test_inspect_gives_each_topic_its_own_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = write_estimate(tmp_path / "run.mcap", 0.3)
+    assert cli.main(["inspect", str(log)]) == cli.DONE
+    shown = capsys.readouterr().out
+    rows = {line.split()[0]: line for line in shown.splitlines() if line.startswith("/")}
+    assert re.search(r"generation \d+ +generation \d+", rows["/estimator/de/generation"])
+    assert re.search(r" 0 s +\S+ s ", rows["/plant/output"]) and " s " not in rows["/estimate/final"]
+    assert not re.search(r"T\d\d:\d\d:\d\d\.\d", shown)
+
+
 def test_inspect_writes_an_attachment(tmp_path: Path) -> None:
     log = write_estimate(tmp_path / "run.mcap", 0.3)
     assert cli.main(["inspect", str(log), "--attachment", "results.npz", "--out", str(tmp_path / "a")]) == cli.DONE
@@ -162,7 +173,7 @@ def test_compare_says_what_differs_and_whether_results_agree(
     words = ["compare", *map(str, logs), "--csv", str(table), "--pictures", str(pictures)]
     assert cli.main(words) == cli.DONE
     shown = capsys.readouterr().out
-    assert "At 95 % these differ: T1.leak.size." in shown and "0.300 ± 0.010" in shown
+    assert "at 95 % these differ: T1.leak.size." in shown and "0.300 ± 0.010" in shown
     with table.open(newline="") as file:
         rows = {(row[0], row[1]): row[2:5] for row in csv.reader(file)}
     assert rows["config", "b"] == ["0", "1", "2"] and ("config", "a") not in rows
@@ -174,7 +185,7 @@ def test_runs_of_different_kinds_are_compared_without_their_settings(
 ) -> None:
     assert cli.main(["compare", str(trained), str(study)]) == cli.DONE
     shown = capsys.readouterr().out
-    assert "the kind of run (Fault diagnosis; Study)" in shown and "settings\n" not in shown
+    assert "the kind of run (default: Fault diagnosis; table3_noise: Study)" in shown and "settings\n" not in shown
     assert "estimates\n" in shown and "agree" not in shown
 
 
@@ -182,7 +193,7 @@ def test_a_page_of_several_runs_compares_them(tmp_path: Path) -> None:
     logs = [write_estimate(tmp_path / f"{k}.mcap", v) for k, v in enumerate((0.30, 0.31))]
     assert cli.main(["report", *map(str, logs), "--quiet", "--out", str(tmp_path / "both.html")]) == cli.DONE
     text = (tmp_path / "both.html").read_text(encoding="utf-8")
-    assert "At 95 % the results agree." in text and text.index("Comparison") < text.index("<article")
+    assert "; there they agree at 95 %." in text and text.index("Comparison") < text.index("<article")
 
 
 def test_equal_logs_are_said_to_be_equal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

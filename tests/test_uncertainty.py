@@ -229,6 +229,15 @@ def test_interval_is_that_of_the_distribution() -> None:
     torch.testing.assert_close(diagonal, torch.ones(2, dtype=DOUBLE))
 
 
+def test_interval_of_an_estimate_at_a_bound_ends_there() -> None:
+    theta = torch.tensor([0.0, 1.0], dtype=DOUBLE)
+    estimate = make_estimate(space("a", "b"), theta, torch.diag(torch.tensor([400.0, 400.0], dtype=DOUBLE)))
+    low, high = estimate.interval()
+    reach = stats.norm.ppf(0.975) * 0.05
+    torch.testing.assert_close(low, torch.tensor([0.0, 1.0 - reach], dtype=DOUBLE))
+    torch.testing.assert_close(high, torch.tensor([reach, 1.0], dtype=DOUBLE))
+
+
 def test_plain_form_is_strict_json_and_says_none_for_no_number() -> None:
     estimate = make_estimate(
         space("a", "b"),

@@ -6,6 +6,7 @@ Path: cli.inspect.run → logbook.export.inspect_log → logbook.export.export
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -17,6 +18,7 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import named_errors, write_text
 from fdi_torch.logbook import Inspection, export, export_attachment, foxglove_layout, inspect_log, read_run
+from fdi_torch.logbook.reader import AT_BOUNDS
 from fdi_torch.names import counted
 from fdi_torch.report.numbers import HEADER, correlation_table, estimate_cells
 
@@ -25,6 +27,8 @@ ESTIMATE = ("names", "units", "value", "std", "covariance", "covariance_shape") 
 DRAWS = ("draws.parameter", "draws.unit", "draws.median", "draws.std")
 ShownTable = tuple[str, list[str], list[list[str]]]
 """Title, header and rows."""
+IN_SI = {"noise_std": "noise_std, SI"}
+_FRACTION = re.compile(r"(?<=T\d\d:\d\d:\d\d)\.\d+")
 RECORDS = ("run", "status", "data", "seeds", "git")
 
 
@@ -79,11 +83,14 @@ def show(inspection: Inspection, screen: Screen) -> None:
     for record in RECORDS:
         values = {name: value for name, value in inspection.about.get(record, {}).items() if value}
         if values:
-            screen.say(f"{record:<8}{', '.join(f'{name} {value}' for name, value in values.items())}")
+            words = (f"{name} {_shortened(value)}" for name, value in values.items())
+            screen.say(f"{record:<8}{', '.join(words)}")
     result = inspection.about.get("result", {})
     tables = estimate_tables(result)
     results = [
-        (name, result_text(text)) for name, text in result.items() if not (tables and name in (*ESTIMATE, *DRAWS))
+        (IN_SI.get(name, name), result_text(text))
+        for name, text in result.items()
+        if not (tables and name in (*ESTIMATE, *DRAWS))
     ]
     results = [(name, text) for name, text in results if text]
     for name, text in results[:MOST_RESULTS]:
@@ -94,11 +101,10 @@ def show(inspection: Inspection, screen: Screen) -> None:
         screen.say()
         screen.table(title, header, cells, left=2)
     rows = [
-        [info.topic, info.schema, str(info.messages), f"{info.first:.6g}", f"{info.last:.6g}", str(info.size)]
-        for info in inspection.topics.values()
+        [info.topic, info.schema, str(info.messages), *info.span, str(info.size)] for info in inspection.topics.values()
     ]
     screen.say()
-    screen.table("", ("topic", "schema", "messages", "from, s", "to, s", "bytes"), rows, left=2)
+    screen.table("", ("topic", "schema", "messages", "from", "to", "bytes"), rows, left=2)
     for item in inspection.attachments.values():
         screen.say(f"attachment {item.name}, {item.size} bytes")
     screen.say()
@@ -114,8 +120,9 @@ def estimate_tables(result: Mapping[str, str]) -> list[ShownTable]:
     """Tables of the estimates, of their correlations if they are few, and of the draws; none if one is unreadable."""
     try:
         names, units, values, std, covariance = (orjson.loads(result.get(key, "[]")) for key in ESTIMATE[:5])
+        at_bounds = {key.removeprefix(AT_BOUNDS): end for key, end in result.items() if key.startswith(AT_BOUNDS)}
         drawn = [orjson.loads(result.get(key, "[]")) for key in DRAWS]
-        tables = [("estimates", ["parameter", *HEADER], _rows(names, units, values, std))]
+        tables = [("estimates", ["parameter", *HEADER], _rows(names, units, values, std, at_bounds))]
         matrix = np.array(covariance, dtype=float).reshape(len(names), -1)
         if matrix.shape == (len(names),) * 2 and len(names) > 1:
             tables += [("correlations of the estimates", *correlation_table(names, matrix))]
@@ -126,17 +133,32 @@ def estimate_tables(result: Mapping[str, str]) -> list[ShownTable]:
 
 
 def _rows(
-    names: Sequence[str], units: Sequence[str], values: Sequence[float | None], std: Sequence[float | None]
+    names: Sequence[str],
+    units: Sequence[str],
+    values: Sequence[float | None],
+    std: Sequence[float | None],
+    at_bounds: Mapping[str, str] | None = None,
 ) -> list[list[str]]:
-    """The estimates; a value without a standard error is not determined."""
+    """The estimates; a value without a standard error is not determined. at_bounds: 'low' or 'high' by name."""
+    ends = at_bounds or {}
     numbers = ((np.nan if v is None else v, np.inf if s is None else s) for v, s in zip(values, std, strict=True))
-    return [[name, *estimate_cells(name, unit, *pair)] for name, unit, pair in zip(names, units, numbers, strict=True)]
+    return [
+        [name, *estimate_cells(name, unit, *pair, ends.get(name, ""))]
+        for name, unit, pair in zip(names, units, numbers, strict=True)
+    ]
+
+
+def _shortened(text: str) -> str:
+    """A record's value; a date and time without the fractions of its seconds."""
+    return _FRACTION.sub("", text)
 
 
 def result_text(text: str) -> str:
-    """A result in words: the numbers of a list with four digits; empty for an empty list."""
+    """A result in words: numbers with four digits; empty for an empty list."""
     with suppress(ValueError):
         value = orjson.loads(text)
+        if isinstance(value, float):
+            return f"{value:.4g}"
         if isinstance(value, list) and all(isinstance(each, int | float | str) for each in value):
             return ", ".join(f"{each:.4g}" if isinstance(each, float) else str(each) for each in value)
     return text

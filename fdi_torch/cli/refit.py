@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from fdi_torch.amounts import rounded
+from fdi_torch.amounts import end_words, rounded
 from fdi_torch.cli.adoption import expect_adoptable, write_adopted
 from fdi_torch.cli.explained import exit_code, say_doubts, say_first
 from fdi_torch.cli.gap_text import MOVED
@@ -131,7 +131,7 @@ def _show(result: Refit, before: PlantDescription, screen: Screen) -> None:
     screen.say(f"{counted(result.parameters, 'value')} fitted, including initial levels")
     values = torch.tensor([value for value, _ in result.fitted.values()], dtype=torch.float64)
     ends = parameters_at_bounds(ParameterSpace([constants[name] for name in result.fitted]), values)
-    screen.points([*remarks, *(f"{name} lies at the {end} end of its range" for name, end in ends.items())])
+    screen.points([*remarks, *(end_words(*each) for each in ends.items())])
 
 
 def _show_run_specific(result: Refit, screen: Screen) -> None:

@@ -13,7 +13,7 @@ import math
 from collections.abc import Sequence
 from functools import partial
 
-from fdi_torch.amounts import parameter_words
+from fdi_torch.amounts import end_words, parameter_words
 from fdi_torch.cli import DONE, NOT_CONVERGED
 from fdi_torch.cli.explained import exit_code, say_doubts, say_first
 from fdi_torch.cli.options import live, overrides
@@ -70,7 +70,7 @@ def show(done: TrainResult, screen: Screen) -> None:
         screen.say()
     rows = []
     for p, value, std in zip(space, final.value.tolist(), final.std.tolist(), strict=True):
-        unit, *cells = estimate_cells(p.name, p.unit, value, std)
+        unit, *cells = estimate_cells(p.name, p.unit, value, std, final.at_bounds.get(p.name, ""))
         exact = [p.nominal, *([done.truth.get(p.name, math.nan)] if done.truth else [])]
         cells += [_plain(p.name, p.unit, number) for number in exact]
         rows.append([p.name, clock_unit(unit, ParameterName.parse(p.name).field, value), *cells])
@@ -129,7 +129,7 @@ def in_words(done: TrainResult) -> list[str]:
         if fault.hole is not None:
             parts.append(f"equivalent to a sharp-edged hole of {1e3 * fault.hole:.3g} mm")
         lines.append(f"- {parameter_words(fault.name)}: " + ", ".join(parts))
-    lines += [f"- {name} lies at the {end} end of its range" for name, end in final.at_bounds.items()]
+    lines += [f"- {end_words(*each)}" for each in final.at_bounds.items()]
     lines += [f"- {sentence}" for sentence in final.undetermined]
     return lines
 

@@ -6,14 +6,20 @@ Path: cli.view.run → view.server.bound → view.server.application
 from __future__ import annotations
 
 import argparse
+import shutil
+import sys
 import webbrowser
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.interruption import Terminated
+from fdi_torch.report.html import short
 from fdi_torch.view.log_list import LogList, selected
+
+LEAST_VERDICT = 24  # letters; a narrower terminal folds the row
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -40,8 +46,18 @@ def _print_list(folder: Path, words: str, screen: Screen) -> None:
     entries = selected(LogList(folder).entries(), words)
     rows = [[e.name, e.started, e.kind, e.state, e.error_text, e.verdict] for e in entries]
     header = ("log", "started, UTC", "kind", "state", "error", "verdict")
-    screen.table("", header, rows, left=len(header))
-    if not rows:
-        screen.say("no log" + (f" with the words '{words}'" if words else f" in {folder}"))
+    if rows:
+        screen.table("", header, _fitting(header, rows), left=len(header))
+    else:
+        screen.say(f"no log matches '{words}'" if words else f"no log in {folder}")
     names = ("log", "started", "kind", "state", "error", "verdict")
     screen.result({"format": "fdi_torch.view_list/1", "logs": [dict(zip(names, row, strict=True)) for row in rows]})
+
+
+def _fitting(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[list[str]]:
+    """The rows with verdicts cut to what the width of the terminal leaves them; uncut where there is no terminal."""
+    if not sys.stdout.isatty():
+        return [list(row) for row in rows]
+    taken = sum(2 + max(map(len, column)) for column in zip(header[:-1], *(row[:-1] for row in rows), strict=True))
+    most = max(shutil.get_terminal_size().columns - taken, LEAST_VERDICT)
+    return [[*row[:-1], short(row[-1], most)] for row in rows]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
@@ -27,6 +28,7 @@ from fdi_torch.plant.description import (
 )
 from fdi_torch.plant.flow_component import FlowComponent
 from fdi_torch.plant.scales import emptying_time
+from fdi_torch.quantities import significant
 from fdi_torch.tables import Table
 
 if TYPE_CHECKING:
@@ -146,7 +148,10 @@ class Plant(PlantDescription):
         from fdi_torch.report.schematic import schematic
         from fdi_torch.report.style import notebook_svg
 
-        sizes = [(t.name, 1e3 * t.area * t.height, emptying_time(self, t)) for t in self.tanks]
+        times = [emptying_time(self, t) for t in self.tanks]
+        ends = [significant(time, 3) if math.isfinite(time) else "never" for time in times]
+        volumes = [significant(1e3 * t.area * t.height, 4) for t in self.tanks]
+        sizes = list(zip((t.name for t in self.tanks), volumes, ends, strict=True))
         table = Table.of_rows(("tank", "volume, l", "empties from full in, s"), sizes)
         return notebook_svg(schematic(self), f"plant-{self.name}", self.title) + table.html()
 

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from fdi_torch.estimate.combinations import Combination, undetermined_groups
 from fdi_torch.estimate.information import certainty
+from fdi_torch.names import counted
 from fdi_torch.parameters import Parameter, ParameterSpace
 from fdi_torch.quantities import quantity_text
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
@@ -55,6 +56,10 @@ class Estimate(Shown):
         """Whether the estimate has converged."""
         return self.warning or self.status.replace("_", " ")
 
+    @property
+    def heading(self) -> str:
+        return f"Estimate of {counted(len(self.names), 'parameter')}: {self.headline}"
+
     @in_its_units
     def table(self) -> Table:
         """One row per parameter, in its unit for display."""
@@ -74,9 +79,14 @@ class Estimate(Shown):
         return self.covariance / (self.std[:, None] * self.std[None, :])
 
     def interval(self, confidence: float = 0.95) -> tuple[torch.Tensor, torch.Tensor]:
-        """Lower and upper limits (P,) of each parameter's confidence interval, from the normal distribution."""
+        """Lower and upper limits (P,) of each parameter's confidence interval, from the normal distribution.
+
+        An estimate at an end of its range is that limit of its interval.
+        """
         half_width = NormalDist().inv_cdf(0.5 + 0.5 * confidence) * self.std
-        return self.value - half_width, self.value + half_width
+        ends = [self.at_bounds.get(name) for name in self.names]
+        low, high = (torch.tensor([end == side for end in ends], device=self.std.device) for side in ("low", "high"))
+        return self.value - half_width.where(~low, 0.0), self.value + half_width.where(~high, 0.0)
 
     def to_arviz(self) -> Any:
         """The draws as an xarray.DataTree by ArviZ (extra `draws`), see `Draws.to_arviz`.

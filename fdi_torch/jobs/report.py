@@ -175,5 +175,5 @@ def compare(logs: Sequence[str | Path]) -> ComparisonResult:
     comparison = logbook.compare(logs)
     runs = tuple(gather(log, plant_of(log, [])) for log in map(read_run, logs))
     with runs[0].in_its_units():
-        sentences = tuple(lowered(s) for s in (*comparison_headline(comparison, runs), *in_words(comparison)))
+        sentences = tuple(lowered(s) for s in (*comparison_headline(comparison, runs), *in_words(comparison, runs)))
         return ComparisonResult(comparison, runs, sentences)

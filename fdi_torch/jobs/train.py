@@ -165,7 +165,7 @@ def estimate_logged(
     if config.draws:
         needed("emcee", "draws")
     until = ESTIMATED_BEFORE_DRAWS if config.draws else 1.0
-    watch = SearchLogger(log, fitting.space, settings, lambda share, text: tell(until * share, text))
+    watch = SearchLogger(log, fitting.space, settings, lambda share, text: tell(share and until * share, text))
     result = estimate_parameters(fitting, settings, run.config.seed, watch.generation, watch.iteration, resume)
     profiles = profiles_of(fitting, result, profiled, config.confidence) if profiled else ()
     if config.draws:

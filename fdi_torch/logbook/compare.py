@@ -53,10 +53,12 @@ AXES = {
 
 @dataclass(frozen=True)
 class Result:
-    """One estimated parameter in all runs; NaN if a run lacks it.
+    """One estimated parameter in all runs; NaN if a run lacks it. ends: 'low' or 'high' where a run's estimate lies at
+    that end of its range, otherwise ''.
 
     p_value: of the hypothesis that all runs estimate one true value with independent errors, by Cochran's Q = sum w (x
-    - mean)^2, w = 1 / std^2, against chi^2; for two runs Q = z^2. NaN if fewer than two runs have standard errors.
+    - mean)^2, w = 1 / std^2, against chi^2; for two runs Q = z^2. Runs whose model does not explain their recording are
+    left out, since their errors do not hold. NaN if fewer than two runs have standard errors.
     """
 
     name: str
@@ -64,6 +66,7 @@ class Result:
     values: tuple[float, ...]
     std: tuple[float, ...]
     p_value: float
+    ends: tuple[str, ...] = ()
 
     @property
     def agree(self) -> bool | None:
@@ -163,9 +166,12 @@ def _differing(runs: Sequence[Run], section: str) -> dict[str, tuple[str, ...]]:
 
 def _results(runs: Sequence[Run]) -> tuple[Result, ...]:
     estimates, results = [_estimates(run) for run in runs], []
+    failing = [run.about("result").get("explained") == "false" for run in runs]
     for name in dict.fromkeys(name for each in estimates for name in each):
         values, std, units = zip(*(each.get(name, (math.nan, math.nan, "")) for each in estimates), strict=True)
-        results.append(Result(name, next(filter(None, units), ""), values, std, chi2_p_value(values, std)))
+        ends = tuple(run.at_bounds.get(name, "") for run in runs)
+        counted = [math.nan if unreliable else error for unreliable, error in zip(failing, std, strict=True)]
+        results.append(Result(name, next(filter(None, units), ""), values, std, chi2_p_value(values, counted), ends))
     return tuple(results)
 
 

@@ -20,6 +20,7 @@ import orjson
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Statistics
 
+from fdi_torch.logbook.compare import AXES
 from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.reader import Attachment, Message, Run, read_run
 from fdi_torch.logbook.scan import Damage, Frame, body_of, stream_of
@@ -125,6 +126,9 @@ def _array(values: list[Any]) -> np.ndarray | None:
 
 PREFIX = "fdi_torch."
 
+WITHOUT_TIME = ("/estimator/", "/estimate/final", "/gap/", "/study/")
+"""Beginnings of topics whose messages have no plant time."""
+
 
 @dataclass
 class TopicInfo:
@@ -138,6 +142,15 @@ class TopicInfo:
     size: int = 0
     first: float = float("nan")
     last: float = float("nan")
+
+    @property
+    def span(self) -> tuple[str, str]:
+        """The first and last plant time, or generation or iteration of a topic of the search; empty for others."""
+        axis = AXES.get(self.topic, "")
+        if not math.isfinite(self.first) or (not axis and self.topic.startswith(WITHOUT_TIME)):
+            return "", ""
+        first, last = (f"{axis} {end:g}" if axis else f"{end:.6g} s" for end in (self.first, self.last))
+        return first, last
 
     def count(self, message: Message) -> None:
         self.first = message.t if self.messages == 0 else min(self.first, message.t)

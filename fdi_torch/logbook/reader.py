@@ -28,6 +28,8 @@ from fdi_torch.logbook.sink import EPOCH_NS
 from fdi_torch.logbook.topic_definitions import Channel
 from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_UNPACKED
 
+AT_BOUNDS = "at_bounds."  # before the parameters in the result
+
 # Outside chunks these records have no CRC. Logs of this program have none there; one found there is a damaged record.
 _LOOSE = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
 _DESCRIBING: dict[int, type[Schema | ChannelRecord]] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: ChannelRecord}
@@ -104,6 +106,12 @@ class Run:
     def about(self, record: str) -> dict[str, str]:
         """A metadata record of this program, such as "status"; empty if the log has none."""
         return self.metadata.get(f"fdi_torch.{record}", {})
+
+    @property
+    def at_bounds(self) -> dict[str, str]:
+        """The end of its range, 'low' or 'high', of each parameter whose estimate lies there."""
+        ends = self.about("result").items()
+        return {key.removeprefix(AT_BOUNDS): end for key, end in ends if key.startswith(AT_BOUNDS)}
 
     @property
     def ours(self) -> bool:

@@ -25,8 +25,10 @@ from fdi_torch.report.html import clean, short
 from fdi_torch.report.numbers import axis, shown_unit
 from fdi_torch.report.style import (
     HEIGHT,
+    INK,
     MARK,
     MODEL,
+    PAPER,
     SOFT,
     VARIABLES,
     label_lines,
@@ -38,6 +40,7 @@ from fdi_torch.report.style import (
 )
 
 BINS = 400
+MOST_LABELS = 4  # of dashed lines in a picture
 
 
 def thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -100,7 +103,8 @@ class Chart:
 
     log: use a logarithmic axis if the values span more than a decade; with zeros among them it is linear below the
     median of the positive values (asinh). level: a horizontal reference line; at 0, the lines are residuals.
-    events: times of vertical lines. clock: charts of one clock show the same crosshair and zoom together. from_zero:
+    events: times of vertical lines. marks: times of thin dashed lines, each with its label.
+    clock: charts of one clock show the same crosshair and zoom together. from_zero:
     a linear vertical axis begins at 0. height: of the picture, inches.
     zero: date of time 0, s since 1970; None if the axis is not time or the recording has no dates. after: words behind
     the label of the axis, as in ' after 2026-11-01 08:00:00'.
@@ -116,6 +120,7 @@ class Chart:
     log: bool = False
     level: float | None = None
     events: Sequence[float] = ()
+    marks: Sequence[tuple[float, str]] = ()
     clock: str = ""
     from_zero: bool = False
     height: float = HEIGHT
@@ -174,6 +179,7 @@ def draw(chart: Chart) -> Figure:
         )
     for moment in list(chart.events)[:MOST_EVENTS]:
         axes.axvline(moment, color=MARK, lw=0.9, alpha=0.8)
+    _draw_marks(axes, chart)
     kind, width = chart.scale
     if kind != "linear":
         logarithmic(axes, width)
@@ -182,6 +188,28 @@ def draw(chart: Chart) -> Figure:
     if len(chart.lines) > 1:
         label_lines(axes)
     return figure
+
+
+def _draw_marks(axes: Axes, chart: Chart) -> None:
+    """Dashed lines with their labels, each on the side that has more room; many are drawn without labels."""
+    marks = list(chart.marks)[:MOST_EVENTS]
+    for k, (moment, label) in enumerate(marks):
+        axes.axvline(moment, color=INK, lw=0.8, ls=(0, (2, 2)))
+        low, high = axes.get_xlim()
+        right = moment - low > 0.5 * (high - low)
+        if len(marks) <= MOST_LABELS:
+            axes.annotate(
+                short(label, 34),
+                xy=(moment, 0.97 - 0.12 * k),
+                xycoords=("data", "axes fraction"),
+                xytext=(-4 if right else 4, 0),
+                textcoords="offset points",
+                ha="right" if right else "left",
+                va="top",
+                fontsize=8.0,
+                color=INK,
+                bbox={"facecolor": PAPER, "edgecolor": "none", "pad": 1.0},
+            )
 
 
 def chart_json(chart: Chart) -> str:
@@ -207,6 +235,7 @@ def chart_json(chart: Chart) -> str:
         "scale": chart.scale,
         "level": chart.level,
         "from_zero": chart.from_zero,
+        "marks": [(float(moment), clean(label)) for moment, label in list(chart.marks)[:MOST_EVENTS]],
         "events": [float(moment) for moment in list(chart.events)[:MOST_EVENTS]],
     }
     return orjson.dumps(described).decode()

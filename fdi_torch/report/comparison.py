@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from typing import Any
@@ -10,10 +11,12 @@ import numpy as np
 
 from fdi_torch.effects import EFFECTS
 from fdi_torch.logbook import Comparison, align
-from fdi_torch.names import listed
+from fdi_torch.logbook.compare import Result
+from fdi_torch.names import counted, listed
 from fdi_torch.parameters import ParameterName
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.comparison_headline import comparison_headline, left_out_words, setting_differences
+from fdi_torch.report.diagnosed_effects import diagnosed_effects
 from fdi_torch.report.html import folded, short, table, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number, plain_unit, raised, with_error
@@ -38,7 +41,10 @@ def comparison_section(compared: Comparison, runs: Sequence[Material]) -> Sectio
 
 def _section(compared: Comparison, runs: Sequence[Material]) -> Section:
     first, *sentences = comparison_headline(compared, runs)
-    blocks: list[Any] = [tag("h3", first), *(tag("p", sentence) for sentence in (*sentences, *in_words(compared)))]
+    blocks: list[Any] = [
+        tag("h3", first),
+        *(tag("p", sentence) for sentence in (*sentences, *in_words(compared, runs))),
+    ]
     if compared.results:
         header, rows = result_table(compared)
         blocks.append(table(header, [[name, raised(unit), *cells] for name, unit, *cells in rows], left=2))
@@ -58,12 +64,27 @@ def _section(compared: Comparison, runs: Sequence[Material]) -> Section:
     return Section("Comparison", blocks)
 
 
-def in_words(compared: Comparison) -> list[str]:
-    """Agreement of the estimates, one sentence each."""
-    words = []
-    apart = [result.name for result in compared.results if result.agree is False]
-    if any(result.agree is not None for result in compared.results):
-        words.append(f"At 95 % these differ: {', '.join(apart)}." if apart else "At 95 % the results agree.")
+def in_words(compared: Comparison, runs: Sequence[Material]) -> list[str]:
+    """Agreement of the estimates that several runs have, with their number, one sentence each.
+
+    Runs agree only if all of them explain their recordings and name the same faults.
+    """
+    failing = [run.unexplained for run in runs]
+    unreliable = [label for label, fails in zip(compared.labels, failing, strict=True) if fails]
+    shared = [result for result in compared.results if result.agree is not None]
+    if not shared:
+        return [f"The estimates are not compared, as {_are_unreliable(unreliable)}."] if unreliable else []
+    apart = [result.name for result in shared if not result.agree]
+    words = [
+        _shared_words(shared, len(compared.results), len(runs) - len(unreliable), "reliable " if unreliable else "")
+    ]
+    if apart:
+        words[0] += f"; at 95 % these differ: {', '.join(apart)}."
+    elif unreliable or _name_different_faults(runs):
+        reason = _are_unreliable(unreliable) if unreliable else "the runs name different faults"
+        words[0] += f"; none of these differs at 95 %, but {reason}."
+    else:
+        words[0] += "; there they agree at 95 %."
     relative = {effect.name for effect in EFFECTS if effect.capacity_share}  # to the capacity of a pipe, as a leak
     shares = [name for name in apart if (p := ParameterName.parse(name)).field == "size" and p.effect in relative]
     pipes = [key for key in compared.differences.get("config", {}) if PIPE_CAPACITY.fullmatch(key)]
@@ -71,9 +92,30 @@ def in_words(compared: Comparison) -> list[str]:
         words.append(
             f"{listed(shares)}: relative to the capacity of a pipe in the plant file; {listed(pipes)} differs."
         )
-    if compared.same_data and words:
+    if compared.same_data:
         words.append("All runs read the same data, so their errors are not independent.")
     return words
+
+
+def _are_unreliable(labels: Sequence[str]) -> str:
+    return f"{listed(labels)} {'is' if len(labels) == 1 else 'are'} unreliable"
+
+
+def _shared_words(shared: Sequence[Result], count: int, runs: int, kind: str) -> str:
+    """'Of 7 parameters 1 is in both runs': how many of `count` parameters have an error in several of the runs of this
+    kind.
+    """
+    in_all = all(sum(math.isfinite(std) for std in result.std) >= runs for result in shared)
+    if in_all and len(shared) == count:
+        same = "the same parameter" if count == 1 else f"the same {count} parameters"
+        return f"{'Both' if runs == 2 else 'All'} {kind}runs have {same}"
+    where = f"more than one {kind}run" if not in_all else f"{'both' if runs == 2 else 'all'} {kind}runs"
+    return f"Of {counted(count, 'parameter')} {len(shared)} {'is' if len(shared) == 1 else 'are'} in {where}"
+
+
+def _name_different_faults(runs: Sequence[Material]) -> bool:
+    """Whether the runs name different faults; a monitor names those that it has isolated."""
+    return len({frozenset(f.words for f in diagnosed_effects(run) if f.present) for run in runs}) > 1
 
 
 def result_table(compared: Comparison) -> tuple[list[str], list[list[str]]]:
@@ -82,7 +124,9 @@ def result_table(compared: Comparison) -> tuple[list[str], list[list[str]]]:
     rows = []
     for result in compared.results:
         unit, scale = plain_unit(result.unit, result.name)
-        values = [with_error(scale * v, scale * s) for v, s in zip(result.values, result.std, strict=True)]
+        ends = result.ends or [""] * len(result.values)
+        numbers = zip(result.values, result.std, ends, strict=True)
+        values = [with_error(scale * v, scale * s, end) for v, s, end in numbers]
         p_value = "< 0.0001" if result.p_value < 1e-4 else number(result.p_value, 2)
         rows.append([result.name, unit or "1", *values, p_value, verdicts[result.agree]])
     header = ["parameter", "unit", *compared.labels, "p", "agree"]

@@ -88,18 +88,18 @@ def _same(runs: Sequence[Material], *columns: str) -> bool:
 
 def _differences(compared: Comparison, runs: Sequence[Material]) -> str:
     """What differs in the inputs: recordings, settings, versions."""
-    parts = []
+    parts, labels = [], compared.labels
     if not _same(runs, "time", "outputs"):
-        parts.append(f"the recording ({_recordings_in_words(runs)})")
+        parts.append(f"the recording ({_recordings_in_words(labels, runs)})")
     elif not _same(runs, "inputs"):
         parts.append("the inputs of the recording")
     kinds = [kind_words(run) for run in runs]
     several = len(set(kinds)) > 1  # their settings have different keys
-    parts += [f"the kind of run ({'; '.join(kinds)})"] if several else []
+    parts += [f"the kind of run ({by_run(labels, kinds)})"] if several else []
     settings = {} if several else setting_differences(compared, runs)[0]
     if any(compared.differences.get(section) for section in VERSIONS):
         parts.append("versions of the software")
-    parts += [f"{key} ({'; '.join(texts)})" for key, texts in settings.items()]
+    parts += [f"{key} ({by_run(labels, texts)})" for key, texts in settings.items()]
     return f"They differ in {_first(parts)}." if parts else "Recording, settings and versions are the same."
 
 
@@ -114,11 +114,13 @@ def setting_differences(compared: Comparison, runs: Sequence[Material]) -> tuple
     has = [{part for key, text in each.items() if text not in NONE for part in _parts(key)} for each in records]
     settings: dict[str, tuple[str, ...]] = {}
     lacking: dict[str, dict[str, str]] = {}  # section -> key -> its part that some runs lack
-    for key, texts in differing.items():
+    for key, texts in (entry for each in differing.items() for entry in _without_common(*each).items()):
         words = tuple(plain_text(text) for text in texts)
         if key in NOT_IN_WORDS or len(set(words)) == 1 or _are_one_amount(words):
             continue
         settings[key] = words
+        if key not in differing:  # within a setting of JSON
+            continue
         part = next((part for part in _parts(key) if not all(part in each for each in has)), key)
         if part != key and len({text for text in texts if text not in NONE}) == 1:
             lacking.setdefault(part.rpartition(".")[0], {})[key] = part
@@ -130,6 +132,49 @@ def setting_differences(compared: Comparison, runs: Sequence[Material]) -> tuple
             left_out += len(parts)
             settings = {key: words for key, words in settings.items() if key not in parts}
     return rows | settings, left_out
+
+
+def _without_common(key: str, texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """A setting of JSON as the keys below it that differ, such as recordings.file; of lists, what not every run has."""
+    try:
+        values = [orjson.loads(text) if text else None for text in texts]
+    except ValueError:
+        return {key: tuple(texts)}
+    if not all(isinstance(value, list | dict) for value in values):
+        return {key: tuple(texts)}
+    return {name: tuple(map(_json, each)) for name, each in _differing_leaves(key, values).items()}
+
+
+def _differing_leaves(key: str, values: Sequence[Any]) -> dict[str, Sequence[Any]]:
+    """The deepest keys that differ. Lists of tables are compared entry by entry if all runs have as many without a
+    name; lists of other things by what they hold, without what every run has.
+    """
+    if all(value == values[0] for value in values):
+        return {}
+    if all(isinstance(value, dict) for value in values):
+        names = dict.fromkeys(name for value in values for name in value)
+        each = (_differing_leaves(f"{key}.{name}", [value.get(name) for value in values]) for name in names)
+        return {name: texts for leaves in each for name, texts in leaves.items()}
+    if not all(isinstance(value, list) for value in values):
+        return {key: values}
+    count = len(values[0])
+    if all(len(value) == count and all(map(_is_nameless_table, value)) for value in values):
+        numbered = [f"{key}.{k + 1}" if count > 1 else key for k in range(count)]
+        each = (
+            _differing_leaves(name, of_runs) for name, of_runs in zip(numbered, zip(*values, strict=True), strict=True)
+        )
+        return {name: texts for leaves in each for name, texts in leaves.items()}
+    rest = [[entry for entry in value if not all(entry in other for other in values)] for value in values]
+    return {key: rest if any(rest) else values}  # the same entries in another order
+
+
+def _is_nameless_table(entry: Any) -> bool:
+    return isinstance(entry, dict) and not {"name", "effect"} & entry.keys()
+
+
+def _json(value: Any) -> str:
+    """A value as text of a setting, '' for none."""
+    return value if isinstance(value, str) else "" if value in (None, [], {}) else orjson.dumps(value).decode()
 
 
 def _part_differences(section: str, parts: Collection[str], has: Sequence[set[str]]) -> dict[str, tuple[str, ...]]:
@@ -182,20 +227,28 @@ def _in_words(value: Any) -> str:
     if isinstance(value, dict) and {"effect", "location"} <= value.keys():
         return effect_words(str(value["effect"]), str(value["location"]))
     if isinstance(value, dict):
-        given = {key: each for key, each in value.items() if each is not None}
+        given = {key: each for key, each in value.items() if each not in (None, "", [], {})}
         return ", ".join(
             _in_words(each) if key == "name" else f"{key} {_in_words(each)}" for key, each in given.items()
         )
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _recordings_in_words(runs: Sequence[Material]) -> str:
+def by_run(labels: Sequence[str], texts: Sequence[str]) -> str:
+    """'a and c: pump lag at Q; b: none': which run has which text."""
+    runs: dict[str, list[str]] = {}
+    for label, text in zip(labels, texts, strict=True):
+        runs.setdefault(text, []).append(label)
+    return "; ".join(f"{listed(having)}: {text}" for text, having in runs.items())
+
+
+def _recordings_in_words(labels: Sequence[str], runs: Sequence[Material]) -> str:
     """Names of the recordings; what tells them apart if the names are the same."""
     names = [_recordings(run) for run in runs]
     if len(set(names)) > 1:
-        return "; ".join(names)
+        return by_run(labels, names)
     counts = [f"{sum(len(recording.time) for recording in run.fitted.values())} samples" for run in runs]
-    return f"{names[0]}: {'; '.join(counts) if len(set(counts)) > 1 else 'other readings'}"
+    return by_run(labels, counts) if len(set(counts)) > 1 else f"{names[0]}: other readings"
 
 
 def _recordings(run: Material) -> str:

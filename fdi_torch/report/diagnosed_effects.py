@@ -39,6 +39,8 @@ class DiagnosedEffect:
     flow: float = NAN
     hole: float = NAN
     quantity: str = "size"
+    end: str = ""
+    """'low' or 'high' if the size lies at that end of its range."""
     equivalents: str = ""
     """Other effects that act alike, ', or equivalently leak at B'."""
 
@@ -52,7 +54,7 @@ class DiagnosedEffect:
         """'leak at T1 (size 0.3000 ± 0.0020, 33.1 cm³/s)': the effect with its size and, if it has one, its flow."""
         name = f"{self.location}.{self.effect}.{self.quantity}"
         unit, scale = shown_unit(self.unit, name)
-        value = with_error(scale * self.size, scale * self.std)
+        value = with_error(scale * self.size, scale * self.std, self.end)
         sizes = [amount_words(name, value, unit)] if math.isfinite(self.size) else []
         sizes += [f"{amount(self.flow, 'm^3/s', 3)}"] if math.isfinite(self.flow) else []
         return f"{self.words} ({', '.join(sizes)})" if sizes else self.words
@@ -60,18 +62,21 @@ class DiagnosedEffect:
 
 def diagnosed_effects(material: Material) -> list[DiagnosedEffect]:
     """Faults of a diagnosis, from the last message about each, and causes of a gap other than rounded readings."""
-    faults = {(m.get("fault"), m.get("location")): _fault(m) for m in material.of("/diagnosis/fault")}
+    faults = {
+        (m.get("fault"), m.get("location")): _fault(m, material.run.at_bounds) for m in material.of("/diagnosis/fault")
+    }
     causes = apart_from_rounding(material.answer.get("causes", []))
     return [*faults.values(), *(_cause(cause, material.plant) for cause in causes)]
 
 
-def _fault(message: Mapping[str, Any]) -> DiagnosedEffect:
+def _fault(message: Mapping[str, Any], at_bounds: Mapping[str, str]) -> DiagnosedEffect:
     size, std, flow, hole = (as_float(message.get(name)) for name in ("size", "size_std", "flow", "hole_diameter"))
     name, location, unit = (str(message.get(key, "")) for key in ("fault", "location", "unit"))
     fault = ParameterName.of_effect(f"{location}.{name}")
     quantity = fault.field or "size"
+    end = at_bounds.get(f"{location}.{fault.effect}.{quantity}", "")
     return DiagnosedEffect(
-        fault.effect, location, message.get("present") is True, size, std, unit, flow, hole, quantity
+        fault.effect, location, message.get("present") is True, size, std, unit, flow, hole, quantity, end
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 MOST_ROWS = 300
 NARROW = 3
+SORTED = " ↓↑"  # the signs behind the column by which a table is sorted, which its cells do not repeat
 _TAGS = re.compile("<[^>]*>")
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff\u202a-\u202e\u2066-\u2069]")
 
@@ -51,7 +52,7 @@ def table(header: Sequence[Any], rows: Sequence[Sequence[Any]], left: int = 1, m
     A column whose cells are all empty is left out.
     A table of more than NARROW columns is `wide`: on a phone its rows become cards, each cell with its `data-label`.
     """
-    labels = [_TAGS.sub("", name) if isinstance(name, Markup) else clean(name) for name in header]
+    labels = [_TAGS.sub("", name).rstrip(SORTED) if isinstance(name, Markup) else clean(name) for name in header]
     sides = ["l" if i < left else "r" for i in range(len(header))]
     filled = [i for i in range(len(header)) if not rows or any(row[i] != "" for row in rows)]
     head = tag("tr", *(tag("th", header[i], class_=sides[i]) for i in filled))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fdi_torch import amounts
-from fdi_torch.amounts import LOWERED, RAISED
+from fdi_torch.amounts import AT_95, LOWERED, RAISED
 from fdi_torch.quantities import display_unit, significant
 
 _RAISED_POWER = re.compile(rf"(?<=[^\W\d])[{''.join(map(chr, LOWERED))}]+")
@@ -73,9 +73,11 @@ def number(value: float, digits: int = 4) -> str:
     return _minus(factor) + (f"·10{str(int(exponent)).translate(RAISED)}" if exponent else "")
 
 
-def with_error(value: float, std: float) -> str:
-    """'0.3000 ± 0.0020': the error with two digits, the value with as many decimals; a dash for NaN."""
-    return _minus(amounts.with_error(value, std)) if math.isfinite(value) else number(value)
+def with_error(value: float, std: float, end: str = "") -> str:
+    """'0.3000 ± 0.0020': the error with two digits, the value with as many decimals; a dash for NaN. end: as for
+    `amounts.with_error`.
+    """
+    return _minus(amounts.with_error(value, std, end)) if math.isfinite(value) else number(value)
 
 
 def rounded_number(value: float, std: float) -> str:
@@ -106,15 +108,18 @@ def as_vector(values: Any) -> np.ndarray:
 
 
 HEADER = ("unit", "estimate", "95 % interval")
-AT_95 = 1.96
 
 
-def estimate_cells(name: str, si_unit: str, value: float, std: float) -> list[str]:
-    """The cells below HEADER of an SI value, in its unit for display; an infinite std: it is not determined."""
+def estimate_cells(name: str, si_unit: str, value: float, std: float, end: str = "") -> list[str]:
+    """The cells below HEADER of an SI value, in its unit for display; an infinite std: it is not determined. end: 'low'
+    or 'high' for an estimate at an end of its range, see `amounts.with_error`.
+    """
     unit, scale = shown_unit(si_unit, name)
     value, std = scale * value, scale * std
-    ends = (value - AT_95 * std, value + AT_95 * std)
-    interval = " … ".join(rounded_number(end, std) for end in ends) if math.isfinite(std) else "–"
+    if end and math.isfinite(std) and std > 0.0:
+        return [unit or "1", rounded_number(value, std), with_error(value, std, end)]
+    limits = (value - AT_95 * std, value + AT_95 * std)
+    interval = " … ".join(rounded_number(limit, std) for limit in limits) if math.isfinite(std) else "–"
     return [unit or "1", with_error(value, std), interval]
 
 

@@ -73,7 +73,7 @@ def page(reports: Sequence[RunReport], first: Sequence[Section] = (), above: Seq
         runs = [(f"r{k}-run", name) for k, name in enumerate(labels_of([r.material.run.path for r in reports]))]
         listed = [*((f"all-{k}", section.title) for k, section in enumerate(first)), *runs]
         shared = (section_html(section, "all-", f"all-{k}") for k, section in enumerate(first))
-        articles = [_index(listed), *shared, *articles]
+        articles = [tag("h1", f"Comparison · {title}"), _index(listed), *shared, *articles]
     return document(title, [*above, *articles])
 
 

@@ -15,7 +15,7 @@ from fdi_torch.gap.verdict_words import verdict_sentence
 from fdi_torch.names import counted, listed
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import number, sentence
+from fdi_torch.report.numbers import as_float, number, sentence, with_error
 from fdi_torch.report.sections.monitor import rehearsal_tables
 from fdi_torch.report.sections.study import SHOWN
 from fdi_torch.report.sections.windows import logged_windows
@@ -112,8 +112,9 @@ def _since(event: Mapping[str, Any]) -> str:
     onset = event.get("onset")
     if not isinstance(onset, int | float):
         return ""
-    moment = clock_text(float(onset))
-    return f", since {number(float(onset), 4)} s" + (f", {moment}" if moment else "")
+    moment, std = clock_text(float(onset)), as_float(event.get("onset_std"))
+    shown = with_error(float(onset), std) if math.isfinite(std) else number(float(onset), 4)
+    return f", since {shown} s" + (f", {moment}" if moment else "")
 
 
 def alarm_words(material: Material) -> str:

@@ -109,7 +109,7 @@ def test_a_live_source_is_not_called_simulated(tmp_path: Path) -> None:
     live = {"recording.file": "mqtt://broker/rig"}
     a = write_fit(tmp_path / "a.mcap", 0.004, config=live)
     b = write_fit(tmp_path / "b.mcap", 0.001, level=0.2)
-    assert sentences(a, b)[-1].startswith("They differ in the recording (mqtt://broker/rig; simulated)")
+    assert sentences(a, b)[-1].startswith("They differ in the recording (a: mqtt://broker/rig; b: simulated)")
 
 
 def test_settings_are_told_in_words(tmp_path: Path) -> None:
@@ -117,14 +117,69 @@ def test_settings_are_told_in_words(tmp_path: Path) -> None:
     a = write_fit(tmp_path / "a.mcap", 0.001, config={"seed": 2})
     b = write_fit(tmp_path / "b.mcap", 0.001, config=ours)
     assert settings_of(a, b)[0] == {"seed": ("2", "1"), "plant.effects": ("none", "leak at T1")}
-    assert sentences(a, b)[-1] == "They differ in seed (2; 1) and plant.effects (none; leak at T1)."
+    assert sentences(a, b)[-1] == ("They differ in seed (a: 2; b: 1) and plant.effects (a: none; b: leak at T1).")
     assert plain_text('[{"name":"T1.leak","low":null}]') == "T1.leak" and plain_text("[broken") == "[broken"
+
+
+def test_of_nested_settings_the_keys_and_entries_that_differ_are_named(tmp_path: Path) -> None:
+    """A run that lacks an entry of a list is told by its label; what all runs have is left out."""
+    recording = {"file": "run.xlsx", "header": True, "columns": {"t": "t", "Q": "Q"}}
+    other = recording | {"file": "run_de.txt", "columns": {"t": "column 1", "Q": "Q"}}
+    a = write_fit(tmp_path / "a.mcap", 0.001, config={"recordings": [recording], "faults": ["A.leak", "B.leak"]})
+    b = write_fit(tmp_path / "b.mcap", 0.001, config={"recordings": [other], "faults": ["A.leak"]})
+    c = write_fit(tmp_path / "c.mcap", 0.001, config={"recordings": [recording], "faults": ["A.leak", "B.leak"]})
+    assert settings_of(a, b, c)[0] == {
+        "recordings.file": ("run.xlsx", "run_de.txt", "run.xlsx"),
+        "recordings.columns.t": ("t", "column 1", "t"),
+        "faults": ("B.leak", "none", "B.leak"),
+    }
+    assert "recordings.file (a and c: run.xlsx; b: run_de.txt)" in sentences(a, b, c)[-1]
+
+
+def test_lists_of_several_recordings_and_of_named_entries_are_told_apart(tmp_path: Path) -> None:
+    leak, lag = {"effect": "leak", "location": "T1"}, {"effect": "pump_lag", "location": "Q1"}
+    first = {"recordings": [{"file": "1.csv"}, {"file": "2.csv"}], "plant.effects": [leak, lag]}
+    second = {"recordings": [{"file": "1.csv"}, {"file": "3.csv"}], "plant.effects": [leak]}
+    a, b = (
+        write_fit(tmp_path / f"{name}.mcap", 0.001, config=config) for name, config in (("a", first), ("b", second))
+    )
+    assert settings_of(a, b)[0] == {
+        "recordings.2.file": ("2.csv", "3.csv"),
+        "plant.effects": ("pump lag at Q1", "none"),
+    }
+
+
+def write_leak(path: Path, *, place: str = "T1", explained: bool = True) -> Path:
+    """An estimate of one parameter that all runs share and of one that only this run has, with a fault."""
+    with RunLog(path, "train", config_text="", config={}, env={}, git={}) as log:
+        names = ["T1.leak.size", f"{path.stem}.area"]
+        log.estimate(names, [0.3, 1.0], [0.01, 0.1], np.eye(2), "converged", units=["1", "m^2"])
+        log.fault("leak.size" if place == "T1" else "leak", place, True)
+        log.result({"explained": explained})
+    return path
+
+
+def agreement(*logs: Path) -> list[str]:
+    return in_words(compare(logs), [gather(read_run(log)) for log in logs])
+
+
+def test_runs_agree_only_if_each_is_reliable_and_they_name_the_same_faults(tmp_path: Path) -> None:
+    a, b = (write_leak(tmp_path / f"{name}.mcap") for name in "ab")
+    other, bad = write_leak(tmp_path / "c.mcap", place="T2"), write_leak(tmp_path / "bad.mcap", explained=False)
+    assert agreement(a, b) == ["Of 3 parameters 1 is in both runs; there they agree at 95 %."]
+    assert agreement(a, other) == [
+        "Of 4 parameters 1 is in both runs; none of these differs at 95 %, but the runs name different faults."
+    ]
+    assert agreement(a, bad, b) == [
+        "Of 4 parameters 1 is in both reliable runs; none of these differs at 95 %, but bad is unreliable."
+    ]
+    assert agreement(a, bad) == ["The estimates are not compared, as bad is unreliable."]
 
 
 def test_every_difference_that_is_not_listed_is_counted(tmp_path: Path) -> None:
     a = write_fit(tmp_path / "a.mcap", 0.001, config={f"key{k}": 1 for k in range(9)})
     b = write_fit(tmp_path / "b.mcap", 0.001, level=0.2, config={f"key{k}": 2 for k in range(9)})
-    listed = "the recording (simulated: other readings), key0 (1; 2), key1 (1; 2), key2 (1; 2)"
+    listed = "the recording (simulated: other readings), key0 (a: 1; b: 2), key1 (a: 1; b: 2), key2 (a: 1; b: 2)"
     assert sentences(a, b)[-1] == f"They differ in {listed} and 6 more."
 
 
@@ -233,9 +288,12 @@ def test_units_on_the_terminal_are_written_as_in_files(tmp_path: Path, capsys: p
         ("plant.pipes.P13.discharge_coefficient", "P13.plugging.size", False),
     ],
 )
-def test_leaks_relative_to_another_capacity_are_not_compared_unsaid(setting: str, name: str, said: bool) -> None:
+def test_leaks_relative_to_another_capacity_are_not_compared_unsaid(
+    tmp_path: Path, setting: str, name: str, said: bool
+) -> None:
     result = Result(name, "1", (0.150, 0.155), (2e-4, 2e-4), 1e-9)
     compared = Comparison(("a", "b"), {"config": {setting: ("0.6", "0.62")}}, (result,), False, True)
-    _, *others = in_words(compared)
+    runs = [gather(read_run(write_fit(tmp_path / f"{label}.mcap", 0.001))) for label in compared.labels]
+    _, *others = in_words(compared, runs)
     explained = f"{name}: relative to the capacity of a pipe in the plant file; {setting} differs."
     assert (explained in others) is said

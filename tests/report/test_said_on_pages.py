@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,10 @@ import pytest
 from sample_runs import material_of, write_study
 
 from fdi_torch.config.plant_file import load_plant
-from fdi_torch.logbook import RunLog
+from fdi_torch.logbook import RunLog, compare
+from fdi_torch.report.comparison import result_table
 from fdi_torch.report.page import page, report_of
-from fdi_torch.report.sections.monitor import _texts
+from fdi_torch.report.sections.monitor import _texts, adoptions
 from fdi_torch.report.verdict import headline
 
 
@@ -31,12 +33,53 @@ def test_an_interval_has_the_digits_of_its_estimate(tmp_path: Path) -> None:
     assert "154.4 ± 2.0" in text and ">150.5 … 158.3<" in text
 
 
+def test_an_estimate_at_an_end_of_its_range_has_a_one_sided_interval(tmp_path: Path) -> None:
+    for name, end in (("a", "low"), ("b", "high")):
+        with RunLog(tmp_path / f"{name}.mcap", "train", env={}, git={}) as log:
+            value = 0.0 if end == "low" else 1.0
+            names = ["B.leak.size"]
+            log.estimate(names, [value], [0.026], [[0.026**2]], "converged", units=["1"], at_bound=names)
+            log.result({"at_bounds": {"B.leak.size": end}})
+    text = page([report_of(material_of(tmp_path / "a.mcap"))])
+    assert ">0.000<" in text and ">below 0.051<" in text and "0.000 ±" not in text
+    assert "B.leak.size lies at the low end of its range" in text
+    compared = result_table(compare([tmp_path / "a.mcap", tmp_path / "b.mcap"]))
+    assert compared[1][0][2:4] == ["below 0.051", "above 0.949"]
+
+
 def test_the_headline_of_a_monitor_is_set_as_the_rest_of_its_page(tmp_path: Path) -> None:
     with RunLog(tmp_path / "run.mcap", "monitor", env={}, git={}) as log:
         held = "pump offset at Q (-11.07 ± 0.87 cm^3/s), by hA-hB"
         log.alarm(764.0, "isolated", "Q.pump_offset", held, alarm=1, state="isolated", headline=held)
     made = headline(material_of(tmp_path / "run.mcap"))
     assert made == "Pump offset at Q (−11.07 ± 0.87 cm³/s), by hA-hB (isolated)"
+
+
+def test_a_page_of_a_monitor_marks_when_its_model_took_a_fault_in(tmp_path: Path) -> None:
+    """From the mark on, residuals are those of the model with the fault; the readings have both models' predictions."""
+    time = np.arange(10.0)
+    with RunLog(tmp_path / "run.mcap", "monitor", config_text="plant: three_tank\n", env={}, git={}) as log:
+        log.recording(time, np.full((10, 1), 4e-5), np.full((10, 1), 0.3), ("Q1",), ("h1",), ("m^3/s",), ("m",))
+        for t in time[1:]:
+            log.write("/observer/residual", {"h1": 0.01 * t, "h1_statistic": t}, t, units={"h1": "m"})
+        for t, believed in ((4.0, []), (6.0, [["A.leak.size", 0.2]]), (7.0, [["A.leak.size", 0.21]]), (8.0, [])):
+            log.alarm(t, "explained", "", "", details=json.dumps({"believed": believed}))
+    material = material_of(tmp_path / "run.mcap")
+    assert adoptions(material) == [(6.0, "leak at A adopted"), (8.0, "leak at A dropped")]
+    report = report_of(material)
+    charts = {p.name: p.chart for p in report.pictures if p.chart is not None}
+    for name in ("observer_residual_1", "observer_statistic_1", "output_1"):
+        assert charts[name].marks == adoptions(material)
+    measured, predicted = charts["output_1"].lines
+    np.testing.assert_allclose(measured.y - predicted.y, [np.nan, *time[1:]], atol=1e-12)
+    assert "from there on the residuals are those of the model with the fault named" in page([report])
+
+
+def test_the_onset_in_the_headline_of_a_monitor_has_its_error(tmp_path: Path) -> None:
+    with RunLog(tmp_path / "run.mcap", "monitor", env={}, git={}) as log:
+        told = {"alarm": 1, "state": "isolated", "headline": "leak at A", "onset": 700.1412, "onset_std": 0.21}
+        log.alarm(764.0, "isolated", "A.leak.size", "leak at A", **told)
+    assert headline(material_of(tmp_path / "run.mcap")) == "Leak at A, since 700.14 ± 0.21 s (isolated)"
 
 
 def test_runs_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from fdi_torch.cli import MISUSE, main
+from fdi_torch.cli.view import _fitting
 from fdi_torch.logbook import RunLog, read_run
 from fdi_torch.report.material import gather
 from fdi_torch.report.predictions import residual_size
@@ -258,11 +259,20 @@ def test_what_cannot_be_served_is_said(tmp_path: Path, capsys: pytest.CaptureFix
     assert "--port: expected a free port, got 70000" in capsys.readouterr().err
 
 
+def test_a_verdict_is_cut_to_the_width_of_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    header, rows = ("log", "verdict"), [["a.mcap", "leak " * 40], ["longer.mcap", "none"]]
+    assert _fitting(header, rows) == rows
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    monkeypatch.setenv("COLUMNS", "80")
+    first, second = _fitting(header, rows)
+    assert len(first[1]) == 80 - len("longer.mcap") - 2 and first[1].endswith("…") and second == rows[1]
+
+
 def test_the_list_is_printed_for_a_day_and_for_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_fit(tmp_path / "a.mcap", 0.02)
     started = read_run(tmp_path / "a.mcap").metadata["fdi_torch.run"]["started"][:10]
     assert main(["view", str(tmp_path), "--list", started]) == 0
     assert "a.mcap" in capsys.readouterr().out
     assert main(["view", str(tmp_path), "--list", "no such words"]) == 0
-    assert capsys.readouterr().out.endswith("no log with the words 'no such words'\n")
+    assert capsys.readouterr().out == "no log matches 'no such words'\n"
     assert main(["view", str(tmp_path / "gone"), "--list"]) != 0

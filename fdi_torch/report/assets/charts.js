@@ -191,20 +191,29 @@ class Chart {
     });
   }
 
-  // Mean and root mean square of the residuals of the stretch that is shown; not of thinned lines.
+  // Mean and root mean square of the residuals of the stretch that is shown, part by part between its marks.
   summary(low, high) {
+    const inside = this.about.marks.map(mark => mark[0]).filter(moment => moment > low && moment < high);
+    const ends = [low, ...new Set(inside), high];
+    const parts = ends.slice(0, -1).map((end, k) => this.part(end, ends[k + 1], !k));
+    this.note.replaceChildren(...parts.filter(part => part).map(part => element("div", "", part)));
+  }
+
+  // Of the part after `low`, and with `low` if it is the first one, until `high`; not of thinned lines.
+  part(low, high, first) {
     const from = `${text(low, 5)} to ${text(high, 5)}${unit(this.about.x)}`, words = [];
     if (this.about.level === 0) this.lines.forEach((line, i) => {
       if (!line.complete) return;
       const time = this.data[0];
-      const inside = this.data[i + 1].filter((value, k) => value != null && time[k] >= low && time[k] <= high);
+      const begun = at => (first ? at >= low : at > low);
+      const inside = this.data[i + 1].filter((value, k) => value != null && begun(time[k]) && time[k] <= high);
       if (!inside.length) return;
       const mean = inside.reduce((sum, value) => sum + value, 0) / inside.length;
       const square = Math.sqrt(inside.reduce((sum, value) => sum + value * value, 0) / inside.length);
       const name = this.lines.length > 1 ? line.name + ": " : "";
       words.push(`${name}mean ${text(mean, 3)}, rms ${text(square, 3)}${unit(this.about.y)}`);
     });
-    this.note.textContent = words.length ? [from, ...words].join(" \u00b7 ") : "";
+    return words.length ? [from, ...words].join(" \u00b7 ") : "";
   }
 
   marks(plot) {
@@ -227,6 +236,21 @@ class Chart {
       const x = plot.valToPos(moment, "x", true);
       line(x, top, x, top + height);
     }
+    ctx.strokeStyle = ctx.fillStyle = colour("ink");
+    ctx.font = `${12 * devicePixelRatio}px system-ui, sans-serif`;
+    ctx.setLineDash([2 * devicePixelRatio, 2 * devicePixelRatio]);
+    this.about.marks.forEach(([moment, label], k, all) => {
+      const x = plot.valToPos(moment, "x", true), left_of_it = x > left + width / 2;
+      line(x, top, x, top + height);
+      ctx.textAlign = left_of_it ? "right" : "left";
+      const y = top + (14 + 15 * k) * devicePixelRatio;
+      if (all.length > 4) return;
+      const at = x + (left_of_it ? -4 : 4) * devicePixelRatio, wide = ctx.measureText(label).width;
+      ctx.fillStyle = colour("paper");
+      ctx.fillRect(left_of_it ? at - wide : at, y - 11 * devicePixelRatio, wide, 14 * devicePixelRatio);
+      ctx.fillStyle = colour("ink");
+      ctx.fillText(label, at, y);
+    });
     ctx.restore();
   }
 

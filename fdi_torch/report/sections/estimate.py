@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fdi_torch.amounts import end_words
 from fdi_torch.estimate.misfit import NOT_ESTABLISHED
 from fdi_torch.names import counted
 from fdi_torch.report.chart import Chart, Line
@@ -30,9 +31,9 @@ def estimate_section(material: Material) -> Section | None:
         return None
     names, units = [str(name) for name in final["names"]], final.get("units") or [""] * len(final["names"])
     rows = []
-    for i, name in enumerate(names):
-        cells = estimate_cells(name, str(units[i]), float(final["values"][i]), float(final["std"][i]))
-        rows.append([name, _finding(material, name), *cells, _simulated(material, str(units[i]), (name,), (1.0,))])
+    for name, unit, value, std in zip(names, units, final["values"], final["std"], strict=True):
+        cells = estimate_cells(name, str(unit), float(value), float(std), material.run.at_bounds.get(name, ""))
+        rows.append([name, _finding(material, name), *cells, _simulated(material, str(unit), (name,), (1.0,))])
     for c in combinations_of(material, "combinations"):
         deviates = c in combinations_of(material, "not_isolated") and not material.unexplained
         found = tag("span", "present", class_="bad") if deviates else ""
@@ -40,7 +41,7 @@ def estimate_section(material: Material) -> Section | None:
         rows.append([c.formula, found, *cells, _simulated(material, c.unit, c.parameters, c.coefficients)])
     header = ("parameter", "finding", *HEADER, "simulated")  # without the columns that are empty
     notes = [str(note) for note in final.get("unidentifiable") or ()]
-    notes += [f"{name} lies at an end of its range" for name in final.get("at_bound") or ()]
+    notes += [end_words(str(name), material.run.at_bounds.get(str(name), "")) for name in final.get("at_bound") or ()]
     return Section("Estimate", [table(header, rows, left=3), *_water(material), *bullets(notes)], lead=True)
 
 

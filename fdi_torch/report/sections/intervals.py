@@ -11,7 +11,7 @@ from fdi_torch.estimate.uncertainty import chi_square_quantile
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import bullets, table
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import as_float, as_vector, axis, number, shown_unit
+from fdi_torch.report.numbers import AT_95, as_float, as_vector, axis, number, shown_unit, with_error
 from fdi_torch.report.section import Column, Picture, Section, signals
 from fdi_torch.report.sections.estimate import last_estimate
 from fdi_torch.report.style import MODEL, OTHER
@@ -33,7 +33,13 @@ def intervals_section(material: Material) -> Section | None:
         if name not in profiles and name not in draws:
             continue
         unit, scale = shown_unit(final["units"][i] if final.get("units") else "", name)
-        rows.append([name, unit or "1", *_limits(final, i, profiles.get(name), draws.get(name), scale)])
+        rows.append(
+            [
+                name,
+                unit or "1",
+                *_limits(final, i, material.run.at_bounds.get(name, ""), profiles.get(name), draws.get(name), scale),
+            ]
+        )
         pictures.append(_column(name, unit, scale, profiles.get(name), draws.get(name), len(pictures)))
     words = (
         "Standard errors assume a likelihood that is quadratic about the estimate. The profile is the likelihood ratio "
@@ -58,10 +64,11 @@ def _draws(material: Material) -> dict[str, np.ndarray]:
 
 
 def _limits(
-    final: Payload, i: int, profile: Mapping[str, Any] | None, draws: np.ndarray | None, scale: float
+    final: Payload, i: int, end: str, profile: Mapping[str, Any] | None, draws: np.ndarray | None, scale: float
 ) -> list[str]:
-    value, reach = float(final["values"][i]), 1.96 * float(final["std"][i])
-    cells = [_interval(scale * (value - reach), scale * (value + reach)), "", "", ""]
+    value, std = scale * float(final["values"][i]), scale * float(final["std"][i])
+    two_sided = _interval(value - AT_95 * std, value + AT_95 * std)
+    cells = [with_error(value, std, end) if end else two_sided, "", "", ""]
     if profile is not None:
         level = f" ({100.0 * as_float(profile.get('confidence')):g} %)"
         cells[1] = _interval(*(scale * as_float(profile.get(end)) for end in ("low", "high"))) + level

@@ -10,8 +10,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import orjson
 
+from fdi_torch.amounts import faults_in_words
 from fdi_torch.clock import clock_text
+from fdi_torch.names import listed
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import Markup, table, tag
 from fdi_torch.report.material import Material, Payload
@@ -29,34 +32,64 @@ def residual_section(material: Material) -> Section | None:
     columns, time = material.residuals, material.residuals.get("t", np.zeros(0))
     if not len(time):
         return None
-    alarms, pictures = _alarms(material), []
+    alarms, marks, pictures = _alarms(material), adoptions(material), []
     for k, name in enumerate(name for name in columns if name != "t" and not name.endswith(_SUFFIXES)):
         unit, lines = material.unit(RESIDUAL, name), [Line("measured − predicted", time, columns[name], MODEL)]
-        about: dict[str, Any] = {"level": 0.0, "events": alarms, "clock": "monitor", "height": 2.1}
-        words = f"observer_residual_{k + 1}", material.channel_words(name), "residual"
-        pictures.append(channel_signals(*words, unit, lines, name, **about))
-    return Section("Residuals", ["Vertical lines: alarms.", pictures]) if pictures else None
+        about: dict[str, Any] = {"level": 0.0, "events": alarms, "marks": marks, "clock": "monitor", "height": 2.1}
+        about |= {"name": f"observer_residual_{k + 1}", "title": material.channel_words(name), "label": "residual"}
+        pictures.append(channel_signals(si_unit=unit, lines=lines, channel=name, **about))
+    words = f"Vertical lines: alarms.{mark_words(marks, 'the residuals are')}"
+    return Section("Residuals", [words, pictures]) if pictures else None
 
 
 def statistic_section(material: Material) -> Section | None:
     """Each test statistic with its threshold and the alarms."""
     columns, time = material.residuals, material.residuals.get("t", np.zeros(0))
-    alarms, pictures = _alarms(material), []
+    alarms, marks, pictures = _alarms(material), adoptions(material), []
     for k, name in enumerate(name for name in columns if name.endswith("_statistic")):
         channel = name.removesuffix("_statistic")
         limit = columns.get(f"{channel}_threshold")
         lines = [Line("statistic", time, columns[name], MODEL)]
         lines += [] if limit is None else [Line("threshold", time, limit, MARK, dashed=True)]
         title = f"Test statistic, {NAMES.get(channel) or material.channel_words(channel)}"
-        chart = Chart(title, "time, s", "statistic (no unit)", lines, log=True, events=alarms, clock="monitor")
+        chart = Chart(
+            title, "time, s", "statistic (no unit)", lines, log=True, events=alarms, marks=marks, clock="monitor"
+        )
         pictures.append(signals(f"observer_statistic_{k + 1}", chart))
     words = "Vertical lines: alarms. Dashed: thresholds." if alarms else "Dashed: thresholds. No alarm was raised."
+    words += mark_words(marks, "the statistics are")
     return Section("Detection", [words, pictures], lead=True) if pictures else None
 
 
 def _alarms(material: Material) -> list[float]:
     """Times of the alarms, s."""
     return [float(m["t"]) for m in material.of(ALARM) if m.get("event") in ("alarm", "raised")]
+
+
+def adoptions(material: Material) -> list[tuple[float, str]]:
+    """Time, s, and words of each change of the faults that the monitor's model contains: 'leak at A adopted'."""
+    held: tuple[str, ...] = ()
+    changes: list[tuple[float, str]] = []
+    for message in material.of(ALARM):
+        now = _believed(message)
+        if now is not None and now != held:
+            words = f"{listed(faults_in_words(now))} adopted" if now else f"{listed(faults_in_words(held))} dropped"
+            changes.append((float(message["t"]), words))
+            held = now
+    return changes
+
+
+def _believed(message: Payload) -> tuple[str, ...] | None:
+    """Names of the sizes of the faults that the monitor's model contains after an event; None if the log lacks them."""
+    try:
+        return tuple(sorted(str(name) for name, _ in orjson.loads(message.get("details", ""))["believed"]))
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def mark_words(marks: Sequence[tuple[float, str]], what: str) -> str:
+    """The sentence about the dashed lines of `adoptions`; empty without any."""
+    return f" Thin dashed lines: from there on {what} those of the model with the fault named." if marks else ""
 
 
 def event_section(material: Material) -> Section | None:

@@ -119,7 +119,7 @@ def health_section(material: Material) -> Section | None:
     state = tag("span", "damaged", class_="bad") if problems else tag("span", "intact", class_="good")
     topics, chunks = inspection.topics.values(), counted(inspection.health.chunks, "chunk")
     content = f"{counted(inspection.messages, 'message')} on {counted(len(topics), 'topic')} in {chunks}"
-    rows = [[info.topic, str(info.messages), number(info.first), number(info.last)] for info in topics]
+    rows = [[info.topic, str(info.messages), *info.span] for info in topics]
     messages = [
         tag("li", f"{_LEVELS[level]}: " if (level := m.get("level")) in _LEVELS else "", m.get("message", ""))
         for m in material.of("/log")
@@ -131,6 +131,6 @@ def health_section(material: Material) -> Section | None:
             *bullets(problems),
             *([inspection.advice] if inspection.advice else []),
             *([folded(f"Log messages ({len(messages)})", tag("ul", *messages))] if messages else []),
-            folded("Topics", table(("topic", "messages", "from, s", "to, s"), rows)),
+            folded("Topics", table(("topic", "messages", "from", "to"), rows)),
         ],
     )

@@ -18,6 +18,7 @@ from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import amount, as_float, axis, number, shown_unit
 from fdi_torch.report.predictions import holdout_prefix, predicted
 from fdi_torch.report.section import Column, Picture, Section, channel_signals, signals
+from fdi_torch.report.sections.monitor import adoptions
 from fdi_torch.report.style import MODEL, OTHER, SOFT
 from fdi_torch.sample_noise import sample_noise
 
@@ -32,12 +33,31 @@ def fit_section(material: Material) -> Section | None:
         fitted |= model is not None
         blocks += [tag("h4", recording_name(group))] if several else []
         sensors = [material.channel_words(name) for name in recording.output_names]
-        blocks.append(_output_panels(recording, sensors, model, f"_{k + 1}" if several else "", clock_of(group)))
+        followed = None if model is not None else _followed(material, recording)
+        marks = [] if followed is None else adoptions(material)
+        blocks += [FOLLOWED] if followed is not None else []
+        suffix = f"_{k + 1}" if several else ""
+        blocks.append(_output_panels(recording, sensors, (model, followed), suffix, clock_of(group), marks))
         if model is not None:
             blocks += [_misfit_table(recording, sensors, model)]
     if not blocks:
         return None
     return Section("Readings against the estimate" if fitted else "Readings", blocks)
+
+
+FOLLOWED = "Predicted: by the monitor's observer, with the faults that its model contains at that time."
+
+
+def _followed(material: Material, recording: Signals) -> np.ndarray | None:
+    """Readings (T, N) that a monitor predicted, NaN where it predicted none; None without a monitor."""
+    time = material.residuals.get("t", np.zeros(0))
+    if material.kind != "monitor" or not len(time):
+        return None
+    place = np.searchsorted(time, recording.time).clip(max=len(time) - 1)
+    same = time[place] == recording.time
+    none = np.full(len(time), np.nan)
+    residual = np.stack([material.residuals.get(name, none)[place] for name in recording.output_names], -1)
+    return np.where(same[:, None], recording.outputs - residual, np.nan)
 
 
 def inputs_section(material: Material) -> Section | None:
@@ -78,9 +98,17 @@ def clock_of(group: str) -> str:
 
 
 def _output_panels(
-    recording: Signals, sensors: Sequence[str], model: np.ndarray | None, suffix: str, clock: str
+    recording: Signals,
+    sensors: Sequence[str],
+    models: tuple[np.ndarray | None, np.ndarray | None],
+    suffix: str,
+    clock: str,
+    marks: Sequence[tuple[float, str]],
 ) -> list[Column]:
-    """A column for each sensor: readings and estimate, and below them the residual."""
+    """A column for each sensor: readings and estimate, and below them the residual. models: readings (T, N) at the
+    estimate, or else those that a monitor predicted.
+    """
+    model, followed = models
     columns: list[Column] = []
     readings = np.where(recording.mask, recording.outputs, np.nan)
     time = recording.time
@@ -90,10 +118,12 @@ def _output_panels(
             "channel": recording.output_names[i],
             "clock": clock,
         }
-        lines = [Line("measured", time, readings[:, i], SOFT, wide=model is not None)]
+        lines = [Line("measured", time, readings[:, i], SOFT, wide=any(each is not None for each in models))]
         if model is not None:
             lines.append(Line("estimate", time, model[:, i], MODEL))
-        column = [channel_signals(f"output{suffix}_{i + 1}", name, "reading", lines=lines, **about)]
+        if followed is not None:
+            lines.append(Line("predicted", time, followed[:, i], MODEL))
+        column = [channel_signals(f"output{suffix}_{i + 1}", name, "reading", lines=lines, marks=marks, **about)]
         if model is not None:
             lines = [Line("measured − estimate", time, readings[:, i] - model[:, i], MODEL)]
             words = f"residual{suffix}_{i + 1}", f"{name}: residual", "residual"
