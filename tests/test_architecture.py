@@ -42,7 +42,7 @@ LAYERS = (
     {"config"},
     {"jobs"},
     {"view"},
-    {"cli", "__main__", "__init__"},
+    {"cli", "train", "__main__", "__init__"},
 )
 RANK = {room: rank for rank, layer in enumerate(LAYERS) for room in layer}
 
