@@ -9,13 +9,14 @@ from torch import Tensor
 
 from fdi_torch.monitor.detection import DRIFT, VERY_LONG, Detector
 from fdi_torch.monitor.events import Explanation, percent_text, size_of
-from fdi_torch.monitor.hypothesis import Fault
+from fdi_torch.monitor.hypothesis import NO_CHANGE, Fault, HypothesisFit
 from fdi_torch.monitor.hypothesis_fit import Prior
 from fdi_torch.monitor.isolation import isolate, with_flows_of_window
 from fdi_torch.monitor.noise_model import NoiseModel
 from fdi_torch.monitor.observer import Observation
 from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow
 from fdi_torch.monitor.samples import Samples
+from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.network import TankNetwork
@@ -24,6 +25,7 @@ from fdi_torch.quantities import quantity_text
 # Posterior probability from which a fault in the fault-free part is reported. Without a fault, posterior odds of 99 are
 # rarer than 1 in 99 times the prior odds of a fault.
 CONVINCING = 0.99
+SMALL_FLOWS = 0.01  # share of the learnt intensities from which a second search for the flows begins
 # Offset of the white residual that is reported, in standard deviations: half the drift that a CUSUM allows.
 OFFSET = 0.5 * DRIFT
 SIGNIFICANT = 4.0  # standard errors of an offset
@@ -59,27 +61,38 @@ def fault_warnings(
     """Warning about a single sudden fault in the fault-free part, if there is one with a probability of CONVINCING.
 
     The random flows were learnt as if there were no fault, and hold its effect. Each plausible explanation, no fault
-    included, is therefore compared with the flows that are most likely under it.
+    included, is therefore compared with the flows that are most likely under it. The likelihood may have two maxima:
+    one with the learnt flows, and one where the fault leaves little for flows. The search begins at both.
     """
-    sudden, whitening = [fault for fault in faults if not fault.shape], noise.whitening
-    if not sudden:
-        return []
-    if (flows := whitening.flows) is not None:  # learnt again, from the same readings
-        earlier = replace(flows, learnt=flows.learnt[:0], by_constants=flows.by_constants[:0])
-        whitening = replace(whitening, flows=earlier)
-    observer = ObserverBank(network, space, noise.gain, whitening, step, noise.constants)
-    window = ObserverWindow(samples, observer.first_state(samples, believed)[0], 1)
-    ranked = isolate(observer, window, believed, sudden, deepest=1)
-    prior = Prior(observer.space.names, len(sudden))
-    ranked = with_flows_of_window(observer, window, believed, ranked, prior)[1]
+    sudden = [fault for fault in faults if not fault.shape]
+    prior = Prior(space.names, len(sudden))
+    for share in (1.0, SMALL_FLOWS) if sudden else ():
+        observer = ObserverBank(network, space, noise.gain, _begun_at(noise.whitening, share), step, noise.constants)
+        window = ObserverWindow(samples, observer.first_state(samples, believed)[0], 1)
+        ranked = isolate(observer, window, believed, sudden, deepest=1)
+        ranked = with_flows_of_window(observer, window, believed, ranked, prior, always=[NO_CHANGE])[1]
+        if sum(f.probability for f in ranked if f.hypothesis.columns) >= CONVINCING:
+            return [_question(observer, ranked)]
+    return []
+
+
+def _begun_at(whitening: Whitening, share: float) -> Whitening:
+    """The whitening with a share of the intensities of its random flows, from which they are learnt again."""
+    if (flows := whitening.flows) is None:
+        return whitening
+    noise = replace(flows.noise, intensity=share * flows.noise.intensity)
+    begun = replace(flows, noise=noise, learnt=flows.learnt[:0], by_constants=flows.by_constants[:0])
+    return replace(whitening, flows=begun, whitener=whitening.whitener * (flows.innovation_std / begun.innovation_std))
+
+
+def _question(observer: ObserverBank, ranked: Sequence[HypothesisFit]) -> str:
+    """The likeliest fault, and the question."""
     likeliest = next(f for f in ranked if f.hypothesis.columns)
-    if sum(f.probability for f in ranked if f.hypothesis.columns) < CONVINCING:
-        return []
     [column] = likeliest.hypothesis.columns
     size = size_of(observer.space.parameters[column], float(likeliest.value[column]), float(likeliest.std[column]))
     fault = Explanation(likeliest.probability, (size,)).text
     since = f"since {likeliest.onset:.0f} s, probability {percent_text(likeliest.probability)}"
-    return [f"{fault} {since}, explains the part taken for fault-free: {QUESTION}"]
+    return f"{fault} {since}, explains the part taken for fault-free: {QUESTION}"
 
 
 def learning_times(noise: NoiseModel, detector: Detector) -> tuple[float, float]:

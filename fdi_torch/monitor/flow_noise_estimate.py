@@ -162,8 +162,14 @@ def learning_from(flows: FlowFilter, residual: Tensor, effects: Tensor, number: 
     own = effects[len(effects) - flows.by_constants.shape[-1] :]
     further, by_constants = (free_residual(flows.linear, flows.observer, x, number) for x in (residual, own))
     segments = [(flows.learnt, flows.by_constants), (further, by_constants.nan_to_num().permute(1, 2, 0))]
-    likeliest, at = _likeliest(replace(flows, begins=number), segments)
-    return likeliest, at.log_likelihood - at.start_log_likelihood
+    flows = replace(flows, begins=number)
+    searches = [_likeliest(flows, segments)]
+    if not len(flows.learnt):  # then the present flows may be far from these
+        usual = _usual_flow(flows.linear, flows.reading_std, flows.start_std)
+        noise = replace(flows.noise, intensity=usual, correlation_time=FIRST_TIME * flows.interval)
+        searches.append(_likeliest(replace(flows, noise=noise), segments, CORRELATION_TIMES))
+    likeliest, at = max(searches, key=lambda search: search[1].log_likelihood)
+    return likeliest, at.log_likelihood - searches[0][1].start_log_likelihood
 
 
 def free_residual(linear: Linear, observer: Gain, residual: Tensor, number: int = 0) -> Tensor:
