@@ -91,7 +91,7 @@ def test_a_message_that_makes_no_sense_costs_its_section_only(tmp_path: Path) ->
         log.write("/diagnosis/fault", {"fault": "leak", "location": "T1", "present": True, "size": "large"})
     report = report_of(material_of(tmp_path / "odd.mcap"))
     assert headline(report.material) == "Fault: leak at T1"
-    assert "The log cannot be shown here: IndexError" in page([report])
+    assert "The log cannot be shown here: ValueError" in page([report])
     assert "Integrity of the log" in [s.title for s in report.sections]
 
 
