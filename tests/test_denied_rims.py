@@ -44,7 +44,7 @@ def test_the_true_cause_is_found_although_the_rim_in_the_plant_file_is_wrong(tmp
     found, right = (fdi_torch.gap(plant, leaking, out=tmp_path, library=library) for plant in (LOW, RIG))
     assert found.headline == right.headline and "leak at A" in found.headline
     assert re.match(TOLD, found.answer.remarks[0]) and not any("rim" in remark for remark in right.answer.remarks)
-    assert "plant.tanks.A.height (34 cm; 60 cm)" in fdi_torch.compare([found.log, right.log]).headline
+    assert "plant.tanks.A.height (gap: 34 cm; gap_2: 60 cm)" in fdi_torch.compare([found.log, right.log]).headline
     assert found.adopted().tanks == LOW.tanks, "the plant file is the user's to correct"
 
 

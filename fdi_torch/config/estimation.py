@@ -134,7 +134,8 @@ def placements_of(names: Iterable[str], plant: PlantDescription) -> tuple[Placem
         try:
             full += matching_names(name, plant)
         except ValueError as error:
-            problems += [f"{name}: {sentence}" for sentence in getattr(error, "problems", (str(error),))]
+            sentences = [sentence.removeprefix(f"{name}: ") for sentence in getattr(error, "problems", (str(error),))]
+            problems += [f"{name}: {sentence}" for sentence in sentences]
     placements = placements_for(full)
     if problems:
         constants = build_network(plant, placements).constants

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import orjson
+import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from torch import Tensor
 
 from fdi_torch.clock import clock_text, clock_zero
 from fdi_torch.plant.description import PlantDescription
@@ -272,7 +272,7 @@ ABREAST = 4
 
 def fit_figure(
     recording: Recording,
-    predictions: Mapping[str, Tensor],
+    predictions: Mapping[str, torch.Tensor],
     title: str,
     plant: PlantDescription,
     columns: Sequence[str] | None = None,
@@ -300,7 +300,9 @@ def fit_figure(
     return figure
 
 
-def _draw_sensor(upper: Axes, lower: Axes, recording: Recording, i: int, predictions: Mapping[str, Tensor]) -> None:
+def _draw_sensor(
+    upper: Axes, lower: Axes, recording: Recording, i: int, predictions: Mapping[str, torch.Tensor]
+) -> None:
     unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
     counted, outputs = recording.mask[:, i].cpu().numpy(), recording.outputs[:, i].cpu().numpy()
     read = scale * np.where(counted, outputs, np.nan)
