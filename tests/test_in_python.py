@@ -321,7 +321,7 @@ def test_a_wrong_argument_of_simulate_is_named_as_an_argument() -> None:
     for arguments, problem in (
         ({"inputs": {"Q": "3 bananas"}}, r"inputs\.Q: expected a quantity in m\^3/s"),
         ({"duration": "3 m"}, "duration: expected a quantity in s"),
-        ({"inputs": {"Q": "3 l/min"}, "faults": {"X.leak": 0.3}}, r"faults: X\.leak: plant .*: expected one of .*, got X"),
+        ({"inputs": {"Q": "3 l/min"}, "faults": {"X.leak": 0.3}}, r"faults: X\.leak: plant .*: expected one of"),
     ):
         wrong: Any = arguments
         with pytest.raises(fdi_torch.ConfigError, match=f"^simulate: {problem}"):
