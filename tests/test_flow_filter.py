@@ -17,12 +17,13 @@ from torch import Tensor
 from benchmarks.monitor_rigs import Case, recordings
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, placements_for
+from fdi_torch.estimate.evidence import posterior
 from fdi_torch.monitor import noise_model
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.fault_free_checks import QUESTION, false_alarm_rate_text
 from fdi_torch.monitor.flow_filter import forcing
 from fdi_torch.monitor.flow_noise_estimate import estimate_flow_filter
-from fdi_torch.monitor.hypothesis import Hypothesis, with_posterior
+from fdi_torch.monitor.hypothesis import Hypothesis
 from fdi_torch.monitor.hypothesis_fit import Prior, fit, misfit, no_change_fit
 from fdi_torch.monitor.isolation import with_flows_of_window
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
@@ -162,8 +163,10 @@ def test_a_fault_is_fitted_again_however_much_flows_learnt_as_too_small_favour_a
     hypotheses, prior = [Hypothesis((1,)), Hypothesis((0, 1))], Prior(space.names, 4)
     base = bank.white_innovations(window, nominal, no_change(nominal))
     fits = fit(bank, window, nominal, hypotheses, start.repeat(2, 1), misfit(base), prior)
-    ranked = with_posterior([*fits, no_change_fit(bank, window, nominal, base)])
+    ranked = sorted([*fits, no_change_fit(bank, window, nominal, base)], key=lambda f: -f.evidence)
     assert ranked[0].hypothesis.columns == (0, 1) and ranked[0].evidence - ranked[1].evidence > 20.0
+    shares = posterior([f.evidence for f in ranked])
+    ranked = [replace(f, probability=p) for f, p in zip(ranked, shares, strict=True)]
     again = with_flows_of_window(bank, window, nominal, ranked, prior)[1]
     assert again[0].hypothesis.columns == (1,) and again[0].probability > 0.99
 
