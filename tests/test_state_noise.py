@@ -352,6 +352,15 @@ def test_slow_flows_are_found_beside_parameters_whose_effects_are_as_slow() -> N
     assert abs(float(average.mean())) < 3.0 * float(average.std()) / math.sqrt(40)
 
 
+def test_readings_that_are_not_finite_have_no_likelihood() -> None:
+    """A candidate whose simulation fails costs no other one."""
+    p, sensors = two_tanks(12), SensorNoise(STD, WHITE)
+    noise = StateNoise(INTENSITY, 15.0, torch.ones(2, dtype=DOUBLE))
+    whole = problem(p, sensors, simulated(p, sensors, noise, 2), columns=3)
+    broken = replace(whole, jacobian=torch.where(whole.jacobian > 0.0, torch.inf, whole.jacobian))
+    assert math.isnan(broken.likelihood(noise)[0]) and math.isfinite(whole.likelihood(noise)[0])
+
+
 def test_intensities_are_tied_except_for_one_apart() -> None:
     together, apart = (
         StateNoise(INTENSITY * torch.tensor([1.0, 50.0]), 15.0, torch.ones(2), apart=k) for k in (None, 1)

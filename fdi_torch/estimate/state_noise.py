@@ -25,7 +25,7 @@ from fdi_torch.estimate.kalman import SCATTER, KalmanFilter, Propagation, Score,
 
 CORRELATION_TIMES = (0.0, 5.0, 20.0, 80.0, 320.0)  # grid of candidates, in sampling intervals; 0: white
 LIKELIHOOD_TOLERANCE = 0.1  # nats; the optimisation ends when an iteration gains less
-RIDGE = 1e-12  # relative to a unit curvature: keeps parameters without information in their place
+RIDGE = 1e-11  # relative to a unit curvature: keeps parameters without information in their place
 MIN_DETERMINED = 1e-2  # lower limit on the effective number of readings per parameter, for its scaling
 LOG_BOUND = 10.0  # bound on |log(intensity / unit)| and |log(scale)| in the optimisation
 
@@ -216,7 +216,8 @@ def _averaged(white: Tensor, pull: Tensor, off: Tensor) -> tuple[Tensor, float]:
     curvature, right = gram[1:, 1:] + torch.diag(pull**2), gram[1:, 0] - pull * off
     scale = torch.diagonal(curvature).sqrt().clamp(min=1e-150)
     unit = curvature / scale / scale.unsqueeze(1) + RIDGE * torch.eye(len(pull), dtype=white.dtype)
-    root = torch.linalg.cholesky(unit)
+    root, failed = torch.linalg.cholesky_ex(unit)
+    root = torch.where(failed > 0, torch.nan, root)  # where the innovations are not finite
     step = torch.cholesky_solve((right / scale).unsqueeze(1), root).squeeze(1) / scale
     mixing = torch.zeros(1 + len(pull), 1 + len(pull), dtype=white.dtype)
     mixing[0, 0], mixing[1:, 0] = 1.0, -step
