@@ -25,7 +25,7 @@ from fdi_torch.estimate.kalman import SCATTER, KalmanFilter, Propagation, Score,
 
 CORRELATION_TIMES = (0.0, 5.0, 20.0, 80.0, 320.0)  # grid of candidates, in sampling intervals; 0: white
 LIKELIHOOD_TOLERANCE = 0.1  # nats; the optimisation ends when an iteration gains less
-RIDGE = 1e-11  # relative to a unit curvature: keeps parameters without information in their place
+RIDGE = 1e-12  # relative to a unit curvature: keeps parameters without information in their place
 MIN_DETERMINED = 1e-2  # lower limit on the effective number of readings per parameter, for its scaling
 LOG_BOUND = 10.0  # bound on |log(intensity / unit)| and |log(scale)| in the optimisation
 
