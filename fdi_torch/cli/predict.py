@@ -1,7 +1,7 @@
 """`fdi predict`: what it does and prints. Its options: `options/predict.py`.
 
 Path: cli.predict.run → config.loaded_recordings.named_recordings → gap.free_runs.prediction.predict →
-estimate.misfit.misfit_of → recordings.check.doubts_about → cli.explained.say_first → report.chart.fit_figure
+estimate.misfit.misfit_of → recordings.check.doubts_about → cli.explained.say_first → report.fit_figure.fit_figure
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import doubts_about
-from fdi_torch.report.chart import fit_figure
+from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import save
 
 

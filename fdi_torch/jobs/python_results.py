@@ -22,7 +22,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import doubts_about
-from fdi_torch.report.chart import fit_figure
+from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.material import gather
 from fdi_torch.report.sections.gap import posterior_bars
 from fdi_torch.report.sections.monitor import statistic_section

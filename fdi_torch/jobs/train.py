@@ -37,7 +37,7 @@ from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.progress import Tell, rounded, silent
 from fdi_torch.recordings.check import doubts_about
-from fdi_torch.report.chart import fit_figure
+from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.style import notebook_svg, save
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
 

@@ -12,7 +12,8 @@ from fdi_torch import Plant
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.plant.description import Sensor, Tank
 from fdi_torch.recording import Recording
-from fdi_torch.report.chart import Chart, Line, draw, fit_figure
+from fdi_torch.report.chart import Chart, Line, draw
+from fdi_torch.report.fit_figure import fit_figure
 from fdi_torch.report.sections.gap_closure import curve_panel
 from fdi_torch.report.style import MODEL, save, set_title
 
