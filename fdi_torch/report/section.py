@@ -15,7 +15,7 @@ from fdi_torch.report.numbers import axis, shown_unit
 from fdi_torch.report.style import inline_svg
 
 REM_PER_INCH = 7.6  # width of a wide picture; its text then has the size of the page's text
-LEAST_REM_PER_INCH = 4.7  # on a small screen, where a picture that is wider still scrolls
+LEAST_REM_PER_INCH = 5.6  # on a small screen, where a picture that is wider still scrolls
 
 
 @dataclass(frozen=True)

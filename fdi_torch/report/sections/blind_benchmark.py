@@ -145,7 +145,7 @@ def shares_panel(
     title: str, kinds: Sequence[str], own: Sequence[Share], others: Mapping[str, Sequence[Share]]
 ) -> Figure:
     """Share of right answers of each kind with its interval, and small marks for the baselines."""
-    figure, axes = panel(short(title), "right answers, %", "", height=1.1 + 0.3 * len(kinds))
+    figure, axes = panel(short(title), "right answers, %", "", height=1.4 + 0.3 * len(kinds))
     rows = np.arange(len(kinds))
     for (name, shares), colour, mark in zip(others.items(), (OTHER, SOFT, INK, MARK), "dx+^", strict=False):
         x = [100 * s["share"] if s else np.nan for s in shares]
@@ -155,8 +155,8 @@ def shares_panel(
     axes.plot(middle, rows, "o", color=MODEL, ms=6, label="fdi")
     axes.set_xlim(-3, 103)
     axes.set_yticks(rows, [f"{short(k, 16)} ({s['of']})" for k, s in zip(kinds, own, strict=True)])
-    axes.invert_yaxis()
-    label_lines(axes, columns=2)
+    axes.set_ylim(len(kinds) - 0.5, -0.5)
+    label_lines(axes)
     return figure
 
 

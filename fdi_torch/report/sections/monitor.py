@@ -15,7 +15,7 @@ import orjson
 from fdi_torch.amounts import faults_in_words
 from fdi_torch.clock import clock_text
 from fdi_torch.names import listed
-from fdi_torch.report.chart import Chart, Line
+from fdi_torch.report.chart import FLAT, Chart, Line
 from fdi_torch.report.html import Markup, table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import as_float, number, rounded_number, sentence
@@ -35,7 +35,7 @@ def residual_section(material: Material) -> Section | None:
     alarms, marks, pictures = _alarms(material), adoptions(material), []
     for k, name in enumerate(name for name in columns if name != "t" and not name.endswith(_SUFFIXES)):
         unit, lines = material.unit(RESIDUAL, name), [Line("measured − predicted", time, columns[name], MODEL)]
-        about: dict[str, Any] = {"level": 0.0, "events": alarms, "marks": marks, "clock": "monitor", "height": 2.1}
+        about: dict[str, Any] = {"level": 0.0, "events": alarms, "marks": marks, "clock": "monitor", "height": FLAT}
         about |= {"name": f"observer_residual_{k + 1}", "title": material.channel_words(name), "label": "residual"}
         pictures.append(channel_signals(si_unit=unit, lines=lines, channel=name, **about))
     words = f"Vertical lines: alarms.{mark_words(marks, 'the residuals are')}"
