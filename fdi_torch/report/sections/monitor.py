@@ -16,9 +16,9 @@ from fdi_torch.amounts import faults_in_words
 from fdi_torch.clock import clock_text
 from fdi_torch.names import listed
 from fdi_torch.report.chart import FLAT, Chart, Line
-from fdi_torch.report.html import Markup, table, tag
+from fdi_torch.report.html import Markup, bullets, table, tag
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import as_float, number, rounded_number, sentence
+from fdi_torch.report.numbers import as_float, number, probability_text, rounded_number, sentence
 from fdi_torch.report.section import Section, channel_signals, signals
 from fdi_torch.report.style import MARK, MODEL
 
@@ -105,14 +105,27 @@ def _event_cells(event: Payload) -> list[Any]:
     """Cells of an event, empty where it has no onset or the recording has no dates."""
     time, onset, std = (as_float(event.get(name)) for name in ("t", "onset", "onset_std"))
     # A span of this class is not broken into two lines.
-    moments = [tag("span", text, class_="moment") if (text := clock_text(t)) else "" for t in (time, onset)]
-    words = str(event.get("event", "")), sentence(str(event.get("message", "")))
-    return [
-        number(time, 6),
-        moments[0],
-        *words,
-        *(["", ""] if math.isnan(onset) else [rounded_number(onset, std), moments[1]]),
-    ]
+    kind, *moments = (
+        tag("span", text, class_="moment") if text else ""
+        for text in (event.get("event", ""), clock_text(time), clock_text(onset))
+    )
+    onsets = ["", ""] if math.isnan(onset) else [rounded_number(onset, std), moments[1]]
+    return [number(time, 6), moments[0], kind, _description(event), *onsets]
+
+
+def _description(event: Payload) -> Markup:
+    """The message, each of its statements on a line, and several explanations of an alarm as a list of all."""
+    message, names = str(event.get("message", "")), event.get("explanations")
+    rivals = list(zip(names, event.get("masses") or (), strict=False)) if isinstance(names, list) else []
+    before, named, after = message.partition(str(event.get("headline") or message))
+    if named and len(rivals) > 1:
+        items = [f"{sentence(str(text))}, {probability_text(as_float(mass))}" for text, mass in rivals]
+        return tag("div", sentence(before), *bullets(items), *_lines(after))
+    return tag("div", *_lines(message))
+
+
+def _lines(message: str) -> list[Markup]:
+    return [tag("div", sentence(part)) for part in message.removeprefix(", ").removeprefix("; ").split("; ") if part]
 
 
 def rehearsal_section(material: Material) -> Section | None:
