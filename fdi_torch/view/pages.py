@@ -10,8 +10,8 @@ from urllib.parse import urlencode
 from fdi_torch.names import counted
 from fdi_torch.report.html import Markup, clean, folded, join, table, tag
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import number
-from fdi_torch.report.page import document
+from fdi_torch.report.numbers import number, sentence
+from fdi_torch.report.page import document, unbroken
 from fdi_torch.report.predictions import Progress
 from fdi_torch.view.log_list import RUNNING, SORTS, UNREADABLE, Entry
 
@@ -104,7 +104,7 @@ def _row(entry: Entry) -> list[Markup | str]:
         state = join([tag("span", RUNNING, class_="good"), " ", _bar(entry.progress)])
     elif entry.state != "completed":
         state = tag("span", entry.state, class_="bad")
-    return [box, name, entry.started, entry.kind, state, entry.verdict, entry.error_text]
+    return [box, name, entry.started, entry.kind, state, unbroken(entry.verdict), entry.error_text]
 
 
 def _bar(progress: Progress) -> Markup:
@@ -123,7 +123,7 @@ def follow_page(entry: Entry, material: Material | None) -> str:
     content.append(tag("p", tag("a", "report of what is logged so far", href=address("/report", log=entry.name))))
     if material is not None:
         messages = [*material.of("/observer/alarm"), *material.of("/log")]
-        rows = [[number(float(m.get("t", math.nan)), 6), m.get("message", "")] for m in messages]
+        rows = [[number(float(m.get("t", math.nan)), 6), sentence(str(m.get("message", "")))] for m in messages]
         if rows:
             content.append(
                 tag("section", tag("h3", "Newest events"), table(("t, s", "event"), rows[-NEWEST:][::-1], 2))

@@ -21,7 +21,15 @@ from fdi_torch.gap.verdict_words import (
 from fdi_torch.report.diagnosed_effects import flows_that_matter, has_causes
 from fdi_torch.report.html import bullets, table
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import as_float, number, percent, probability_text, shown_unit, with_error
+from fdi_torch.report.numbers import (
+    as_float,
+    number,
+    percent,
+    probability_text,
+    sentence,
+    shown_unit,
+    with_error,
+)
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.style import BAR_NAME, bar_panel
 
@@ -72,7 +80,7 @@ def causes_section(material: Material) -> Section | None:
     if len(plausible) > 1 and (not bars or max(map(len, plausible)) > BAR_NAME):
         blocks += ["Explanations with 95 % of the probability together:", *bullets(plausible)]
     blocks += bars
-    blocks += bullets(answer.get("remarks") or ())
+    blocks += bullets(sentence(str(remark)) for remark in answer.get("remarks") or ())
     return Section("What causes it", blocks, lead=True) if blocks else None
 
 

@@ -16,7 +16,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.html import bullets, folded, pairs, table, tag
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import number, shown_unit
+from fdi_torch.report.numbers import number, sentence, shown_unit
 from fdi_torch.report.schematic import Overlay, schematic
 from fdi_torch.report.section import Picture, Section
 
@@ -121,7 +121,11 @@ def health_section(material: Material) -> Section | None:
     content = f"{counted(inspection.messages, 'message')} on {counted(len(topics), 'topic')} in {chunks}"
     rows = [[info.topic, str(info.messages), *info.span] for info in topics]
     messages = [
-        tag("li", f"{_LEVELS[level]}: " if (level := m.get("level")) in _LEVELS else "", m.get("message", ""))
+        tag(
+            "li",
+            f"{_LEVELS[level]}: " if (level := m.get("level")) in _LEVELS else "",
+            sentence(str(m.get("message", ""))),
+        )
         for m in material.of("/log")
     ]
     return Section(
