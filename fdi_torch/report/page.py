@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
 from fdi_torch.logbook import labels_of
-from fdi_torch.report.html import Markup, bullets, join, tag
+from fdi_torch.report.html import Markup, bullets, join, tag, unbroken
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import sentence
 from fdi_torch.report.section import Maker, Picture, Section, section_html
@@ -62,10 +61,6 @@ def report_of(material: Material) -> RunReport:
     return RunReport(material, tuple(section for section in made if section is not None))
 
 
-_WITHIN_DATE = re.compile(r"(?<=\d)-(?=\d)")
-_WITHIN_NUMBER = re.compile(r" (?=[±%])|(?<=±) |(?<=\d) (?=[^\s\d]{1,8}(?:[),;.]|$))")
-
-
 def page(reports: Sequence[RunReport], first: Sequence[Section] = (), above: Sequence[Markup] = ()) -> str:
     """The complete page. first: sections about all runs, such as their comparison. above: elements before them."""
     title = " · ".join(report.material.run.path.stem for report in reports[:4])
@@ -109,11 +104,6 @@ def _article(report: RunReport, prefix: str) -> Markup:
     made = [section_html(section, prefix, name) for name, section in ordered.items()]
     leading = sum(section.lead for section in report.sections)
     return tag("article", *top, index, *_lead(report, made, leading), id=f"{prefix}run")
-
-
-def unbroken(sentence: str) -> str:
-    """The sentence whose lines do not end within a number with its error and unit, or within a date."""
-    return _WITHIN_DATE.sub("\u2060-\u2060", _WITHIN_NUMBER.sub("\u00a0", sentence))
 
 
 def _lead(report: RunReport, sections: list[Markup], leading: int) -> list[Markup]:

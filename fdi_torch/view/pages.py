@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from urllib.parse import urlencode
 
 from fdi_torch.names import counted
-from fdi_torch.report.html import Markup, clean, folded, join, table, tag
+from fdi_torch.report.html import Markup, clean, folded, join, table, tag, unbroken
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number, sentence
-from fdi_torch.report.page import document, unbroken
+from fdi_torch.report.page import document
 from fdi_torch.report.predictions import Progress
 from fdi_torch.view.log_list import RUNNING, SORTS, UNREADABLE, Entry
 

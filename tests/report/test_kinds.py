@@ -30,8 +30,9 @@ from fdi_torch.logbook import RunLog, read_run
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.report.chart import draw
 from fdi_torch.report.diagnosed_effects import diagnosed_effects
+from fdi_torch.report.html import unbroken
 from fdi_torch.report.material import gather
-from fdi_torch.report.page import RunReport, page, report_of, unbroken
+from fdi_torch.report.page import RunReport, page, report_of
 from fdi_torch.report.sections.signals import profile_section
 from fdi_torch.report.verdict import _latest, headline
 

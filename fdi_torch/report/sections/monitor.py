@@ -16,7 +16,7 @@ from fdi_torch.amounts import faults_in_words
 from fdi_torch.clock import clock_text
 from fdi_torch.names import listed
 from fdi_torch.report.chart import FLAT, Chart, Line
-from fdi_torch.report.html import Markup, bullets, table, tag
+from fdi_torch.report.html import Markup, bullets, table, tag, unbroken
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import as_float, number, probability_text, rounded_number, sentence
 from fdi_torch.report.section import Section, channel_signals, signals
@@ -119,13 +119,14 @@ def _description(event: Payload) -> Markup:
     rivals = list(zip(names, event.get("masses") or (), strict=False)) if isinstance(names, list) else []
     before, named, after = message.partition(str(event.get("headline") or message))
     if named and len(rivals) > 1:
-        items = [f"{sentence(str(text))}, {probability_text(as_float(mass))}" for text, mass in rivals]
+        items = [unbroken(f"{sentence(str(text))}, {probability_text(as_float(mass))}") for text, mass in rivals]
         return tag("div", sentence(before), *bullets(items), *_lines(after))
     return tag("div", *_lines(message))
 
 
 def _lines(message: str) -> list[Markup]:
-    return [tag("div", sentence(part)) for part in message.removeprefix(", ").removeprefix("; ").split("; ") if part]
+    parts = message.removeprefix(", ").removeprefix("; ").split("; ")
+    return [tag("div", unbroken(sentence(part))) for part in parts if part]
 
 
 def rehearsal_section(material: Material) -> Section | None:
