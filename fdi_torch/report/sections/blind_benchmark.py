@@ -185,7 +185,7 @@ def calibration_panel(title: str, bins: Sequence[Mapping[str, Any]]) -> Figure:
     axes.plot(at, [100 * b["stated"] for b in bins], "_", color=MARK, ms=22, mew=2.0)
     axes.set_xticks(at, [f"{b['low']:g}–{b['high']:g}\n({b['of']})" for b in bins])
     axes.set_xlim(-0.6, len(bins) - 0.4)
-    axes.set_ylim(-3, 103)
+    axes.set_ylim(-8, 108)
     return figure
 
 
