@@ -167,8 +167,10 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
 
 
 def notebook_svg(figure: Figure, name: str, description: str) -> str:
-    """The figure as an HTML element for notebooks, on a background of its own, no larger than its natural size."""
-    width = f"{72 * figure.get_figwidth():g}px"
+    """The figure as an HTML element for notebooks, on a background of its own, no larger than its natural size, in
+    which letters of 9 points have 12 pixels.
+    """
+    width = f"{96 * figure.get_figwidth():g}px"
     style = f"max-width: {width}; background: {PAPER}; color: {INK}"
     svg = _svg(figure, re.sub(r"\W+", "-", name), escape(description))
     return f'<div style="{style}">{svg}</div>'
