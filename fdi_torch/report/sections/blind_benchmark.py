@@ -18,7 +18,7 @@ from fdi_torch.report.html import Markup, folded, short, table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.sections.study import TRIAL, group_panel
-from fdi_torch.report.style import INK, MARK, MODEL, OTHER, PAPER, SOFT, label_lines, panel
+from fdi_torch.report.style import INK, MARK, MODEL, OTHER, PAPER, SOFT, WIDTH, label_lines, panel
 
 PLACES = {"pumps": (PUMP,), "pipes and outlets": (PIPE, OUTLET), "tanks": (TANK, PAIR), "sensors": (SENSOR,)}
 Share = Mapping[str, Any]
@@ -162,7 +162,8 @@ def shares_panel(
 
 def confusion_panel(title: str, rows: Sequence[str], columns: Sequence[str], counts: np.ndarray) -> Figure:
     """Counts (rows, columns) of the true cause against the answer; right answers are blue."""
-    figure, axes = panel(short(title), "", "", height=1.35 + 0.27 * len(rows))
+    width = max(WIDTH, 1.4 + 0.17 * len(columns))  # of slanted letters of 9 points beside each other
+    figure, axes = panel(short(title), "", "", width=width, height=1.35 + 0.27 * len(rows))
     for i, j in np.argwhere(counts > 0):
         right = rows[i] == columns[j] or columns[j] == "unknown, there"
         axes.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, facecolor=MODEL if right else MARK, edgecolor=PAPER))
