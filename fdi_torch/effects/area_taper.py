@@ -10,8 +10,8 @@ LEAST_WIDTH = 0.05  # relative to the width where the area is nominal
 
 
 class AreaTaper(Effect):
-    """The cross-section is A (1 + s (h/H - r) / p)^p. A is the area at the level r H (half height by default; r = 0 if it
-    was measured at the floor), and s its slope there times H/A. p = 1: two opposite walls are inclined; p = 2: all of
+    """The cross-section is A (1 + s (h/H - r) / p)^p: A is the area at the level r H (half height by default; r = 0 if
+    measured at the floor), s its slope there times H/A. p = 1: two opposite walls are inclined; p = 2: all of
     them, as in a cone.
 
     Typical: s of -0.5 to 0.5, r of 0 or 1/2, p of 1 or 2. Like an internal body, it changes how fast levels move but no
