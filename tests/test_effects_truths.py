@@ -363,7 +363,15 @@ def test_times_that_may_be_endless_are_bounded_by_the_recording() -> None:
     assert space["Q1.pump_lag.time_constant"].high == 60.0
 
 
-def test_a_taper_measured_at_the_floor_is_a_cone_from_there() -> None:
+def test_a_tank_whose_walls_are_all_inclined_holds_a_frustum() -> None:
+    taper = PlacedEffect("area_taper", "T1", {"taper": 0.8, "reference": 0.0, "power": 2.0})
+    level = float(filled((taper,), height=3.0)[0])
+    # The width grows by 40 % from floor to rim.
+    ratio = 1.0 + 0.4 * level / 3.0
+    assert level / 3.0 * 160e-4 * (1.0 + ratio + ratio**2) == pytest.approx(30e-3, rel=1e-6)
+
+
+def test_a_taper_measured_at_the_floor_grows_from_there() -> None:
     taper = PlacedEffect("area_taper", "T1", {"taper": 0.8, "reference": 0.0})
     level = float(filled((taper,), height=3.0)[0])
     assert 160e-4 * (level + 0.8 * level**2 / 6.0) == pytest.approx(30e-3, rel=1e-6)

@@ -58,10 +58,30 @@ def test_clipped_noise_is_no_further_gap(behind: bool) -> None:
     answer = diagnose(nominal_plant(), replace(recording, outputs=reading), settings=Settings(library))
     assert answer.verdict == "named"
     assert [(c.effect, c.location, c.parameters["limit"].value) for c in answer.causes] == [
-        ("sensor_saturation", "h1", limit)
+        ("sensor_saturation", "h1", pytest.approx(limit, rel=1e-9))
     ]
     assert answer.noise["h1"]["std"] == pytest.approx(std, rel=0.08)
     known = replace(
         nominal_plant(), sensors=tuple(replace(s, high=limit) if s.name == "h1" else s for s in nominal_plant().sensors)
     )
     assert diagnose(known, replace(recording, outputs=reading), settings=Settings(library)).verdict == "no_gap"
+
+
+def test_the_last_bits_of_readings_change_nothing() -> None:
+    """They depend on the unit in which a file holds the readings. One sensor is clipped here, one rounds."""
+    recording = recorded({}, 12, 1000, 1e-3)
+    level = recording.outputs
+    limit = float(level[:, 0].quantile(0.8))
+    held = torch.stack([level[:, 0].clamp(max=limit), level[:, 1], (level[:, 2] / 0.004).round() * 0.004], dim=1)
+    library = ("sensor_saturation", "sensor_quantization", "sensor_bias", "pump_gain@Q1")
+    up = torch.rand(held.shape, generator=torch.Generator().manual_seed(1)) < 0.5
+    in_another_unit = torch.nextafter(held, torch.where(up, 1.0, 0.0).to(held))
+    answers = [
+        diagnose(nominal_plant(), replace(recording, outputs=readings), settings=Settings(library)).to_dict()
+        for readings in (held, in_another_unit)
+    ]
+    assert {(c["effect"], c["location"]) for c in answers[0]["causes"]} == {
+        ("sensor_saturation", "h1"),
+        ("sensor_quantization", "h3"),
+    }
+    assert answers[0] == answers[1]

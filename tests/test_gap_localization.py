@@ -466,6 +466,16 @@ def test_a_draw_with_a_timer_is_one_regressor_although_random_flows_explain_each
     assert duration == pytest.approx(40.0, rel=0.1)
 
 
+def test_the_period_of_the_likeliest_place_is_tried_at_the_others() -> None:
+    """A pump stalls three times in each period. The search at its tank finds the period, that at the pump does not."""
+    command = random_steps(15e-6, 75e-6, 30, 130, 7)
+    phase = torch.arange(len(command), dtype=torch.float64) / 880.0 % 1.0
+    stalled = ((phase > 0.1) & (phase < 0.2)) | ((phase > 0.4) & (phase < 0.45)) | ((phase > 0.7) & (phase < 0.82))
+    fitter, fit, noise = delivering(command, command * torch.where(stalled, 0.5, 1.0), 7)
+    found = localize(fitter, fit, noise, ("Q1", "T1", "P13")).discrepancies
+    assert found[0].location == "Q1" and found[0].periods[0] == pytest.approx(880.0, rel=2e-3)
+
+
 def test_constants_stay_within_their_tolerances_beside_an_effect_and_the_error_of_its_law() -> None:
     """A plugged outlet and regressors of its flow may nearly cancel, as a wider outlet does."""
     case = problem_of(nominal_plant(), (recorded({"OUT2.laminar_flow.transition_head": 0.1}, 4),), (), Settings())

@@ -335,7 +335,7 @@ def test_weirs_in_a_row_are_computed_along_the_water() -> None:
     weirs = (Weir("second", "B", "C", 0.3, 0.02), Weir("first", "A", "B", 0.3, 0.02))
     circle = (Transfer("X", "C", "A", 1e-5), Transfer("Y", "A", "C", 1e-5))
     plant = PlantDescription("row", tanks, weirs=weirs, transfers=circle)
-    names = [component.name for component in plant.flows_in_order()]
+    names = [component.name for component in plant.flows_in_order]
     assert names.index("first") < names.index("second")
     assert sorted(names) == ["X", "Y", "first", "second"]
 

@@ -36,6 +36,9 @@ MANY_STEPS = 1_500
 """Steps beyond which longer ones are taken, up to the longest. It limits computing time and memory, which grow with the
 number of steps; long recordings determine lags and periods well in any case."""
 
+RELIABLE_BITS = 30
+"""Bits of a reading that count, of its 53. No converter has more than 24, nor has a file of single precision."""
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -142,8 +145,22 @@ def _examined(
 
     Raises ValueError for a faulty recording.
     """
-    checked = [usable(plant, replace(r, trusted=r.trusted or trusted), effects=True) for r in recordings]
+    checked = [
+        usable(plant, replace(_without_rounding_errors(r), trusted=r.trusted or trusted), effects=True)
+        for r in recordings
+    ]
     return [f.recording for f in checked], [s for f in checked for s in f.stuck]
+
+
+def _without_rounding_errors(recording: Recording) -> Recording:
+    """The recording with readings rounded to RELIABLE_BITS.
+
+    The last bits depend on the unit in which a file holds a reading. Equal readings, which show a limit, a stuck sensor
+    or rounding, shall be equal in every unit.
+    """
+    largest = recording.outputs.nan_to_num().abs().amax(dim=0)
+    step = torch.exp2(torch.floor(torch.log2(largest.clamp(min=torch.finfo(largest.dtype).tiny))) - RELIABLE_BITS)
+    return replace(recording, outputs=(recording.outputs / step).round() * step)
 
 
 def _without_stuck_sensors(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from fdi_torch.names import counted, nearest
@@ -135,27 +136,35 @@ class PlantDescription:
 
     def metered_flows(self) -> list[MeteredFlow]:
         """The pumps and transfers, whose flows are input channels, in the order of their channels."""
-        return [c for c in self.flows_in_order() if isinstance(c, MeteredFlow)]
+        return [c for c in self.flows_in_order if isinstance(c, MeteredFlow)]
 
-    def flows_in_order(self) -> list[FlowComponent]:
+    @cached_property
+    def flows_in_order(self) -> tuple[FlowComponent, ...]:
         """The flow components in the order in which their flows are computed and their channels are listed.
 
         Flows that depend on the net inflow of their source follow the water: a flow into a tank precedes one out of it.
         """
         depth = _depths(self)
-        return sorted(self.flow_components(), key=lambda c: (c.order, depth.get(c.name, 0)))
+        return tuple(sorted(self.flow_components(), key=lambda c: (c.order, depth.get(c.name, 0))))
 
     def component(self, name: str) -> Tank | FlowComponent | Sensor:
         """The component of that name; `tank`, `sensor`, `flow`, `pipe` and `metered_flow` also expect its kind."""
-        for component in self.components():
-            if component.name == name:
-                return component
+        if (component := self._by_name.get(name)) is not None:
+            return component
         near = nearest(name, (component.name for component in self.components()))
         places, pair = (
             (c.name for c in self.components()),
             next((f" or a pair of tanks such as {a}-{b}" for a, b in self.tank_pairs()), ""),
         )
         raise ValueError(f"{self.title}: expected one of {', '.join(places)}{pair}, got {name}{near}")
+
+    @cached_property
+    def _by_name(self) -> dict[str, Tank | FlowComponent | Sensor]:
+        return {c.name: c for c in self.components()}
+
+    @cached_property
+    def _tanks_at(self) -> dict[str, tuple[str, ...]]:
+        return {t.name: (t.name,) for t in self.tanks} | {f"{a}-{b}": (a, b) for a, b in self.tank_pairs()}
 
     def tank(self, name: str) -> Tank:
         return self._of_kind(Tank, name)
@@ -185,8 +194,7 @@ class PlantDescription:
 
     def tanks_at(self, location: str) -> tuple[str, ...]:
         """The tank of that name, or the two tanks of a pair 'T1-T2'; none for any other place."""
-        pairs = {f"{a}-{b}": (a, b) for a, b in self.tank_pairs()}
-        return pairs.get(location, tuple(t.name for t in self.tanks if t.name == location))
+        return self._tanks_at.get(location, ())
 
     def floor_outlets(self, tank: str) -> tuple[str, ...]:
         """Names of a tank's outlets at its floor without a valve; a leak of the tank is the same as a wider outlet."""
@@ -202,7 +210,7 @@ class PlantDescription:
 
     def channel_units(self) -> dict[str, str]:
         """SI unit of each input channel: of a pump's or transfer's command, or 1 for a valve's opening."""
-        given = [c.input_channel for c in self.flows_in_order()]
+        given = [c.input_channel for c in self.flows_in_order]
         units: dict[str, str] = {}
         for channel, unit in (pair for pair in given if pair is not None):
             units.setdefault(channel, unit)
@@ -214,7 +222,7 @@ class PlantDescription:
 
     def channel_words(self, channel: str) -> str:
         """The components of a channel, by their names in the plant file: 'hB (LT_101)', or 'h1' if that is both."""
-        of_inputs = [c.name for c in self.flows_in_order() if (c.input_channel or ("",))[0] == channel]
+        of_inputs = [c.name for c in self.flows_in_order if (c.input_channel or ("",))[0] == channel]
         names = [s.name for s in self.sensors if s.column == channel] or of_inputs
         return channel if names in ([channel], []) else f"{', '.join(names)} ({channel})"
 

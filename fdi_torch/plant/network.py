@@ -50,8 +50,8 @@ class TankNetwork(nn.Module):
         effect_parameters = [p for placement in self.placements for p in placed_parameters(placement, description)]
         self.constants = ParameterSpace([*constant_parameters(description), *effect_parameters])
         self.register_buffer("nominal", self.constants.nominal())
-        self._first_flows = [c for c in description.flows_in_order() if c.order <= FlowOrder.BY_LEVELS]
-        self._last_flows = [c for c in description.flows_in_order() if c.order > FlowOrder.BY_LEVELS]
+        self._first_flows = [c for c in description.flows_in_order if c.order <= FlowOrder.BY_LEVELS]
+        self._last_flows = [c for c in description.flows_in_order if c.order > FlowOrder.BY_LEVELS]
         self._tank_index = {tank.name: i for i, tank in enumerate(description.tanks)}
 
     def restricted_to(self, prefixes: Collection[str]) -> TankNetwork:
@@ -260,7 +260,7 @@ class TankNetwork(nn.Module):
 
     def actuators(self) -> list[tuple[str, int]]:
         """Name and input channel index of each component that has an input channel, as in `flows_in_order`."""
-        given = [(c.name, c.input_channel) for c in self.description.flows_in_order()]
+        given = [(c.name, c.input_channel) for c in self.description.flows_in_order]
         return [(name, self._channel_index[channel[0]]) for name, channel in given if channel is not None]
 
     def sensor_tanks(self) -> list[int]:

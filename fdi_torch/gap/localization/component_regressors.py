@@ -217,7 +217,7 @@ def _by_head(component: FlowComponent, plant: PlantDescription) -> DiscrepancyMo
 
 def _actuator(plant: PlantDescription, name: str) -> int:
     """Index of a component among those with an input channel."""
-    return [c.name for c in plant.flows_in_order() if c.input_channel is not None].index(name)
+    return [c.name for c in plant.flows_in_order if c.input_channel is not None].index(name)
 
 
 def _pair(place: str, plant: PlantDescription) -> DiscrepancyModel:

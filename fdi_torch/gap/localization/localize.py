@@ -9,7 +9,7 @@ effects: `marginal_likelihood.py`). Random processes at one tank or sensor compe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
 
@@ -21,6 +21,7 @@ from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_ascent import Ascent, gain_of
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
+from fdi_torch.gap.localization.fine_positions import FREQUENCY_ERROR
 from fdi_torch.gap.localization.localized_discrepancy import (
     LocalizedDiscrepancy,
     is_rounding_error,
@@ -94,6 +95,11 @@ def localize(
         largest = float(best.explained.square().mean(dim=0).max().sqrt())
         if selected and not is_rounding_error(fitter, place, largest):
             needed, evaluated[place] = max(needed, best.gain + math.log(RARE)), best.localized(fitter)
+    for at in _without_the_period(evaluated.values(), fitter.data.longest_duration):
+        period = max(evaluated.values(), key=gain_of).periods[0]
+        periodic = DiscrepancyRegression(fitter, fit, [1.0 / period], regression.level_filter)
+        again = ascent.climbed(ascent.under_less_and_less_noise(periodic, at.location, likely), needed)
+        evaluated[at.location] = max(at, again.localized(fitter), key=gain_of)
     processes = [*drifting_sensors(regression, likely, places, base, needed)]
     processes += random_flows(regression, likely, places, base, needed)
     return Localization(_likeliest_of_each_place([*evaluated.values(), *processes]), itself)
@@ -122,6 +128,19 @@ def _about_predicted(
         if is_linear:
             break
     return max(about_each, key=itemgetter(0))
+
+
+def _without_the_period(discrepancies: Collection[LocalizedDiscrepancy], duration: float) -> list[LocalizedDiscrepancy]:
+    """The discrepancies without the period of the likeliest one, if that has a period.
+
+    The search at each place begins at frequencies of a spectrum, and may end at a harmonic. duration: of the longest
+    recording, s.
+    """
+    best = max(discrepancies, key=gain_of, default=None)
+    if best is None or not best.periods:
+        return []
+    frequency, error = 1.0 / best.periods[0], FREQUENCY_ERROR / duration
+    return [d for d in discrepancies if all(abs(1.0 / p - frequency) > error for p in d.periods[:1])]
 
 
 def _likeliest_of_each_place(discrepancies: Sequence[LocalizedDiscrepancy]) -> tuple[LocalizedDiscrepancy, ...]:
