@@ -63,22 +63,9 @@ def test_no_explanation_has_more_simultaneous_faults_than_allowed_however_often_
         assert max(len(f.hypothesis.sizes) for f in fits) == 2
 
 
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [
-        ({}, {"T3.leak.size": 0.1, "P32.plugging.size": 0.2}),
-        ({}, {"T2.leak.size": 0.1, "P32.plugging.size": 0.2}),
-        ({"T3.leak.size": 0.1}, {"P32.plugging.size": 0.2}),
-        ({"P32.plugging.size": 0.2}, {"T3.leak.size": 0.1}),
-        ({"T1.leak.size": 0.1}, {"P13.plugging.size": 0.2}),
-    ],
-)
-def test_two_changes_that_mask_each_other_are_among_the_explanations(
-    before: dict[str, float], after: dict[str, float]
-) -> None:
-    """Two new faults, or one that recovers while another begins. A search that adds a second fault to the likeliest
-    single changes misses them, because neither is among those.
-    """
+@pytest.mark.parametrize("names", [("T3.leak.size", "P32.plugging.size"), ("T2.leak.size", "P32.plugging.size")])
+def test_two_faults_that_mask_each_other_are_among_the_explanations(names: tuple[str, str]) -> None:
+    """A search that adds a second fault to the likeliest single ones misses them, because neither is among those."""
     tanks, pipes, sensors = ("T1", "T2", "T3"), ("P13", "P32", "OUT2"), ("h1", "h2", "h3")
     places = {
         "leak": tanks,
@@ -91,15 +78,16 @@ def test_two_changes_that_mask_each_other_are_among_the_explanations(
     network = build_network(PLANT, placed)
     sizes = [f"{p.prefix}.{p.effect.parameters(p.location, PLANT)[0].name}" for p in placed]
     space = ParameterSpace([network.constants[name] for name in sizes])
-    nominal, known, final = space.nominal(), space.vector(before), space.vector(after)
-    learnt = learn_noise(network, recorded(lambda t: nominal, 400, network, space, seed=99), space, nominal)[0]
-    window = from_rest(recorded(lambda t: final if t > 100.0 else known, 180, network, space, seed=1))
+    faulty = space.vector(dict(zip(names, (0.1, 0.2), strict=True)))
+    healthy, nominal = recorded(lambda t: space.nominal(), 400, network, space, seed=99), space.nominal()
+    learnt = learn_noise(network, healthy, space, nominal)[0]
+    window = from_rest(recorded(lambda t: faulty if t > 100.0 else nominal, 180, network, space, seed=1))
     bank = ObserverBank(network, space, learnt.gain, learnt.whitening)
-    fits = isolate(bank, window, known, [Fault(c) for c in range(len(sizes))], GROWTH_TIMES, 2, nominal)
-    columns, ended = ([sizes.index(name) for name in names] for names in (after, before))
-    told = {(f.hypothesis.columns, f.hypothesis.recovered): f for f in credible_set(merged(fits))}
-    found = told[tuple(sorted([*columns, *ended])), tuple(ended)]
-    assert float(((found.value - final) / found.std)[columns].abs().max()) < 4.0
+    fits = isolate(bank, window, nominal, [Fault(c) for c in range(len(sizes))], GROWTH_TIMES, deepest=2)
+    told = {frozenset(sizes[c] for c in f.hypothesis.columns): f for f in credible_set(merged(fits))}
+    assert frozenset(names) in told
+    found, columns = told[frozenset(names)], [sizes.index(name) for name in names]
+    assert float(((found.value - faulty) / found.std)[columns].abs().max()) < 4.0
 
 
 def test_a_fault_that_grew_before_the_search_window_is_found_with_its_onset() -> None:

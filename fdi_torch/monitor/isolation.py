@@ -17,6 +17,7 @@ from fdi_torch.monitor.hypothesis import Fault, Hypothesis, HypothesisFit, with_
 from fdi_torch.monitor.hypothesis_fit import Prior, changes_of, fit, misfit, no_change_fit, point_of
 from fdi_torch.monitor.initial_guesses import (
     oscillation_guess,
+    recovery_guesses,
     recovery_hypotheses,
     signature_guesses,
 )
@@ -56,19 +57,22 @@ def isolate(
     )
     oscillating = [Hypothesis(f.columns, shape=f.shape) for f in faults if f.shape]
     base = observer.white_innovations(window, believed, no_change(believed))
-    healthy = believed if healthy is None else healthy
-    changes, most_pairs = [*recovery_hypotheses(believed, healthy, faults), *plain], len(faults) if deepest > 1 else 0
-    single_starts, pairs = signature_guesses(observer, window, believed, healthy, changes, base, most_pairs)
-    earlier = [f for f in earlier if f.hypothesis.columns]
+    most_pairs = len(faults) if deepest > 1 else 0
+    single_starts, pairs = signature_guesses(observer, window, believed, plain, base, most_pairs)
     starts = torch.cat(
         [
             single_starts,
-            signature_guesses(observer, window, believed, healthy, others, base)[0],
+            signature_guesses(observer, window, believed, others, base)[0],
             *(oscillation_guess(observer, window, believed, h, base) for h in oscillating),
-            *(point_of(f)[None] for f in earlier),
         ]
     )
-    hypotheses = [*changes, *others, *oscillating, *(f.hypothesis for f in earlier)]
+    recoveries = [] if healthy is None else recovery_hypotheses(believed, healthy, faults)
+    if healthy is not None and recoveries:
+        starts = torch.cat([starts, recovery_guesses(observer, window, believed, healthy, recoveries)])
+    earlier = [f for f in earlier if f.hypothesis.columns]
+    if earlier:
+        starts = torch.cat([starts, torch.stack([point_of(f) for f in earlier])])
+    hypotheses = [*plain, *others, *oscillating, *recoveries, *(f.hypothesis for f in earlier)]
     fits = _best_of_each(fit(observer, window, believed, hypotheses, starts, misfit(base), prior))
     # Where nothing fits, the law of the plant or of a known fault is wrong: no evidence for a cause outside the list.
     fits = [f for f in fits if f.fits or f.hypothesis.columns[0] not in outside]
