@@ -7,16 +7,17 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from fdi_torch.estimate.evidence import posterior
 from fdi_torch.monitor.detection import DRIFT, VERY_LONG, Detector
 from fdi_torch.monitor.events import Explanation, percent_text, size_of
-from fdi_torch.monitor.hypothesis import NO_CHANGE, Fault, HypothesisFit
-from fdi_torch.monitor.hypothesis_fit import Prior
-from fdi_torch.monitor.isolation import isolate, with_flows_of_window
+from fdi_torch.monitor.flow_noise_estimate import with_usual_flows
+from fdi_torch.monitor.hypothesis import Fault, HypothesisFit
+from fdi_torch.monitor.hypothesis_fit import changes_of
+from fdi_torch.monitor.isolation import SMALLEST_PROBABILITY, isolate
 from fdi_torch.monitor.noise_model import NoiseModel
 from fdi_torch.monitor.observer import Observation
 from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow
 from fdi_torch.monitor.samples import Samples
-from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.network import TankNetwork
@@ -25,7 +26,6 @@ from fdi_torch.quantities import quantity_text
 # Posterior probability from which a fault in the fault-free part is reported. Without a fault, posterior odds of 99 are
 # rarer than 1 in 99 times the prior odds of a fault.
 CONVINCING = 0.99
-SMALL_FLOWS = 0.01  # share of the learnt intensities from which a second search for the flows begins
 # Offset of the white residual that is reported, in standard deviations: half the drift that a CUSUM allows.
 OFFSET = 0.5 * DRIFT
 SIGNIFICANT = 4.0  # standard errors of an offset
@@ -60,29 +60,30 @@ def fault_warnings(
 ) -> list[str]:
     """Warning about a single sudden fault in the fault-free part, if there is one with a probability of CONVINCING.
 
-    The random flows were learnt as if there were no fault, and hold its effect. Each plausible explanation, no fault
-    included, is therefore compared with the flows that are most likely under it. The likelihood may have two maxima:
-    one with the learnt flows, and one where the fault leaves little for flows. The search begins at both.
+    The random flows were learnt as if there were no fault, and hold its effect. Faults are therefore searched for
+    beside the usual flows, and again beside those that are most likely under the likeliest fault. Each plausible
+    explanation, no fault included, then has the evidence at the flows that are most likely under it.
     """
     sudden = [fault for fault in faults if not fault.shape]
-    prior = Prior(space.names, len(sudden))
-    for share in (1.0, SMALL_FLOWS) if sudden else ():
-        observer = ObserverBank(network, space, noise.gain, _begun_at(noise.whitening, share), step, noise.constants)
-        window = ObserverWindow(samples, observer.first_state(samples, believed)[0], 1)
-        ranked = isolate(observer, window, believed, sudden, deepest=1)
-        ranked = with_flows_of_window(observer, window, believed, ranked, prior, always=[NO_CHANGE])[1]
-        if sum(f.probability for f in ranked if f.hypothesis.columns) >= CONVINCING:
-            return [_question(observer, ranked)]
-    return []
-
-
-def _begun_at(whitening: Whitening, share: float) -> Whitening:
-    """The whitening with a share of the intensities of its random flows, from which they are learnt again."""
-    if (flows := whitening.flows) is None:
-        return whitening
-    noise = replace(flows.noise, intensity=share * flows.noise.intensity)
-    begun = replace(flows, noise=noise, learnt=flows.learnt[:0], by_constants=flows.by_constants[:0])
-    return replace(whitening, flows=begun, whitener=whitening.whitener * (flows.innovation_std / begun.innovation_std))
+    if not sudden:
+        return []
+    whitening = noise.whitening
+    if whitening.flows is not None:
+        whitening = whitening.with_flows(with_usual_flows(whitening.flows))
+    observer = ObserverBank(network, space, noise.gain, whitening, step, noise.constants)
+    window = ObserverWindow(samples, observer.first_state(samples, believed)[0], 1)
+    first = isolate(observer, window, believed, sudden, deepest=1)
+    likeliest = next(f for f in first if f.hypothesis.columns)
+    observer = observer.learning_from(window, believed, changes_of([likeliest]))[0]
+    fits = isolate(observer, window, believed, sudden, deepest=1, earlier=first)
+    excess = min(fits, key=lambda f: f.misfit).misfit_ratio  # by which `isolate` divided the misfits
+    fits = [f for f in fits if f.probability > SMALLEST_PROBABILITY or not f.hypothesis.columns]
+    likelihoods = [observer.learning_from(window, believed, changes_of([f]))[1] for f in fits]
+    evidence = [f.evidence + f.misfit / excess + likelihood for f, likelihood in zip(fits, likelihoods, strict=True)]
+    ranked = [replace(f, probability=p) for f, p in zip(fits, posterior(evidence), strict=True)]
+    if sum(f.probability for f in ranked if f.hypothesis.columns) < CONVINCING:
+        return []
+    return [_question(observer, sorted(ranked, key=lambda f: -f.probability))]
 
 
 def _question(observer: ObserverBank, ranked: Sequence[HypothesisFit]) -> str:

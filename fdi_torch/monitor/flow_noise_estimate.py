@@ -151,9 +151,16 @@ def _usual_flow(linear: Linear, reading_std: Tensor, start_std: Tensor) -> Tenso
     return FIRST_UNIT * metres.median() * torch.ones_like(start_std)
 
 
-def learning_from(flows: FlowFilter, residual: Tensor, effects: Tensor, number: int) -> tuple[FlowFilter, float]:
-    """The filter with the most likely noise, given its earlier data and further residuals, and the logarithm of the
-    likelihood ratio to the present noise.
+def with_usual_flows(flows: FlowFilter) -> FlowFilter:
+    """The filter with the flows from which the search for them begins, and without data."""
+    usual = _usual_flow(flows.linear, flows.reading_std, flows.start_std)
+    noise = replace(flows.noise, intensity=usual, correlation_time=FIRST_TIME * flows.interval)
+    return replace(flows, noise=noise, learnt=flows.learnt[:0], by_constants=flows.by_constants[:0])
+
+
+def learning_from(flows: FlowFilter, residual: Tensor, effects: Tensor, number: int) -> tuple[FlowFilter, float, float]:
+    """The filter with the most likely noise, given its earlier data and further residuals, the log-likelihood of these
+    data, and what it gained over the present noise.
 
     residual (S, sensors): scaled to the steady variance, of the observer's samples from `number` on. effects (P, S,
     sensors): of the errors of constants on it, last of those beside which the flows were learnt. The filter
@@ -165,11 +172,9 @@ def learning_from(flows: FlowFilter, residual: Tensor, effects: Tensor, number: 
     flows = replace(flows, begins=number)
     searches = [_likeliest(flows, segments)]
     if not len(flows.learnt):  # then the present flows may be far from these
-        usual = _usual_flow(flows.linear, flows.reading_std, flows.start_std)
-        noise = replace(flows.noise, intensity=usual, correlation_time=FIRST_TIME * flows.interval)
-        searches.append(_likeliest(replace(flows, noise=noise), segments, CORRELATION_TIMES))
+        searches.append(_likeliest(with_usual_flows(flows), segments, CORRELATION_TIMES))
     likeliest, at = max(searches, key=lambda search: search[1].log_likelihood)
-    return likeliest, at.log_likelihood - searches[0][1].start_log_likelihood
+    return likeliest, at.log_likelihood, at.log_likelihood - searches[0][1].start_log_likelihood
 
 
 def free_residual(linear: Linear, observer: Gain, residual: Tensor, number: int = 0) -> Tensor:

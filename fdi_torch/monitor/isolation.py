@@ -106,18 +106,16 @@ def with_flows_of_window(
     believed: Tensor,
     ranked: Sequence[HypothesisFit],
     prior: Prior,
-    always: Sequence[Hypothesis] = (),
 ) -> tuple[ObserverBank, list[HypothesisFit]]:
     """The fits repeated with random flows that are learnt from the window too, because a short fault-free part leaves
     them uncertain.
 
     First, the hypotheses are fitted again with the flows that are most likely under the likeliest change, apart from
     those that are far from plausible with their previous values, both with the earlier flows and with these. Then the
-    evidence of each plausible hypothesis, and of those of `always`, is raised by the log-likelihood that flows learnt
-    under it add.
+    evidence of each plausible hypothesis is raised by the log-likelihood that flows learnt under it add.
     """
     likeliest = next(f for f in ranked if f.hypothesis.columns)
-    observer, _ = observer.learning_from(window, believed, changes_of([likeliest]))
+    observer = observer.learning_from(window, believed, changes_of([likeliest]))[0]
     base = observer.white_innovations(window, believed, no_change(believed))
     blocks = observer.in_blocks(window, changes_of(ranked))
     misfits = torch.cat([0.5 * observer.white_innovations(window, believed, b).square().sum((1, 2)) for b in blocks])
@@ -131,10 +129,9 @@ def with_flows_of_window(
     fits = fit(observer, window, believed, hypotheses, starts, misfit(base), prior)
     fits.append(no_change_fit(observer, window, believed, base))
     likely = {f.hypothesis for f in (*ranked, *with_posterior(fits)) if f.probability > SMALLEST_PROBABILITY}
-    likely.update(always)
     for i, f in enumerate(fits):
         if f.hypothesis in likely:
-            gain = observer.learning_from(window, believed, changes_of([f]))[1]
+            gain = observer.learning_from(window, believed, changes_of([f]))[2]
             fits[i] = replace(f, evidence=f.evidence + gain)
     return observer, with_posterior(fits)
 

@@ -159,15 +159,16 @@ class ObserverBank:
 
     def learning_from(
         self, window: ObserverWindow, believed: Tensor, change: ChangeHypotheses
-    ) -> tuple[ObserverBank, float]:
-        """The same observers, with random flows learnt from a window too, in which a change (one lane) took place, and
-        the log of the likelihood of these flows over that of the present ones.
+    ) -> tuple[ObserverBank, float, float]:
+        """The same observers, with random flows learnt from a window too, in which a change (one lane) took place, the
+        log-likelihood of these flows, and what it gained over that of the present ones.
         """
         bank, residual = copy(self), self.run(window, believed, change)[1][0]
         beside = self._beside_errors(window, believed)
         bank._errors = None
-        bank.whitening, gain = self.whitening.learning_from(residual, (beside[1:] - beside[0]) / STEP, window.number)
-        return bank, gain
+        effects = (beside[1:] - beside[0]) / STEP
+        bank.whitening, likelihood, gain = self.whitening.learning_from(residual, effects, window.number)
+        return bank, likelihood, gain
 
     def in_blocks(self, window: ObserverWindow, changes: ChangeHypotheses, even: int = 1) -> list[ChangeHypotheses]:
         """The hypotheses in blocks that fit into memory; each block's size is a multiple of `even`."""

@@ -54,18 +54,22 @@ class Whitening:
         eye = torch.eye(len(self.mean), dtype=self.mean.dtype)
         return self.whitener @ (eye - self.coefficients.sum(0)) @ self.mean
 
-    def learning_from(self, residual: Tensor, effects: Tensor, number: int) -> tuple[Whitening, float]:
+    def learning_from(self, residual: Tensor, effects: Tensor, number: int) -> tuple[Whitening, float, float]:
         """The whitening if the random flows are learnt from further residuals (S, C) too, the observer's from `number`
-        on, and the log of their likelihood over that with the present ones. effects (P, S, C): of the errors of
-        constants on these residuals.
-
-        The ratio of the innovations' standard deviations to those that the flow filter predicts is kept.
+        on, the log-likelihood of all residuals that they were learnt from, and what it gained over the present flows.
+        effects (P, S, C): of the errors of constants on these residuals.
         """
         if self.flows is None:
-            return self, 0.0
-        flows, gain = learning_from(self.flows, residual, effects, number)
-        whitener = self.whitener * (self.flows.innovation_std / flows.innovation_std)
-        return replace(self, whitener=whitener, samples=self.samples + len(residual), flows=flows), gain
+            return self, -0.5 * float(self(residual).square().nansum()), 0.0
+        flows, likelihood, gain = learning_from(self.flows, residual, effects, number)
+        return replace(self.with_flows(flows), samples=self.samples + len(residual)), likelihood, gain
+
+    def with_flows(self, flows: FlowFilter) -> Whitening:
+        """The whitening with other random flows, and with the same ratio of the innovations' standard deviations to
+        those that the flow filter predicts.
+        """
+        before = flows.innovation_std if self.flows is None else self.flows.innovation_std
+        return replace(self, whitener=self.whitener * (before / flows.innovation_std), flows=flows)
 
     def __call__(self, residual: Tensor) -> Tensor:
         """Residuals of a run from its first sample on, scaled to the steady variance (*batch, S, C) -> white
