@@ -18,7 +18,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     with live(arguments, rehearsal.name, screen) as listener, screen.progress(rehearsal.name) as advance:
         done = rehearse(rehearsal, arguments.resume, advance, listener)
     for table in done.tables:
-        screen.table(table.title, table.header, table.rows, left=2)
+        screen.show(table)
         screen.say()
     screen.say(f"{done.computed} of {done.tasks} tasks in {done.seconds:.0f} s; {log_words(done.log)}")
     screen.result(as_json(done))

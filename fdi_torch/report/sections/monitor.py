@@ -5,22 +5,22 @@ Carlo validation.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import orjson
 
-from fdi_torch.amounts import faults_in_words
+from fdi_torch.amounts import faults_in_words, rounded
 from fdi_torch.clock import clock_text
 from fdi_torch.names import listed
 from fdi_torch.report.chart import Chart, Line
-from fdi_torch.report.html import Markup, table, tag
+from fdi_torch.report.html import Markup, shown, table, tag
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import as_float, number, rounded_number, sentence
+from fdi_torch.report.numbers import as_float, number
 from fdi_torch.report.section import Section, channel_signals, signals
 from fdi_torch.report.style import MARK, MODEL
+from fdi_torch.tables import Table
 
 RESIDUAL, ALARM = "/observer/residual", "/observer/alarm"
 _SUFFIXES = ("_statistic", "_threshold")
@@ -106,31 +106,19 @@ def _event_cells(event: Payload) -> list[Any]:
     time, onset, std = (as_float(event.get(name)) for name in ("t", "onset", "onset_std"))
     # A span of this class is not broken into two lines.
     moments = [tag("span", text, class_="moment") if (text := clock_text(t)) else "" for t in (time, onset)]
-    words = str(event.get("event", "")), sentence(str(event.get("message", "")))
-    return [
-        number(time, 6),
-        moments[0],
-        *words,
-        *(["", ""] if math.isnan(onset) else [rounded_number(onset, std), moments[1]]),
-    ]
+    since = ["", ""] if math.isnan(onset) else [rounded(onset, std), moments[1]]
+    return [number(time, 6), moments[0], event.get("event", ""), event.get("message", ""), *since]
 
 
 def rehearsal_section(material: Material) -> Section | None:
     """Every table under its title."""
-    blocks: list[Markup | str] = []
+    blocks: list[Markup] = []
     for entry in rehearsal_tables(material):
         title, header, rows = (entry.get(name) for name in ("title", "header", "rows"))
         if isinstance(header, list) and isinstance(rows, list):
             complete = [row for row in rows if isinstance(row, list) and len(row) == len(header)]
-            words = str(title)
-            blocks += [tag("h4", words[:1].upper() + words[1:]), table(header, complete, _texts(complete))]
+            blocks.append(shown(Table(header, complete, str(title))))
     return Section("Validation of the monitor", blocks) if blocks else None
-
-
-def _texts(rows: Sequence[Sequence[Any]]) -> int:
-    """Number of leading columns that hold no number, at least one."""
-    columns = list(zip(*rows, strict=True))[1:]
-    return 1 + next((k for k, column in enumerate(columns) if re.search(r"\d", " ".join(map(str, column)))), 0)
 
 
 def rehearsal_tables(material: Material) -> list[dict[str, Any]]:

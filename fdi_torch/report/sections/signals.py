@@ -11,11 +11,12 @@ import numpy as np
 import torch
 
 from fdi_torch.logbook import Signals
+from fdi_torch.quantities import quantity_text
 from fdi_torch.report.chart import Chart, Line, corner_points
-from fdi_torch.report.diagnosed_effects import MODEL_NAMES, has_causes
+from fdi_torch.report.gap_tables import MODEL_NAMES, has_causes
 from fdi_torch.report.html import table, tag
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import amount, as_float, axis, number, shown_unit
+from fdi_torch.report.numbers import as_float, axis, number, shown_unit
 from fdi_torch.report.predictions import holdout_prefix, predicted
 from fdi_torch.report.section import Column, Picture, Section, channel_signals, signals
 from fdi_torch.report.sections.monitor import adoptions
@@ -70,7 +71,7 @@ def inputs_section(material: Material) -> Section | None:
         for i, name in enumerate(map(material.channel_words, recording.input_names)):
             unit, channel, values = recording.input_units[i], recording.input_names[i], recording.inputs[:, i]
             if np.isfinite(values).any() and np.nanmin(values) == np.nanmax(values):
-                constant.append(f"{name} at {amount(float(np.nanmax(values)), unit, name=channel)}")
+                constant.append(f"{name} at {quantity_text(float(np.nanmax(values)), unit, name=channel)}")
                 continue
             held = recording.hold == "zero_order"
             time, corners = corner_points(recording.time, values) if held else (recording.time, values)
