@@ -25,7 +25,7 @@ from fdi_torch.config.yaml_files import YAML_ENDINGS, find_data
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import Misfit
 from fdi_torch.gap.free_runs.prediction import Prediction, predict
-from fdi_torch.jobs.python_results import FreeRun, shown_errors, shown_unit
+from fdi_torch.jobs.python_results import FreeRun, sensor_unit, shown_errors
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     before = [FreeRun(other, r, _predict(other, r, arguments, vary=())) for r in recordings] if other else []
     own_name, other_name = _names(plant.name, arguments)
     rows = [(own_name, *_row(run, plant)) for run in runs] + [(other_name, *_row(run, plant)) for run in before]
-    units = (f"{s.name}, {shown_unit(s)}" for s in plant.sensors)
+    units = (f"{s.name}, {sensor_unit(s)}" for s in plant.sensors)
     header = ("plant", "recording", "from, s", "to, s", *units, "start at")
     alone = 0 if other else 1  # without the column of plants
     title = "root mean square error" + ("" if settle is None else f" after the first {settle:g} s")

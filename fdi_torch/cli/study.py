@@ -13,8 +13,7 @@ from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.config.study_file import load_study
 from fdi_torch.jobs.study import StudyResult, run_study
 from fdi_torch.names import counted
-from fdi_torch.report.setting_tables import LEGEND
-from fdi_torch.study.summary import Isolation
+from fdi_torch.report.setting_tables import LEGEND, isolation_sentence
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -36,18 +35,10 @@ def show(result: StudyResult, screen: Screen) -> None:
     if len(tables) == len(result.summaries):
         screen.say(LEGEND)
     if result.isolation is not None:
-        screen.say(isolation_in_words(result.isolation))
+        screen.say(isolation_sentence(vars(result.isolation)))
     per_trial = f", {1e3 * result.seconds / result.computed:.0f} ms each" if result.computed else ""
     screen.say(f"{counted(result.computed, 'trial')} in {result.seconds:.0f} s{per_trial}")
     screen.say(log_words(result.log))
-
-
-def isolation_in_words(isolation: Isolation) -> str:
-    right = 100.0 * isolation.right / isolation.trials
-    return (
-        f"isolation: {isolation.right} of {isolation.trials} modes right ({right:.1f} %), {isolation.missed} faults "
-        f"missed, {isolation.false} false ones"
-    )
 
 
 def as_json(result: StudyResult) -> dict[str, object]:

@@ -198,7 +198,7 @@ class RefitResult(Shown):
         fits = {"constants fitted": self.fit.before, "constants and effects fitted": self.fit.rmse}
         fits = fits if self.plant.effects else {"constants fitted": self.fit.rmse}
         columns = zip(*(shown_errors(self.plant, rmse) for rmse in fits.values()), strict=True)
-        rows = [(s.name, *row, shown_unit(s)) for s, row in zip(self.plant.sensors, columns, strict=True)]
+        rows = [(s.name, *row, sensor_unit(s)) for s, row in zip(self.plant.sensors, columns, strict=True)]
         return Table(("sensor", *fits, "unit"), rows, "root mean square error", digits=4)
 
     def remarks(self) -> list[str]:
@@ -234,7 +234,8 @@ class RefitResult(Shown):
         return self.fit.narrowed()
 
 
-def shown_unit(sensor: Sensor) -> str:
+def sensor_unit(sensor: Sensor) -> str:
+    """The unit for display of a sensor's readings."""
     return display_unit(sensor.unit, sensor.column)[0] or "share"
 
 
@@ -248,6 +249,6 @@ def error_table(trials: Sequence[LeftOutRun], plant: PlantDescription, refitted:
     """One row per free run: errors of the plant file, and of the refitted plant. refitted: to what, in words."""
     errors = [[*shown_errors(plant, t.as_is), *shown_errors(plant, t.refitted)] for t in trials]
     rows = [(Path(t.source).name, t.start, t.stop, *each) for t, each in zip(trials, errors, strict=True)]
-    names = (f"{s.name} {of}, {shown_unit(s)}" for of in ("as is", "refitted") for s in plant.sensors)
+    names = (f"{s.name} {of}, {sensor_unit(s)}" for of in ("as is", "refitted") for s in plant.sensors)
     title = f"root mean square error of free runs; {refitted}"
     return Table(("run", "from, s", "to, s", *names), rows, title, digits=4)

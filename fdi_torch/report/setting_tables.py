@@ -36,6 +36,12 @@ def setting_tables(settings: Sequence[tuple[str, Any, Numbers]], units: Mapping[
     return [Table(("setting", "trials", "failures", "worst error (share of range)"), rows)]
 
 
+def isolation_sentence(counts: Mapping[str, Any]) -> str:
+    """How many modes were stated correctly, from the counts of an `Isolation`."""
+    right, trials, missed, false = (counts.get(name, "?") for name in ("right", "trials", "missed", "false"))
+    return f"{right} of {trials} modes stated correctly; {missed} faults missed, {false} false faults."
+
+
 def _setting_table(setting: str, trials: Any, numbers: Numbers, units: Mapping[str, str]) -> Table:
     """One row per estimator and parameter. The summary says how the trials ended."""
     rows = []

@@ -11,17 +11,18 @@ import numpy as np
 import torch
 
 from fdi_torch.logbook import Signals
-from fdi_torch.quantities import quantity_text
+from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.report.chart import Chart, Line, corner_points
 from fdi_torch.report.gap_tables import MODEL_NAMES, has_causes
-from fdi_torch.report.html import table, tag
+from fdi_torch.report.html import Markup, shown, tag
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import as_float, axis, number, shown_unit
+from fdi_torch.report.numbers import as_float, axis, shown_unit
 from fdi_torch.report.predictions import holdout_prefix, predicted
 from fdi_torch.report.section import Column, Picture, Section, channel_signals, signals
 from fdi_torch.report.sections.monitor import adoptions
 from fdi_torch.report.style import MODEL, OTHER, SOFT
 from fdi_torch.sample_noise import sample_noise
+from fdi_torch.tables import Table
 
 
 def fit_section(material: Material) -> Section | None:
@@ -133,32 +134,20 @@ def _output_panels(
     return columns
 
 
-def _misfit_table(recording: Signals, sensors: Sequence[str], model: np.ndarray) -> str:
+def _misfit_table(recording: Signals, sensors: Sequence[str], model: np.ndarray) -> Markup:
     """Root mean square, mean, largest residual, and Pearson correlation of each sensor."""
     rows = []
     for i, name in enumerate(sensors):
-        unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
+        unit, scale = display_unit(recording.output_units[i], recording.output_names[i])
         counted = recording.mask[:, i] & np.isfinite(model[:, i])
         read, estimate = scale * recording.outputs[counted, i], scale * model[counted, i]
-        residual = read - estimate
-        row = [name, unit or "1", str(int(counted.sum())), *_statistics(residual), _correlation(read, estimate)]
-        rows.append(row)
+        residual = read - estimate if len(read) else np.array([np.nan])
+        statistics = (np.sqrt(np.mean(residual**2)), np.mean(residual), np.max(np.abs(residual)))
+        varies = len(read) > 1 and np.ptp(read) > 0 and np.ptp(estimate) > 0
+        correlation = f"{float(np.corrcoef(read, estimate)[0, 1]):.6f}" if varies else "–"
+        rows.append((name, unit or "1", len(read), *map(float, statistics), correlation))
     header = ("sensor", "unit", "readings", "root mean square", "mean", "largest", "correlation")
-    return table(header, rows, left=2)
-
-
-def _statistics(residual: np.ndarray) -> list[str]:
-    if not len(residual):
-        return ["–"] * 3
-    statistics = (np.sqrt(np.mean(residual**2)), np.mean(residual), np.max(np.abs(residual)))
-    return [number(float(v), 3) for v in statistics]
-
-
-def _correlation(read: np.ndarray, estimate: np.ndarray) -> str:
-    """Pearson correlation; a dash if one of both is constant."""
-    if len(read) < 2 or np.ptp(read) == 0 or np.ptp(estimate) == 0:
-        return "–"
-    return f"{float(np.corrcoef(read, estimate)[0, 1]):.6f}"
+    return shown(Table(header, rows, digits=3))
 
 
 BINS = 24

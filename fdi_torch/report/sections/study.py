@@ -21,7 +21,7 @@ from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import axis, percent, shown_unit
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.sections.estimate import column
-from fdi_torch.report.setting_tables import LEGEND, setting_tables
+from fdi_torch.report.setting_tables import LEGEND, isolation_sentence, setting_tables
 from fdi_torch.report.style import MARK, MODEL, SOFT, logarithmic, panel
 from fdi_torch.study.estimators import ESTIMATORS, Estimator
 
@@ -168,11 +168,8 @@ def isolation_section(material: Material) -> Section | None:
     if counts is None or counts.shape != (len(labels), len(labels)) or not 0 < len(labels) <= MOST_MODES:
         return None
     result = material.about("result")
-    counts_ = [result.get(f"isolation.{name}", "?") for name in ("right", "trials", "missed", "false")]
-    words = (
-        "{} of {} modes stated correctly; {} faults missed, {} false faults. ".format(*counts_)
-        + "Row: true mode; column: stated mode; the table has their full names."
-    )
+    sentence = isolation_sentence({name.removeprefix("isolation."): text for name, text in result.items()})
+    words = f"{sentence} Row: true mode; column: stated mode; the table has their full names."
     rows = [_row(k, labels, counts) for k in range(len(labels)) if counts[k].sum()]
     listed = table(["", "mode", "trials", "right", "most often taken for"], rows)
     picture = Picture("isolation", matrix_panel(counts, labels))
