@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from fdi_torch.cli.adoption import expect_adoptable, write_adopted
 from fdi_torch.cli.explained import exit_code, say_doubts, say_first
@@ -39,8 +40,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     a = arguments
     fitted_to = partial(refit, plant, leave_out=a.leave_out, step=a.step, hold=a.hold, white=white, vary=a.vary)
 
-    trials: list[LeftOutRun] = []
-    held_out: list[LeftOutRun] = []
+    without_its_file, trials = arguments.leave_one_file_out, list[LeftOutRun]()
     with one_thread():
         with screen.progress("refit") as advance:
             fitted = fitted_to(recordings, tell=advance)
@@ -64,24 +64,16 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
                     f"- next: {arguments.adopt} keeps the tolerances of {arguments.plant}; --narrow replaces them by "
                     "the standard errors of this fit, which suits constants that do not drift from day to day"
                 )
-        if holdouts and not arguments.leave_one_file_out:
-            with screen.progress("hold-out") as advance:
-                held_out = predicted_beside(
-                    (plant, fitted.plant), holdouts, arguments.start_samples, advance, arguments.settle
-                )
-            screen.show(error_table(held_out, plant, "refitted: to the recordings above"))
-        if arguments.leave_one_file_out:
-            with screen.progress("leave-one-file-out validation") as advance:
-                trials = leave_one_file_out(
-                    plant,
-                    recordings,
-                    holdouts or recordings,
-                    lambda others: fitted_to(others).plant,
-                    arguments.start_samples,
-                    advance,
-                    arguments.settle,
-                )
+        start: dict[str, Any] = {"start_samples": arguments.start_samples, "settle": arguments.settle}
+        if without_its_file:
+            with screen.progress("leave-one-file-out validation") as start["progress"]:
+                files = (recordings, holdouts or recordings)
+                trials = leave_one_file_out(plant, *files, lambda others: fitted_to(others).plant, **start)
             screen.show(error_table(trials, plant, "refitted: without the file of the run"))
+        elif holdouts:
+            with screen.progress("hold-out") as start["progress"]:
+                trials = predicted_beside((plant, fitted.plant), holdouts, **start)
+            screen.show(error_table(trials, plant, "refitted: to the recordings above"))
     screen.result(
         {
             "format": "fdi_torch.refit/1",
@@ -92,8 +84,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             "parameters": fitted.parameters,
             "fitted": {n: {"value": v, "std": s} for n, (v, s) in fitted.fitted.items()},
             "own": fitted.own,
-            "leave_one_file_out": trials,
-            "holdout": held_out,
+            "leave_one_file_out": trials if without_its_file else [],
+            "holdout": [] if without_its_file else trials,
         }
     )
     return exit_code(misfit)

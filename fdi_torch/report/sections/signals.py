@@ -30,15 +30,13 @@ def fit_section(material: Material) -> Section | None:
     blocks: list[str | list[Column]] = []
     fitted = False
     for k, (recording, group) in enumerate(zip(material.recordings, material.groups, strict=True)):
-        several = len(material.recordings) > 1
-        model = predicted(material, k)
+        model, suffix = predicted(material, k), _suffix(material, k)
         fitted |= model is not None
-        blocks += [tag("h4", recording_name(group))] if several else []
+        blocks += [tag("h4", recording_name(group))] if suffix else []
         sensors = [material.channel_words(name) for name in recording.output_names]
         followed = None if model is not None else _followed(material, recording)
         marks = [] if followed is None else adoptions(material)
         blocks += [FOLLOWED] if followed is not None else []
-        suffix = f"_{k + 1}" if several else ""
         blocks.append(_output_panels(recording, sensors, (model, followed), suffix, clock_of(group), marks))
         if model is not None:
             blocks += [_misfit_table(recording, sensors, model)]
@@ -66,9 +64,7 @@ def inputs_section(material: Material) -> Section | None:
     """Inputs: panels for those that vary, text for constant ones."""
     blocks: list[str | list[Picture]] = []
     for k, (recording, group) in enumerate(zip(material.recordings, material.groups, strict=True)):
-        several = len(material.recordings) > 1
-        suffix = f"_{k + 1}" if several else ""
-        pictures, constant = [], []
+        suffix, pictures, constant = _suffix(material, k), [], []
         for i, name in enumerate(map(material.channel_words, recording.input_names)):
             unit, channel, values = recording.input_units[i], recording.input_names[i], recording.inputs[:, i]
             if np.isfinite(values).any() and np.nanmin(values) == np.nanmax(values):
@@ -77,15 +73,17 @@ def inputs_section(material: Material) -> Section | None:
             held = recording.hold == "zero_order"
             time, corners = corner_points(recording.time, values) if held else (recording.time, values)
             line = Line("command", time, corners, MODEL, steps=held)
-            title = f"{name}, {recording_name(group).lower()}" if several else name
-            clock = clock_of(group)
-            pictures.append(
-                channel_signals(f"input{suffix}_{i + 1}", title, "command", unit, [line], channel, clock=clock)
-            )
-        of = f"{recording_name(group)}, constant" if several else "Constant"
+            words = f"input{suffix}_{i + 1}", f"{name}, {recording_name(group).lower()}" if suffix else name, "command"
+            pictures.append(channel_signals(*words, unit, [line], channel, clock=clock_of(group)))
+        of = f"{recording_name(group)}, constant" if suffix else "Constant"
         blocks += [f"{of}: {', '.join(constant)}."] if constant else []
         blocks += [pictures] if pictures else []
     return Section("Inputs", blocks) if blocks else None
+
+
+def _suffix(material: Material, k: int) -> str:
+    """What the names of the pictures of recording k end with; empty if there is only one."""
+    return f"_{k + 1}" if len(material.recordings) > 1 else ""
 
 
 def recording_name(group: str) -> str:
