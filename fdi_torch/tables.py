@@ -57,6 +57,11 @@ class Table:
         return {name: [row[k] for row in self.rows] for k, name in enumerate(self.header)}
 
     @property
+    def records(self) -> list[dict[str, Any]]:
+        """The rows, each by the names of the columns."""
+        return [dict(zip(self.header, row, strict=True)) for row in self.rows]
+
+    @property
     def left(self) -> int:
         """Number of leading columns that are left-aligned: those of words."""
         if self.words is not None:

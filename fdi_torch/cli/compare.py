@@ -14,7 +14,7 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import replacing
 from fdi_torch.jobs.report import ComparisonResult, compare
-from fdi_torch.report.style import save
+from fdi_torch.report.page import write_pictures
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -26,9 +26,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         screen.say(f"table: {arguments.csv}")
     if arguments.pictures:
         pictures = compared.pictures
-        for picture in pictures:
-            for ending in (".png", ".svg"):
-                save(picture.figure, Path(arguments.pictures) / f"{picture.name}{ending}")
+        write_pictures(pictures, Path(arguments.pictures))
         screen.say(f"{len(pictures)} pictures: {arguments.pictures}")
     words = {"comparison": compared.comparison, "headline": compared.sentences}
     screen.result({"format": "fdi_torch.compare/1", **words})
@@ -37,9 +35,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 def show(compared: ComparisonResult, screen: Screen) -> None:
     """Print the comparison in the units of the first run."""
-    with compared.runs[0].in_its_units():
-        for sentence in compared.sentences:
-            screen.say(sentence)
-        for table in compared.tables():
-            screen.say()
-            screen.show(table)
+    for sentence in compared.sentences:
+        screen.say(sentence)
+    for table in compared.tables():
+        screen.say()
+        screen.show(table)

@@ -20,6 +20,5 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     numbers = ", ".join(counted(counts[kind], kind) for kind in ("input", "output", "parameter"))
     screen.say(f"{arguments.fmu}: FMU for co-simulation (FMI 2.0) with {numbers}")
     screen.show(table)
-    rows = [dict(zip(table.header, row, strict=True)) for row in table.rows]
-    screen.result({"format": "fdi_torch.export/1", "fmu": str(arguments.fmu), "variables": rows})
+    screen.result({"format": "fdi_torch.export/1", "fmu": str(arguments.fmu), "variables": table.records})
     return DONE

@@ -22,7 +22,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         advance(0.0, f"{study.plan.trials} trials")
         result = run_study(study, arguments.resume, arguments.cluster, advance, listener)
     show(result, screen)
-    screen.result(as_json(result))
+    numbers = {"settings": result.summaries, "isolation": result.isolation, "computed": result.computed}
+    screen.result({"format": "fdi_torch.study/1", **numbers, "seconds": result.seconds, "log": str(result.log)})
     return 0
 
 
@@ -39,14 +40,3 @@ def show(result: StudyResult, screen: Screen) -> None:
     per_trial = f", {1e3 * result.seconds / result.computed:.0f} ms each" if result.computed else ""
     screen.say(f"{counted(result.computed, 'trial')} in {result.seconds:.0f} s{per_trial}")
     screen.say(log_words(result.log))
-
-
-def as_json(result: StudyResult) -> dict[str, object]:
-    return {
-        "format": "fdi_torch.study/1",
-        "settings": result.summaries,
-        "isolation": result.isolation,
-        "computed": result.computed,
-        "seconds": result.seconds,
-        "log": str(result.log),
-    }

@@ -68,7 +68,7 @@ def report(
     written: list[Path] = []
     for k, each in enumerate(reports if pictures else ()):
         several = f"{k + 1}_" if len(reports) > 1 else ""
-        written += write_pictures(each, target.with_suffix("") / several if several else target.with_suffix(""))
+        written += write_pictures(each.pictures, target.with_suffix("") / several)
     tell(1.0, "done")
     headlines = {str(each.material.run.path): headline(each.material) for each in reports}
     return Report(target, tuple(written), headlines, tuple(notes))

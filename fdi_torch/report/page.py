@@ -92,9 +92,9 @@ def document(title: str, content: Sequence[Markup], style: str = "", refresh: in
     return f"<!doctype html>\n{tag('html', tag('head', head), tag('body', tag('main', *content)), lang='en')}\n"
 
 
-def write_pictures(report: RunReport, folder: Path) -> list[Path]:
+def write_pictures(pictures: Sequence[Picture], folder: Path) -> list[Path]:
     """Write every picture as PNG and SVG."""
-    return [save(p.figure, folder / f"{p.name}{ending}") for p in report.pictures for ending in (".png", ".svg")]
+    return [save(p.figure, folder / f"{p.name}{ending}") for p in pictures for ending in (".png", ".svg")]
 
 
 def _article(report: RunReport, prefix: str) -> Markup:

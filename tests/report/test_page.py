@@ -103,8 +103,8 @@ def test_a_torn_log_is_shown_and_said_to_be_torn(log: Path, tmp_path: Path) -> N
 
 
 def test_pictures_are_written_as_png_and_svg_and_repeat(log: Path, tmp_path: Path) -> None:
-    first = write_pictures(report_of(material_of(log)), tmp_path / "a")
-    again = write_pictures(report_of(material_of(log)), tmp_path / "b")
+    first = write_pictures(report_of(material_of(log)).pictures, tmp_path / "a")
+    again = write_pictures(report_of(material_of(log)).pictures, tmp_path / "b")
     assert {p.suffix for p in first} == {".png", ".svg"}
     assert [p.read_bytes() for p in first] == [p.read_bytes() for p in again]
     assert first[0].read_bytes().startswith(b"\x89PNG")
