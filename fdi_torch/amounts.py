@@ -101,6 +101,11 @@ def probability_words(probability: float) -> str:
     return f"{100.0 * probability:.1f} %" if probability >= 0.001 else "under 0.1 %"
 
 
+def percent_text(mass: float) -> str:
+    """The probability of an explanation of a monitor in whole percent: 'over 99 %', '60 %'."""
+    return "over 99 %" if mass > 0.99 else f"{100.0 * mass:.0f} %" if mass >= 0.01 else "under 1 %"
+
+
 def rounded(value: float, std: float) -> str:
     """The value with as many digits as show two of its standard error; with six where it has none, or one that is
     within the rounding of the numbers it was computed with.

@@ -424,6 +424,14 @@ def test_a_long_line_is_folded_on_a_terminal_only(
     first, second = capsys.readouterr().out.splitlines()
     assert first == "   400.0 s  notice  watches for leak at A and B, plugging at"
     assert second == f"{'':20}link and drain, pump gain at Q"
+    Screen().say(
+        "   400.0 s  explained leak at A, 60 %, or leak at B, 40 %, since 380.0 s; A overflows in 90 s", indent=20
+    )
+    assert capsys.readouterr().out.splitlines() == [
+        "   400.0 s  explained leak at A, 60 %,",
+        f"{'':20}or leak at B, 40 %, since 380.0 s;",
+        f"{'':20}A overflows in 90 s",
+    ]
 
 
 def test_json_has_null_where_a_number_is_not_finite(capsys: pytest.CaptureFixture[str]) -> None:

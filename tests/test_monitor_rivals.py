@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from fdi_torch.monitor.events import SMALLEST_SHARE, Explanation, Size, headline, percent_text
+from fdi_torch.amounts import percent_text
+from fdi_torch.monitor.events import SMALLEST_SHARE, Explanation, Size, headline
 from tests.sessions import BLOCK, run_command
 from tests.test_monitor import SPACE, followed, monitor, recorded, step_to
 
@@ -82,6 +84,34 @@ def test_a_headline_has_the_likeliest_and_every_rival_above_5_percent() -> None:
     assert headline(told) == "leak at A (size 0.1), 90 %, or pump gain at Q (size 0.1), 6 %"
     assert headline(told, sizes=False) == "leak at A, 90 %, or pump gain at Q, 6 %"
     assert headline(told[2:]) == "sensor bias at hA (size 0.1)"
+
+
+def test_a_headline_names_three_of_many_rivals() -> None:
+    shares = (0.3, 0.2, 0.16, 0.14, 0.13, 0.04)
+    told = [
+        Explanation(mass, (Size(f"{k}.leak.size", 0.1, 0.01, "1", "size 0.1"),))
+        for mass, k in zip(shares, "ABCDEF", strict=True)
+    ]
+    three = "leak at A, 30 %, or leak at B, 20 %, or leak at C, 16 %"
+    assert headline(told, sizes=False) == f"{three}, or 2 more, 27 % (see the log)"
+    assert headline(told[:3], sizes=False) == three
+
+
+@pytest.mark.parametrize(
+    ("flow", "shown"), [(9.6e-14, "0 cm^3/s now"), (-3e-13, "0 cm^3/s now"), (3e-9, "0.003 cm^3/s now")]
+)
+def test_an_empty_tank_has_no_leak_flow(flow: float, shown: str) -> None:
+    """The law of an orifice is smoothed, so that some 1e-13 m^3/s remain."""
+    assert Size("A.leak.size", 2.8, 0.1, "1", "size 2.80 ± 0.10", flow=flow).amounts[1] == shown
+
+
+def test_the_summary_of_an_alarm_without_an_answer_says_only_that_it_is_not_explained() -> None:
+    watch = monitor()
+    state, _ = followed(watch, recorded(step_to("T3.leak.size", 0.05, 200.0), 300))
+    [alarm, *_] = state.alarms
+    change = SimpleNamespace(number=alarm.number, best=SimpleNamespace(misfit_ratio=2.0))
+    event = watch.writer.summary(replace(state, change=change, tracks=()), replace(alarm, explanations=()))
+    assert ": does not explain all of the residual; raised at" in event.text
 
 
 def test_a_gap_in_the_fault_free_part_does_not_end_the_learning() -> None:

@@ -48,7 +48,7 @@ drawn, axes = figure(1, 2, found.headline.partition(";")[0])
 residual, law = axes[0]
 for k, color in ((0, GREY), (1, BLUE), (2, ORANGE)):
     residual.plot(time, 100 * (noisy - free)[:, k], color=color, linewidth=0.9, label=names[1][k])
-residual.set(xlabel="time, s", ylabel="recorded - nominal model, cm")
+residual.set(xlabel="time, s", ylabel="recorded − nominal model, cm")
 residual.legend(frameon=False)
 heights = torch.linspace(0.34, 0.47, 100)
 law.plot(100 * heights, 1e6 * lost(heights), color=ORANGE, label="simulated law")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import math
 import os
+import re
 import sys
 import textwrap
 import time
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 SECONDS_BETWEEN_LINES = 2.0
 SECONDS_BETWEEN_EQUAL_LINES = 60.0  # a line that repeats the last one says only that the job still runs
 ENDLESS = 1 << 16  # characters per line of a pipe or a file
+_PARTS = re.compile(r"(?<=;) |(?<=,) (?=or )")
 
 
 def log_words(log: Path) -> str:
@@ -72,12 +74,16 @@ class Screen:
 
     def say(self, text: str = "", indent: int = 0) -> None:
         """Print a line of the result; not with JSON. indent: of the further lines into which a terminal folds it, if it
-        has room for them."""
+        has room for them: one for each statement and each of several alternatives.
+        """
         if self.json:
             return
         folded = [text]
         if indent and self._out.is_terminal and self._out.width > 2 * indent:
-            folded = textwrap.wrap(text, self._out.width, subsequent_indent=" " * indent, break_on_hyphens=False)
+            first, *others = _PARTS.split(text)
+            parts = [first, *(" " * indent + part for part in others)]
+            options: Any = {"subsequent_indent": " " * indent, "break_on_hyphens": False}
+            folded = [line for part in parts for line in textwrap.wrap(part, self._out.width, **options)]
         for line in folded:
             self._out.print(_shown(line))
 

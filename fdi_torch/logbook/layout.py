@@ -2,6 +2,9 @@
 
 Every message path names a field of the schema of its topic. It quotes names with other characters than letters of
 ASCII, digits and underscores, such as `"T1.leak.size"`, as the grammar of these viewers requires.
+
+The unit of a plot, SI as in the log, stands in its title, at its axis (Foxglove), and in the legend, because Lichtblick
+has no labels of axes.
 """
 
 from __future__ import annotations
@@ -26,6 +29,8 @@ _COST = {
 _TABLES = ("/observer/alarm", "/diagnosis/fault", "/gap/where", "/study/summary", "/study/trial")
 _TEXTS = ("/estimate/final", "/gap/verdict")
 _SECONDS = {"t", "timestamp", "wall"}
+_TITLES = ("foxglovePanelTitle", "lichtblickPanelTitle")  # keys of a panel's title in the two viewers
+_NO_UNIT = "no unit"
 MOST_PER_TAB = 4
 
 Panel = tuple[str, dict[str, Any]]  # type of the panel, configuration
@@ -96,7 +101,7 @@ def _sensor_plots(fields: Fields) -> list[Panel]:
         for name, unit in _signals(fields[topic]):
             lines = [(_path(topic, name), "measured")]
             lines += [(_path(model, name), "estimated")] if name in fields.get(model, {}) else []
-            plots.append(_plot(_title(name, topic, unit), lines))
+            plots.append(_plot(_title(name, topic), unit, lines))
     return plots
 
 
@@ -107,9 +112,10 @@ def _residual_plots(fields: Fields) -> list[Panel]:
         present = fields[topic]
         for name, unit in _signals(present):
             lines = [(_path(topic, name), "residual"), *_companions(present, topic, name, _BAND)]
-            plots.append(_plot(_title(f"{name}: residual", topic, unit), lines))
+            plots.append(_plot(_title(f"{name}: residual", topic), unit, lines))
         for name in _tests(present):
-            plots.append(_plot(_title(f"{name}: test statistic", topic, ""), _companions(present, topic, name, _TEST)))
+            title = _title(f"{name}: test statistic", topic)
+            plots.append(_plot(title, _NO_UNIT, _companions(present, topic, name, _TEST)))
     return plots
 
 
@@ -133,13 +139,13 @@ def _input_plots(fields: Fields) -> list[Panel]:
     for topic in _topics(fields, "/plant/", "/input"):
         for unit in dict.fromkeys(unit for _, unit in _signals(fields[topic])):
             lines = [(_path(topic, name), name) for name, its in _signals(fields[topic]) if its == unit]
-            plots.append(_plot(_title("Inputs", topic, unit), lines))
+            plots.append(_plot(_title("Inputs", topic), unit, lines))
     return plots
 
 
 def _cost_plots(fields: Fields) -> list[Panel]:
     return [
-        _plot(f"{title}: cost over {step}", [(_path(topic, name), name) for name in costs], f"{topic}.{step}")
+        _plot(f"{title}: cost over {step}", _NO_UNIT, [(_path(topic, name), name) for name in costs], f"{topic}.{step}")
         for topic, (title, step, costs) in _COST.items()
         if {step, *costs} <= fields.get(topic, {}).keys()
     ]
@@ -152,20 +158,24 @@ def _signals(present: Mapping[str, str]) -> list[tuple[str, str]]:
     return [(name, unit) for name, unit in present.items() if name not in _SECONDS and name not in companions]
 
 
-def _title(name: str, topic: str, unit: str) -> str:
-    """The name with the recording's group and the unit."""
+def _title(name: str, topic: str) -> str:
+    """The name with the recording's group."""
     parts = topic.split("/")
-    group = f" ({parts[2]})" if len(parts) == 4 else ""
-    return f"{name}{group}{', ' + unit if unit else ''}"
+    return f"{name} ({parts[2]})" if len(parts) == 4 else name
 
 
-def _plot(title: str, lines: Sequence[tuple[str, str]], over: str = "") -> Panel:
-    """A plot of message paths with labels, over time or over another field."""
+def _plot(title: str, unit: str, lines: Sequence[tuple[str, str]], over: str = "") -> Panel:
+    """A plot of message paths with labels, over time or over another field. unit: empty if unknown."""
+    unit = _NO_UNIT if unit == "1" else unit
+    end = f", {unit}" if unit else ""
     paths = [
-        {"value": value, "enabled": True, "timestampMethod": "receiveTime", "label": label} for value, label in lines
+        {"value": value, "enabled": True, "timestampMethod": "receiveTime", "label": f"{label}{end}"}
+        for value, label in lines
     ]
-    plot: dict[str, Any] = {"title": title, "paths": paths, "showLegend": True, "legendDisplay": "floating"}
-    plot |= {"showXAxisLabels": True, "showYAxisLabels": True, "isSynced": not over}
+    plot: dict[str, Any] = dict.fromkeys(_TITLES, f"{title}{end}")
+    plot |= {"paths": paths, "showLegend": True, "legendDisplay": "floating", "isSynced": not over}
+    plot |= {"showXAxisLabels": True, "showYAxisLabels": True, "yAxisLabel": f"{title}{end}"}
+    plot |= {"xAxisLabel": over.rpartition(".")[2] or "time, s"}
     plot |= {"xAxisVal": "custom", "xAxisPath": {"value": over, "enabled": True}} if over else {"xAxisVal": "timestamp"}
     return "Plot", plot
 

@@ -167,7 +167,7 @@ class EventWriter:
             explanations = (self._tracks_explanation(state, tracks, likeliest.mass), *rivals)
             faults = self._tracks_text(explanations, tracks)
         if state.change is not None and state.change.number == alarm.number:
-            faults += _unexplained_text(state.change.best)
+            faults = (faults + _unexplained_text(state.change.best)).removeprefix("; ")
         if alarm.count > 1:
             times = f"raised {alarm.count} times, {alarm.first:g} s to {alarm.last:g} s"
         else:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
-from fdi_torch.amounts import amount_words, estimate_words, parameter_words, sized_words
+from fdi_torch.amounts import amount_words, estimate_words, parameter_words, percent_text, sized_words
 from fdi_torch.clock import clock_text
 from fdi_torch.estimate.uncertainty import end_reached, plain_value
 from fdi_torch.monitor.alarm_state import State
@@ -30,6 +30,8 @@ Kind = Literal[
 ]
 FORMAT = "fdi_torch.event/3"
 SMALLEST_SHARE = 0.05  # headlines name explanations with at least this probability, and sensors with this share
+MOST_NAMED = 3  # explanations of a headline; the event has all
+NO_FLOW = 1e-12  # m^3/s, a drop in half a day: what the smoothed law of an orifice leaves of a flow from an empty tank
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,10 @@ class Size:
     @property
     def amounts(self) -> tuple[str, ...]:
         """'size 0.300 ± 0.020', '12.1 cm^3/s now'."""
-        return (self.shown,) if self.flow is None else (self.shown, f"{quantity_text(self.flow, 'm^3/s', 3)} now")
+        if self.flow is None:
+            return (self.shown,)
+        flow = self.flow if abs(self.flow) >= NO_FLOW else 0.0
+        return self.shown, f"{quantity_text(flow, 'm^3/s', 3)} now"
 
 
 @dataclass(frozen=True)
@@ -208,7 +213,7 @@ class Event:
 
     @property
     def headline(self) -> str:
-        """The explanations above 5 %, with their probabilities if there are several."""
+        """The likeliest explanations, with their probabilities if there are several."""
         return headline(self.explanations)
 
     def to_dict(self) -> dict[str, Any]:
@@ -219,12 +224,17 @@ class Event:
 
 
 def headline(explanations: Sequence[Explanation], sizes: bool = True) -> str:
-    """The explanations above 5 %, likeliest first, with their probabilities if there are several. sizes: name them."""
-    named = [e for k, e in enumerate(explanations) if k == 0 or e.mass >= SMALLEST_SHARE]
+    """The explanations above 5 %, likeliest first, with their probabilities if there are several; of more than
+    `MOST_NAMED` the others' number. sizes: name them.
+    """
+    above = [e for k, e in enumerate(explanations) if k == 0 or e.mass >= SMALLEST_SHARE]
+    named, others = above[:MOST_NAMED], above[MOST_NAMED:]
     texts = [e.text if sizes else e.causes for e in named]
     if len(named) == 1:
         return texts[0]
-    return ", or ".join(f"{text}, {percent_text(e.mass)}" for text, e in zip(texts, named, strict=True))
+    said = [f"{text}, {percent_text(e.mass)}" for text, e in zip(texts, named, strict=True)]
+    said += [f"{len(others)} more, {percent_text(sum(e.mass for e in others))} (see the log)"] if others else []
+    return ", or ".join(said)
 
 
 def _by_effect(sizes: Sequence[Size]) -> list[list[Size]]:
@@ -232,10 +242,6 @@ def _by_effect(sizes: Sequence[Size]) -> list[list[Size]]:
     for size in sizes:
         grouped.setdefault(ParameterName.parse(size.name).prefix, []).append(size)
     return list(grouped.values())
-
-
-def percent_text(mass: float) -> str:
-    return "over 99 %" if mass > 0.99 else f"{100.0 * mass:.0f} %" if mass >= 0.01 else "under 1 %"
 
 
 def size_of(p: Parameter, size: float, std: float, rate: float | None = None) -> Size:

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from fdi_torch.amounts import percent_text
 from fdi_torch.monitor.detection import DRIFT, VERY_LONG, Detector
-from fdi_torch.monitor.events import Explanation, percent_text, size_of
+from fdi_torch.monitor.events import Explanation, size_of
 from fdi_torch.monitor.hypothesis import NO_CHANGE, Fault, HypothesisFit
 from fdi_torch.monitor.hypothesis_fit import Prior
 from fdi_torch.monitor.isolation import isolate, with_flows_of_window

@@ -8,6 +8,7 @@ import base64
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,10 +28,13 @@ from fdi_torch.report.style import (
     label_lines,
     logarithmic,
     panel,
+    row_letters,
 )
 
 BINS = 400
 MOST_LABELS = 4  # of dashed lines in a picture
+LEAST_LETTERS = 12  # of a line of such a label
+FLAT = 1.8  # height of a picture of residuals, inches
 
 
 def thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -181,25 +185,32 @@ def draw(chart: Chart) -> Figure:
 
 
 def _draw_marks(axes: Axes, chart: Chart) -> None:
-    """Dashed lines with their labels, each on the side that has more room; many are drawn without labels."""
+    """Dashed lines with their labels, each on the side that has more room, in lines that fit there; many are drawn
+    without labels.
+    """
     marks = list(chart.marks)[:MOST_EVENTS]
-    for k, (moment, label) in enumerate(marks):
+    low, high = axes.get_xlim()
+    lines = 0  # of labels so far
+    for moment, label in marks:
         axes.axvline(moment, color=INK, lw=0.8, ls=(0, (2, 2)))
-        low, high = axes.get_xlim()
-        right = moment - low > 0.5 * (high - low)
+        place = (moment - low) / (high - low)
+        right = place > 0.5
         if len(marks) <= MOST_LABELS:
+            letters = int(max(place, 1.0 - place) * row_letters(axes))
+            text = fill(short(label, 80), max(letters, LEAST_LETTERS), max_lines=3, placeholder="…")
             axes.annotate(
-                short(label, 34),
-                xy=(moment, 0.97 - 0.12 * k),
+                text,
+                xy=(moment, 0.97 - 0.15 * HEIGHT / chart.height * lines),
                 xycoords=("data", "axes fraction"),
                 xytext=(-4 if right else 4, 0),
                 textcoords="offset points",
                 ha="right" if right else "left",
                 va="top",
-                fontsize=8.0,
+                fontsize=9.0,
                 color=INK,
-                bbox={"facecolor": PAPER, "edgecolor": "none", "pad": 1.0},
+                bbox={"facecolor": PAPER, "edgecolor": "none", "pad": 1.0, "alpha": 0.8},
             )
+            lines += 1 + text.count("\n")
 
 
 def chart_json(chart: Chart) -> str:

@@ -20,6 +20,8 @@ _TAGS = re.compile("<[^>]*>")
 _POWER = re.compile(r"(?<=[^\W\d_])\^(-?\d+)")
 _NEGATIVE = re.compile(r"(?<![\w.])-(?=\d)")
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff\u202a-\u202e\u2066-\u2069]")
+_WITHIN_DATE = re.compile(r"(?<=\d)-(?=\d)")
+_WITHIN_NUMBER = re.compile(r" (?=[±%])|(?<=±) |(?<=\d) (?=[^\s\d]{1,8}(?:[),;.]|$))")
 
 
 class Markup(str):
@@ -53,6 +55,11 @@ def tag(name: str, /, *content: Any, **attributes: str) -> Markup:
     """An element with its text typeset; write `class_` and `for_` for attributes that are Python keywords."""
     written = "".join(f' {key.rstrip("_").replace("_", "-")}="{escape(value)}"' for key, value in attributes.items())
     return Markup(f"<{name}{written}>{join(content)}</{name}>")
+
+
+def unbroken(sentence: str) -> str:
+    """The sentence whose lines do not end within a number with its error and unit, or within a date."""
+    return _WITHIN_DATE.sub("\u2060-\u2060", _WITHIN_NUMBER.sub("\u00a0", sentence))
 
 
 def join(parts: Iterable[Any]) -> Markup:

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
 from fdi_torch.logbook import labels_of
-from fdi_torch.report.html import Markup, bullets, join, tag
+from fdi_torch.report.html import Markup, bullets, join, tag, unbroken
 from fdi_torch.report.material import Material
 from fdi_torch.report.section import Maker, Picture, Section, section_html
 from fdi_torch.report.sections import SECTIONS
@@ -39,7 +38,7 @@ _HASH = base64.b64encode(hashlib.sha256(SCRIPT.encode()).digest()).decode()
 POLICY = f"default-src 'none'; style-src 'unsafe-inline'; script-src 'sha256-{_HASH}'"
 
 
-WIDEST_BESIDE = 6.8  # inches of a rig beside the result; a wider one would have letters too small to read
+WIDEST_BESIDE = 5.3  # inches of a rig beside the result; a wider one would have letters too small to read
 
 
 @dataclass(frozen=True)
@@ -61,10 +60,6 @@ def report_of(material: Material) -> RunReport:
     return RunReport(material, tuple(section for section in made if section is not None))
 
 
-_WITHIN_DATE = re.compile(r"(?<=\d)-(?=\d)")
-_WITHIN_NUMBER = re.compile(r" (?=[±%])|(?<=±) |(?<=\d) (?=[^\s\d]{1,8}(?:[),;.]|$))")
-
-
 def page(reports: Sequence[RunReport], first: Sequence[Section] = (), above: Sequence[Markup] = ()) -> str:
     """The complete page. first: sections about all runs, such as their comparison. above: elements before them."""
     title = " · ".join(report.material.run.path.stem for report in reports[:4])
@@ -73,7 +68,7 @@ def page(reports: Sequence[RunReport], first: Sequence[Section] = (), above: Seq
         runs = [(f"r{k}-run", name) for k, name in enumerate(labels_of([r.material.run.path for r in reports]))]
         listed = [*((f"all-{k}", section.title) for k, section in enumerate(first)), *runs]
         shared = (section_html(section, "all-", f"all-{k}") for k, section in enumerate(first))
-        articles = [tag("h1", f"Comparison · {title}"), _index(listed), *shared, *articles]
+        articles = [tag("h1", f"Comparison · {title}"), _index(listed), _cards([*shared]), *articles]
     return document(title, [*above, *articles])
 
 
@@ -107,21 +102,19 @@ def _article(report: RunReport, prefix: str) -> Markup:
     index = _index([(name, section.title) for name, section in ordered.items()])
     made = [section_html(section, prefix, name) for name, section in ordered.items()]
     leading = sum(section.lead for section in report.sections)
-    return tag("article", *top, index, *_lead(report, made[:leading]), *made[leading:], id=f"{prefix}run")
+    return tag("article", *top, index, *_lead(report, made, leading), id=f"{prefix}run")
 
 
-def unbroken(sentence: str) -> str:
-    """The sentence whose lines do not end within a number with its error and unit, or within a date."""
-    return _WITHIN_DATE.sub("\u2060-\u2060", _WITHIN_NUMBER.sub("\u00a0", sentence))
-
-
-def _lead(report: RunReport, sections: list[Markup]) -> list[Markup]:
-    """The result: the rig and, beside it or below a wide one, the other leading sections."""
+def _lead(report: RunReport, sections: list[Markup], leading: int) -> list[Markup]:
+    """All sections as cards. The first `leading` ones are the result, a rig that is not wide beside the others."""
     rig = next((picture.figure for picture in report.pictures if picture.name == RIG), None)
-    if rig is None or len(sections) < 2:
-        return sections
-    parts = [sections[0], tag("div", *sections[1:], class_="findings")]
-    return parts if rig.get_figwidth() > WIDEST_BESIDE else [tag("div", *parts, class_="lead")]
+    if rig is None or leading < 2 or rig.get_figwidth() > WIDEST_BESIDE:
+        return [_cards(sections)]
+    return [tag("div", sections[0], _cards(sections[1:leading]), class_="lead"), _cards(sections[leading:])]
+
+
+def _cards(sections: Sequence[Markup]) -> Markup:
+    return tag("div", *sections, class_="cards")
 
 
 def _index(entries: Sequence[tuple[str, str]]) -> Markup:

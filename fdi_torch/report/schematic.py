@@ -12,6 +12,7 @@ from matplotlib.patches import Circle, Polygon, Rectangle
 
 from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor, Tank
 from fdi_torch.plant.flow_component import FlowComponent, Sketch
+from fdi_torch.report.flow_routes import ASIDE, LOWEST, FlowRoutes, TankGrid
 from fdi_torch.report.html import short
 from fdi_torch.report.rig_layout import (
     GAP,
@@ -36,8 +37,6 @@ INCH = 0.8  # per unit of the drawing; a tank is one unit wide
 POINTS_PER_UNIT = 72 * INCH
 TALL = 1.4  # minimum height of a tank
 COLUMN, BETWEEN = 1.95, 1.7  # minimum distance of two tanks' middles; minimum free height between two rows
-LOWEST = 0.12  # height of a line between two tanks above their floors
-ASIDE, LANE = 0.68, 0.36  # from a tank's middle to a line beside its left wall, and on to the next one
 
 
 def schematic(plant: PlantDescription, overlay: Overlay | None = None) -> Figure:
@@ -52,15 +51,16 @@ class _Drawing:
     def __init__(self, plant: PlantDescription, overlay: Overlay) -> None:
         self.plant, self.overlay = plant, overlay
         self.places = tank_places(plant)
-        self.crossings = self.besides = 0
         self.ends: list[Point] = []  # of the lines of flow components
         self.blocks: list[TextBlock] = []
         counts = {c.name: len(self.lines(c.name)) for c in plant.components()}
-        self.tall = max(TALL, 0.4 + LINE * (1 + max(counts[t.name] for t in plant.tanks)))
+        tall = max(TALL, 0.4 + LINE * (1 + max(counts[t.name] for t in plant.tanks)))
         most = max((counts[c.name] for c in plant.flow_components()), default=1)
-        self.row = self.tall + BETWEEN + LINE * max(0, 2 * most - 4)  # words below a tank and above the next row
+        row = tall + BETWEEN + LINE * max(0, 2 * most - 4)  # words below a tank and above the next row
         beside = max((text_width(t, w) for x in plant.sensors for t, _, w in self.lines(x.name)), default=0.0)
-        self.column = max(COLUMN, 1.24 + beside / POINTS_PER_UNIT)
+        grid = TankGrid(self.places, max(COLUMN, 1.24 + beside / POINTS_PER_UNIT), row, tall)
+        self.tall, self.corner = tall, grid.corner
+        self.routes = FlowRoutes(plant, grid)
         self.figure = Figure()
         FigureCanvasAgg(self.figure)
         self.axes: Axes = self.figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -104,11 +104,6 @@ class _Drawing:
     def tank_box(self, tank: str) -> Box:
         x, y = self.corner(tank)
         return x - 0.5, y, x + 0.5, y + self.tall
-
-    def corner(self, tank: str) -> Point:
-        """Middle of a tank's floor."""
-        row, column = self.places[tank]
-        return column * self.column, -row * self.row
 
     def colour(self, name: str) -> str:
         return MARK if name in self.overlay.marks else INK
@@ -181,7 +176,7 @@ class _Drawing:
     def flow(self, component: FlowComponent) -> None:
         """Draw a flow component as its `sketch` declares: a line along its route with its symbol."""
         sketch = component.sketch()
-        points = self.route(component, sketch)
+        points = self.routes.route(component, sketch)
         self.ends += [points[0], points[-1]]
         self.line(component.name, points, arrow=sketch.arrow)
         start, end = longest_piece(points)
@@ -192,7 +187,7 @@ class _Drawing:
             self.symbol(component.name, sketch, middle, direction(start, end))
         if sketch.route == "from_above":
             top = middle[1] + sketch.round + 0.08
-            if self.fed_from_above(component.target):  # beside the flow from above
+            if self.routes.fed_from_above(component.target):  # beside the flow from above
                 self.words(component.name, (middle[0] + 2 * sketch.round, top), "right", "bottom")
             else:
                 self.words(component.name, (middle[0], top), "center", "bottom")
@@ -207,60 +202,6 @@ class _Drawing:
         else:
             low = min(middle[1], self.corner(component.source)[1] + LOWEST) - 0.18 - sketch.round
             self.words(component.name, (middle[0], low), "center", "top")
-
-    def route(self, component: FlowComponent, sketch: Sketch) -> list[Point]:
-        """Corner points of a flow component's line."""
-        if sketch.route == "from_above":
-            return self.route_from_above(component, sketch)
-        x, y = self.corner(component.source)
-        rise = self.tall * min(sketch.height / self.plant.tank(component.source).height, 0.9)
-        if sketch.route == "over_wall":
-            return self.route_over_wall(component, rise)
-        flows = [c for c in self.plant.flow_components() if c.sketch().route == sketch.route]
-        if component.target == OUTSIDE:
-            out = [c.name for c in flows if c.source == component.source and c.target == OUTSIDE]
-            x += 0.3 * (out.index(component.name) - (len(out) - 1) / 2)
-            return [(x, y + rise), (x, y - 0.55)]
-        to_x, to_y = self.corner(component.target)
-        if component.falls:
-            to_x += 0.22
-            return [(x + 0.22, y), (x + 0.22, y - 0.3), (to_x, y - 0.3), (to_x, to_y + self.tall + 0.06)]
-        side = 0.5 if to_x > x else -0.5
-        same = [c.name for c in flows if {c.source, c.target} == {component.source, component.target}]
-        rise += LOWEST + 0.28 * same.index(component.name)
-        if y == to_y and abs(to_x - x) < 1.01 * self.column:  # the next tank
-            return [(x + side, y + rise), (to_x - side, to_y + rise)]
-        if x == to_x and sketch.arrow:
-            return self.route_beside((x - 0.5, y + rise), to_x, to_y)
-        self.crossings += 1
-        low = min(y, to_y) - 0.16 - 0.12 * self.crossings
-        return [(x + 0.6 * side, y), (x + 0.6 * side, low), (to_x - 0.6 * side, low), (to_x - 0.6 * side, to_y)]
-
-    def route_from_above(self, component: FlowComponent, sketch: Sketch) -> list[Point]:
-        """From a symbol above the target down to its rim."""
-        x, y = self.corner(component.target)
-        same = [c.name for c in self.plant.flow_components() if c.source == OUTSIDE and c.target == component.target]
-        fed = 0.22 if self.fed_from_above(component.target) else 0.0
-        x += (same.index(component.name) - (len(same) - 1) / 2) * 0.7 - fed
-        return [(x, y + self.tall + 0.55 - sketch.round), (x, y + self.tall + 0.06)]
-
-    def route_over_wall(self, component: FlowComponent, rise: float) -> list[Point]:
-        """Points of a line over the source's wall at the height `rise`, then down outside or into the target."""
-        x, y = self.corner(component.source)
-        if component.target == OUTSIDE:
-            return [(x - 0.5, y + rise), (x - ASIDE, y + rise), (x - ASIDE, y - 0.45)]
-        to_x, to_y = self.corner(component.target)
-        if to_y != y:
-            return self.route_beside((x - 0.5, y + rise), to_x, to_y)
-        side = 0.5 if to_x > x else -0.5
-        return [(x + side, y + rise), (to_x - side, y + rise)]
-
-    def route_beside(self, start: Point, to_x: float, to_y: float) -> list[Point]:
-        """Points of a line from the left wall of a tank, past this tank, to the rim of a tank in another row."""
-        self.besides += 1
-        lane, above = start[0] + 0.5 - ASIDE - LANE * (self.besides - 1), to_y + self.tall + 0.14 + 0.1 * self.besides
-        end = to_x - 0.2 - 0.12 * self.besides
-        return [start, (lane, start[1]), (lane, above), (end, above), (end, to_y + self.tall + 0.06)]
 
     def symbol(self, name: str, sketch: Sketch, middle: Point, direction: Point) -> None:
         """Draw a component's symbol at the middle of its line, turned into the direction of the flow."""
@@ -296,6 +237,3 @@ class _Drawing:
         self.axes.plot(*np.array(points).T, color=MARK, lw=1.8, ls="--", alpha=alpha, zorder=1)
         if location in self.overlay.marks:
             self.words(location, ((x + to_x) / 2, (y + to_y) / 2 + 1.3), "center", "top")
-
-    def fed_from_above(self, tank: str) -> bool:
-        return any(c.falls and c.target == tank for c in self.plant.flow_components())

@@ -15,7 +15,8 @@ from fdi_torch.report.numbers import axis, shown_unit
 from fdi_torch.report.style import inline_svg
 
 REM_PER_INCH = 7.6  # width of a wide picture; its text then has the size of the page's text
-LEAST_REM_PER_INCH = 4.7  # on a small screen, where a picture that is wider still scrolls
+LEAST_REM_PER_INCH = 5.6  # on a small screen, where a picture that is wider still scrolls
+WIDE = 36.0  # rem; a picture that is narrower leaves room for another card
 
 
 @dataclass(frozen=True)
@@ -96,4 +97,5 @@ def _figure(picture: Picture, prefix: str) -> Markup:
     if not picture.wide:
         return tag("figure", svg, *caption)
     usual, least = (rem * picture.figure.get_figwidth() for rem in (REM_PER_INCH, LEAST_REM_PER_INCH))
-    return tag("figure", svg, *caption, class_="wide", style=f"max-width: {usual:.1f}rem; --least: {least:.1f}rem")
+    kind = "wide" if usual > WIDE else "wide small"
+    return tag("figure", svg, *caption, class_=kind, style=f"max-width: {usual:.1f}rem; --least: {least:.1f}rem")

@@ -69,7 +69,7 @@ _SETTINGS: dict[Any, Any] = {
     "axes.facecolor": "none",
     "savefig.facecolor": PAPER,
 }
-WIDTH, HEIGHT = 4.4, 2.7
+WIDTH, HEIGHT = 3.2, 2.3  # inches; letters of 9 points then have 11 pixels in the narrowest card
 MOST_TITLE, LETTERS_AN_INCH = 400, 10
 
 
@@ -88,8 +88,8 @@ def panel(title: str, x_label: str, y_label: str, width: float = WIDTH, height: 
         FigureCanvasAgg(figure)
         axes = figure.subplots()
         set_panel_title(axes, title)
-        axes.set_xlabel(x_label)
-        axes.set_ylabel(y_label)
+        axes.set_xlabel(fill(x_label, int(LETTERS_AN_INCH * width)))
+        axes.set_ylabel(fill(y_label, max(int(1.1 * LETTERS_AN_INCH * height), 12)))
     return figure, axes
 
 
@@ -118,21 +118,24 @@ def power_text(value: float) -> str:
     return power if float(digits) == 1.0 else f"{float(digits):g}·{power}"
 
 
-def label_lines(axes: Axes, columns: int = 4) -> None:
+def label_lines(axes: Axes) -> None:
     """Label the lines above the plot in their colours, so that no box hides data; a long title is above the labels."""
     title, names = axes.get_title("left"), axes.get_legend_handles_labels()[1]
+    widths = [len(name) + 4 for name in names]
+    row = int(1.4 * row_letters(axes))  # the letters of labels are smaller than those of titles
+    columns = len(names) if sum(widths) <= row else max(1, row // max(widths))
     with styled():
-        if "\n" in title or len(title) + sum(len(name) + 4 for name in names) > _row(axes):
-            axes.set_title(title, pad=18.0)
+        if "\n" in title or columns < len(names) or len(title) + sum(widths) > row_letters(axes):
+            axes.set_title(title, pad=5.0 + 13.5 * ceil(len(names) / columns))
         axes.legend(loc="lower right", bbox_to_anchor=(1.02, 0.97), ncols=columns)
 
 
 def set_panel_title(axes: Axes, title: str) -> None:
     """Set the title of a panel, broken into lines that fit its width."""
-    axes.set_title(fill(title, _row(axes)))
+    axes.set_title(fill(title, row_letters(axes)))
 
 
-def _row(axes: Axes) -> int:
+def row_letters(axes: Axes) -> int:
     """Letters of a panel's title that fit one row."""
     place, figure = axes.get_subplotspec(), axes.get_figure(root=True)
     columns = place.get_gridspec().ncols if place else 1
@@ -164,8 +167,10 @@ def inline_svg(figure: Figure, name: str, description: str) -> str:
 
 
 def notebook_svg(figure: Figure, name: str, description: str) -> str:
-    """The figure as an HTML element for notebooks, on a background of its own, no larger than its natural size."""
-    width = f"{72 * figure.get_figwidth():g}px"
+    """The figure as an HTML element for notebooks, on a background of its own, no larger than its natural size, in
+    which letters of 9 points have 12 pixels.
+    """
+    width = f"{96 * figure.get_figwidth():g}px"
     style = f"max-width: {width}; background: {PAPER}; color: {INK}"
     svg = _svg(figure, re.sub(r"\W+", "-", name), escape(description))
     return f'<div style="{style}">{svg}</div>'
@@ -195,7 +200,7 @@ def _own_ids(svg: str, name: str) -> str:
     return re.sub(r'(url\(#|href="#)', rf"\g<1>{name}-", svg)
 
 
-BAR_NAME = 28  # letters of a line of a bar's name, which has at most two
+BAR_NAME = 24  # letters of a line of a bar's name, which has at most three
 ONE_LINE = 26  # letters of a parameter's name beside an axis
 
 
@@ -208,8 +213,9 @@ def bar_panel(
     strong: Sequence[bool],
 ) -> Figure:
     """Horizontal bars from the top, each with its value at the end; `strong` ones are highlighted."""
-    labels = [fill(short(name, 80), BAR_NAME, max_lines=2, placeholder="…") for name in names]
-    height = 0.6 + (0.4 if any("\n" in label for label in labels) else 0.29) * len(names)
+    labels = [fill(short(name, 80), BAR_NAME, max_lines=3, placeholder="…") for name in names]
+    lines = max((1 + label.count("\n") for label in labels), default=1)
+    height = 0.6 + max(0.29, 0.155 * lines) * len(names)
     figure, axes = panel(short(title), short(x_label), "", height=height)
     rows = list(range(len(names)))
     lengths = np.nan_to_num(np.asarray(values, dtype=float))
@@ -239,7 +245,7 @@ def ellipse_panel(
 ) -> Figure:
     """50 % and 95 % confidence regions of two parameters (chi^2 with two degrees of freedom), and the true values."""
     labels = [f"{_in_two_lines(n)}{', ' + u if u else ''}" for n, u in zip(names, units, strict=True)]
-    figure, axes = panel("", labels[0], labels[1], width=3.6, height=3.0)
+    figure, axes = panel("", labels[0], labels[1], height=2.7)
     values, vectors = np.linalg.eigh(covariance)
     angle = np.linspace(0.0, 2.0 * np.pi, 121)
     circle = np.stack((np.cos(angle), np.sin(angle)))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from urllib.parse import urlencode
 
 from fdi_torch.names import counted
-from fdi_torch.report.html import Markup, clean, escape, folded, join, table, tag
+from fdi_torch.report.html import Markup, clean, escape, folded, join, table, tag, unbroken
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import number
 from fdi_torch.report.page import document
@@ -94,7 +94,7 @@ def _sorting(key: str, name: str, query: Query) -> Markup:
 
 def _row(entry: Entry) -> list[Markup | str]:
     """A log in the list; one that cannot be read has neither box nor link."""
-    box, (name, started, kind, state, *rest) = "", entry.cells
+    box, (name, started, kind, state, error, verdict) = "", entry.cells
     if entry.state != UNREADABLE:
         box = _field(type="checkbox", name="log", value=entry.name, aria_label=f"compare {entry.name}")
         page = "/follow" if entry.state == RUNNING else "/report"
@@ -103,7 +103,7 @@ def _row(entry: Entry) -> list[Markup | str]:
         state = join([tag("span", RUNNING, class_="good"), " ", _bar(entry.progress)])
     elif entry.state != "completed":
         state = tag("span", entry.state, class_="bad")
-    return [box, name, started, kind, state, *rest]
+    return [box, name, started, kind, state, error, unbroken(verdict)]
 
 
 def _bar(progress: Progress) -> Markup:

@@ -16,11 +16,12 @@ from fdi_torch.cli import DONE, MISUSE, main
 from fdi_torch.logbook import RunLog, foxglove_layout, read_run, series
 
 # Keys that the panels read: fields of PlotConfig, TableConfig, LogConfig, RawMessagesConfig in foxglove.layouts of
-# foxglove-sdk 0.30.3, and of the types of these panels in Lichtblick (packages/suite-base/src/panels), camel case.
+# foxglove-sdk 0.30.3, and of the types of these panels in Lichtblick (packages/suite-base/src/panels), camel case. The
+# title is kept beside them by the viewer itself: PANEL_TITLE_CONFIG_KEY of packages/suite-base/src/util/layout.ts.
 PANELS = {
     "Plot": {
-        *("title", "paths", "showLegend", "legendDisplay", "showXAxisLabels", "showYAxisLabels", "isSynced"),
-        *("xAxisVal", "xAxisPath"),
+        *("paths", "showLegend", "legendDisplay", "showXAxisLabels", "showYAxisLabels", "isSynced"),
+        *("xAxisVal", "xAxisPath", "xAxisLabel", "yAxisLabel", "foxglovePanelTitle", "lichtblickPanelTitle"),
     },
     "Table": {"topicPath"},
     "RawMessages": {"topicPath"},
@@ -86,20 +87,29 @@ def test_a_plot_per_sensor_shows_measured_and_estimated(tmp_path: Path) -> None:
     assert main(["inspect", str(tmp_path / "a.mcap"), "--layout", str(tmp_path / "a.json")]) == DONE
     layout = json.loads((tmp_path / "a.json").read_text())
     shown = expect_sound(layout, tmp_path / "a.mcap")
-    plots = {p["title"]: [line["value"] for line in p["paths"]] for p in layout["configById"].values() if "paths" in p}
+    panels = [panel for panel in layout["configById"].values() if "paths" in panel]
+    plots = {panel["foxglovePanelTitle"]: [line["value"] for line in panel["paths"]] for panel in panels}
     assert plots["h2, m"] == ["/plant/output.h2", "/estimate/output.h2"]
     residual = "/estimate/residual.h2"
     assert [residual, f"{residual}_low", f"{residual}_high"] in plots.values()
     assert plots["Inputs, m^3/s"] == ["/plant/input.Q1", "/plant/input.Q2"]
+    for panel in panels:
+        title, unit = panel["foxglovePanelTitle"], panel["foxglovePanelTitle"].rpartition(", ")[2]
+        assert panel["lichtblickPanelTitle"] == panel["yAxisLabel"] == title and unit in ("m", "m^3/s", "no unit")
+        assert all(line["label"].endswith(f", {unit}") for line in panel["paths"])
+        assert panel["xAxisLabel"] == (
+            "time, s" if panel["xAxisVal"] == "timestamp" else title.rpartition(" over ")[2][:-9]
+        )
     assert {"/log", "/observer/alarm", "/gap/verdict", "/estimate/final"} <= set(shown)
 
 
 def test_the_statistic_of_a_monitor_is_beside_its_threshold() -> None:
     panels = foxglove_layout(read_run(DATA / "log_format_1_monitor.mcap"))["configById"].values()
-    plots = {p["title"]: [(line["value"], line["label"]) for line in p["paths"]] for p in panels if "paths" in p}
-    test = [(f"/observer/residual.cusum_{name}", name) for name in ("statistic", "threshold")]
-    assert plots["cusum: test statistic"] == test
-    assert plots["h1: residual, m"] == [("/observer/residual.h1", "residual")]
+    title = "lichtblickPanelTitle"
+    plots = {p[title]: [(line["value"], line["label"]) for line in p["paths"]] for p in panels if "paths" in p}
+    test = [(f"/observer/residual.cusum_{name}", f"{name}, no unit") for name in ("statistic", "threshold")]
+    assert plots["cusum: test statistic, no unit"] == test
+    assert plots["h1: residual, m"] == [("/observer/residual.h1", "residual, m")]
     assert sum("cusum" in title for title in plots) == 1
 
 
@@ -150,7 +160,7 @@ def test_the_library_of_the_viewer_accepts_every_panel(log: Path) -> None:
     panels = {name: config for name, config in found.items() if not name.startswith("Tab!")}
     assert panels
     for name, config in panels.items():
-        untitled = {key: value for key, value in config.items() if key != "title"}  # the title belongs to the panel
+        untitled = {key: value for key, value in config.items() if "PanelTitle" not in key}  # it belongs to the panel
         assert _read(untitled, *classes[name.partition("!")[0]]) == untitled, name
 
 

@@ -118,7 +118,7 @@ GAP_ANSWER: dict[str, Any] = {
             "Q1": {"at": [0.0, 100.0, 200.0], "value": [2e-5, 8e-5, 2e-5]},
         },
     },
-    "remarks": ["Two input steps can never separate lag from delay."],
+    "remarks": ["Two input steps can never separate lag from delay.", "a rate is at the end of its range (-0.5 1/s)"],
     "impostors": {
         "best": [_DELAY],
         "left_open": 0.03,

@@ -14,7 +14,8 @@ from browser import browser, draw_all, opened  # noqa: F401
 from sample_runs import material_of, write_train
 
 from fdi_torch.report.chart import MOST_SAMPLES, Chart, Line, chart_json, draw
-from fdi_torch.report.page import POLICY, SCRIPT, page, report_of
+from fdi_torch.report.page import POLICY, SCRIPT, document, page, report_of
+from fdi_torch.report.section import Section, section_html, signals
 from fdi_torch.report.style import MARK, MODEL
 
 TIME = np.arange(100.0)
@@ -210,3 +211,46 @@ def test_without_scripts_and_on_paper_the_pictures_stay(browser: Any, path: Path
     tab.emulate_media(media="print")
     assert all(picture.is_visible() for picture in tab.locator("figure > svg").all())
     assert not tab.locator("canvas").first.is_visible()
+
+
+ADOPTED = "leak at Zulauf and valve leak at Verbindung 12 and sensor bias at LI-101 adopted"
+# Keeps the words that are written on canvases, with their left and right ends and the width of the canvas.
+WRITTEN = """() => {
+    window.written = [];
+    const write = CanvasRenderingContext2D.prototype.fillText;
+    CanvasRenderingContext2D.prototype.fillText = function (text, x, ...rest) {
+        const wide = this.measureText(text).width, left = this.textAlign === "right" ? x - wide : x;
+        written.push([text, left, left + wide, this.canvas.width]);
+        write.call(this, text, x, ...rest);
+    };
+}"""
+
+
+@pytest.mark.parametrize("moment", [3.0, 45.0, 55.0, 97.0])
+def test_the_label_of_a_mark_is_not_cut_on_a_narrow_chart(browser: Any, moment: float, tmp_path: Path) -> None:  # noqa: F811
+    line = Line("residual", TIME, np.sin(TIME), MODEL)
+    chart = Chart("h1", "time, s", "residual, cm", [line], level=0.0, marks=[(moment, ADOPTED)])
+    (tmp_path / "page.html").write_text(
+        document("charts", [section_html(Section("Residuals", [[signals("h1", chart)]]), "r", "s")])
+    )
+    tab, said = opened(browser, tmp_path / "page.html", 500)
+    draw_all(tab)
+    tab.evaluate(WRITTEN)
+    tab.set_viewport_size({"width": 390, "height": 900})
+    tab.wait_for_timeout(200)
+    parts = [each for each in tab.evaluate("written") if each[0] in ADOPTED and not each[0].isdigit()]
+    assert " ".join(part for part, *_ in parts) == ADOPTED and len(parts) > 1
+    assert all(left >= 0 and right <= wide for _, left, right, wide in parts)
+    tab.context.close()
+    assert said == []
+
+
+@pytest.mark.parametrize("moment", [3.0, 45.0, 55.0, 97.0])
+def test_the_label_of_a_mark_is_not_cut_in_a_picture(moment: float) -> None:
+    chart = Chart("h1", "time, s", "residual, cm", [Line("r", TIME, np.sin(TIME), MODEL)], marks=[(moment, ADOPTED)])
+    figure = draw(chart)
+    figure.canvas.draw()
+    (label,) = figure.axes[0].texts
+    box = label.get_window_extent()
+    assert box.x0 >= 0.0 and box.x1 <= figure.bbox.x1
+    assert label.get_text().replace("\n", " ").startswith("leak at Zulauf and valve leak")

@@ -69,6 +69,16 @@ def test_a_value_stays_beside_its_error() -> None:
         assert "±\n" not in figure.get_suptitle() and "\n±" not in figure.get_suptitle()
 
 
+def test_the_title_of_a_fit_has_minus_signs_and_raised_units() -> None:
+    plant = Plant([Tank("A", 0.1, 1.0)], sensors=[Sensor("h", "A")])
+    time, read = torch.arange(5.0, dtype=torch.float64), torch.ones(5, 1, dtype=torch.float64)
+    recording = plant.recording(time, read[:, :0], read, source="run-2.csv")
+    title = fit_figure(
+        recording, {"estimate": read}, "run-2.csv: pump offset at Q (-11.1 cm^3/s)", plant
+    ).get_suptitle()
+    assert title == "run-2.csv: pump offset at Q (−11.1 cm³/s)"
+
+
 def test_many_sensors_stand_in_rows() -> None:
     plant = Plant([Tank(f"T{k}", 0.1, 1.0) for k in range(7)], sensors=[Sensor(f"h{k}", f"T{k}") for k in range(7)])
     time, read = torch.arange(5.0, dtype=torch.float64), torch.ones(5, 7, dtype=torch.float64)

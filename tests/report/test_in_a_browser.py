@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import re
+import unicodedata
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
@@ -47,7 +48,11 @@ WRITERS = {
 }
 LOGS = ("windows", "what_if", "monitor", "gap")
 KINDS = (*WRITERS, *(f"logged_{name}" for name in LOGS), "compare", "nasty", "view")
-PAPER = 688  # pixels of an A4 page between its margins
+PAPER, PAGE = 688, 1009  # pixels of an A4 page between its margins
+
+# The words of each table that fits on a page.
+BLOCKS = """most => [...document.querySelectorAll("table")].filter(table => table.checkVisibility()
+    && table.getBoundingClientRect().height < 0.95 * most).map(table => table.innerText)"""
 
 # What is wrong with a page, in words. Text on a canvas is not seen; whether it is drawn is.
 FAULTS = """() => {
@@ -92,9 +97,12 @@ FAULTS = """() => {
     const [a, b] = [light(svg ? style.fill : style.color), light(svg ? below(svg, parent, own[0]) : ground(parent))];
     const contrast = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
     if (contrast < 4.5) wrong.push(`contrast of ${contrast.toFixed(2)}: ${text}`);
-    const height = svg ? own[0].height : parseFloat(style.fontSize);
-    if (height && height < 8.5) wrong.push(`letters of ${height.toFixed(1)} pixels: ${text}`);
-    for (const box of own) if (box.right > innerWidth + 1 && !parent.closest(".scroll")) wrong.push(`cut off: ${text}`);
+    const matrix = svg && parent.getScreenCTM(), scale = svg ? Math.hypot(matrix.a, matrix.b) : 1;
+    const letters = scale * parseFloat(style.fontSize), least = matchMedia("print").matches ? 10 : 11;
+    if (letters < least) wrong.push(`letters of ${letters.toFixed(1)} pixels: ${text}`);
+    if (/(^|[\\s(])-\\d/.test(text) && !parent.closest("pre")) wrong.push(`a hyphen for a minus sign: ${text}`);
+    const cut = own.some(box => box.right > innerWidth + 1) && !parent.closest(".scroll, .wide");
+    if (cut) wrong.push(`cut off: ${text}`);
   }
   boxes.sort((one, other) => one.box.top - other.box.top);
   boxes.forEach((one, i) => {
@@ -194,6 +202,9 @@ def test_a_page_can_be_printed(browser: Any, path: Path) -> None:  # noqa: F811
     before_content = "h1, h2, h3, h4, summary, p:has(+ .grid)"
     leading = tab.eval_on_selector_all(before_content, "all => all.map(each => each.textContent)")
     pages = [squeezed(each.extract_text()) for each in pypdf.PdfReader(io.BytesIO(printed)).pages]
+    for words in tab.evaluate(BLOCKS, PAGE):
+        ends = squeezed(words)[:40], squeezed(words)[-40:]
+        assert any(all(end in text for end in ends) for text in pages), f"broken between two pages: {words[:80]}"
     for k, text in enumerate(pages[:-1]):
         last = [words for words in map(squeezed, leading) if text.endswith(words[-60:])]
         assert not last, f"page {k + 1} ends with what belongs to the next one: {last}"
@@ -201,8 +212,8 @@ def test_a_page_can_be_printed(browser: Any, path: Path) -> None:  # noqa: F811
 
 
 def squeezed(text: str) -> str:
-    """Text without spaces, which PDF does not keep."""
-    return re.sub(r"\s", "", text)
+    """Text without spaces and ligatures, which PDF does not keep or adds."""
+    return re.sub(r"\s", "", unicodedata.normalize("NFKC", text))
 
 
 FLOW = {"std": 2.5e-6, "unit": "m^3/s", "correlation_time": 15.0}

@@ -30,8 +30,9 @@ from fdi_torch.logbook import RunLog, read_run
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.report.chart import draw
 from fdi_torch.report.diagnosed_effects import diagnosed_effects
+from fdi_torch.report.html import unbroken
 from fdi_torch.report.material import gather
-from fdi_torch.report.page import RunReport, page, report_of, unbroken
+from fdi_torch.report.page import RunReport, page, report_of
 from fdi_torch.report.sections.signals import profile_section
 from fdi_torch.report.verdict import _latest, headline
 
@@ -171,6 +172,7 @@ def test_a_page_of_the_first_format_says_what_its_shares_are(gap_page: str) -> N
     assert "Share of the gap that a free discrepancy there alone closes." in text
     assert "something is wrong there" not in text and "Random flows" not in text
     assert "something unknown at Q1" in text, "which the first format says in a field of its own"
+    assert "at the end of its range (−0.5 1/s)" in text
 
 
 def test_a_monitor_page_shows_residuals_thresholds_and_events(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ def test_numbers_of_a_monitor_have_the_digits_that_their_standard_errors_justify
         log.alarm(764.0, "explained", "Q.pump_offset", told, onset=700.4754, onset_std=0.31)
     text = page([report_of(material_of(tmp_path / "run.mcap"))])
     assert ">700.48<" in text and "700.475" not in text
+    text = text.replace("\N{NO-BREAK SPACE}", " ").replace("\N{WORD JOINER}", "")
     assert "(−1.072 ± 0.087 l/min), by hA-hB of 2026-11-24" in text
 
 
@@ -110,3 +111,25 @@ def test_an_unfinished_study_names_its_parameters(tmp_path: Path) -> None:
     assert axes.get_title(loc="left") == "pump offset at Q1" and axes.get_ylabel() == "size of the error, cm³/s"
     bar = next(line for line in axes.lines if line.get_linestyle() == "-").get_ydata()
     assert bar == pytest.approx(0.1 * np.sqrt([7.5, 7.5])), "a bound limits the root mean square, not the median"
+
+
+def test_the_rivals_of_an_alarm_are_a_list_and_each_statement_has_a_line(tmp_path: Path) -> None:
+    names = [f"leak at {k} (size -0.2 ± 0.1)" for k in "ABCDE"]
+    head = f"{names[0]}, 60 %, or {names[1]}, 20 %, or 3 more, 20 % (see the log)"
+    told = f"{head}, since 700.1 ± 0.2 s; A runs dry in 80 s"
+    with RunLog(tmp_path / "run.mcap", "monitor", env={}, git={}) as log:
+        about = {"explanations": names, "masses": [0.6, 0.2, 0.1, 0.06, 0.04], "headline": head}
+        log.alarm(764.0, "cannot tell", "A.leak.size", told, alarm=1, **about)
+        log.alarm(800.0, "summary", "A.leak.size", f"alarm 1, explained: {told}", alarm=1, **about)
+        log.alarm(
+            900.0, "revised", "A.leak.size", f"{names[0]}; A runs dry", alarm=1, explanations=names[:1], masses=[1.0]
+        )
+    text = page([report_of(material_of(tmp_path / "run.mcap"))]).replace("\N{NO-BREAK SPACE}", " ")
+    listed = "<li>leak at A (size −0.2 ± 0.1), 60 %</li>", "<li>leak at E (size −0.2 ± 0.1), 4 %</li>"
+    assert all(text.count(item) == 2 for item in listed)
+    assert (
+        "<div>since 700.1 ± 0.2 s</div><div>A runs dry in 80 s</div>" in text
+        and "3 more" not in text.split("<tbody>")[1]
+    )
+    assert "<div>leak at A (size −0.2 ± 0.1)</div><div>A runs dry</div>" in text
+    assert ">alarm 1, explained: <ul>" in text

@@ -19,6 +19,7 @@ const text = (value, digits = 5) => {
 const decoded = (code, Kind) => new Kind(Uint8Array.from(atob(code), letter => letter.charCodeAt(0)).buffer);
 const unit = label => (label.includes(", ") ? " " + label.slice(label.lastIndexOf(", ") + 2) : "");
 
+const MOST_LABELS = 4; // of marks
 // Charts of one clock: they share crosshair and zoom.
 class Clock {
   constructor(key) { this.key = key; this.charts = []; this.span = null; }
@@ -138,6 +139,7 @@ class Chart {
         setCursor: [plot => this.read(plot.cursor.idx)],
         setSelect: [plot => this.select(plot)],
         drawAxes: [plot => this.marks(plot)],
+        draw: [plot => this.labels(plot)],
       },
     };
   }
@@ -155,7 +157,7 @@ class Chart {
   size() {
     const width = Math.max(this.field.clientWidth, 120);
     const enlarged = this.figure.closest("dialog");
-    if (!enlarged) return { width, height: Math.round(Math.max(0.86 * this.ratio * width, 130)) };
+    if (!enlarged) return { width, height: Math.round(Math.min(Math.max(0.86 * this.ratio * width, 130), 320)) };
     const count = enlarged.querySelectorAll("figure").length;
     return { width, height: Math.round(Math.max((innerHeight - 120) / count - 90, 130)) };
   }
@@ -191,10 +193,11 @@ class Chart {
     });
   }
 
-  // Mean and root mean square of the residuals of the stretch that is shown, part by part between its marks.
+  // Mean and root mean square of the residuals of the stretch that is shown, part by part between its marks if these
+  // are few.
   summary(low, high) {
-    const inside = this.about.marks.map(mark => mark[0]).filter(moment => moment > low && moment < high);
-    const ends = [low, ...new Set(inside), high];
+    const inside = new Set(this.about.marks.map(mark => mark[0]).filter(moment => moment > low && moment < high));
+    const ends = [low, ...(inside.size > MOST_LABELS ? [] : inside), high];
     const parts = ends.slice(0, -1).map((end, k) => this.part(end, ends[k + 1], !k));
     this.note.replaceChildren(...parts.filter(part => part).map(part => element("div", "", part)));
   }
@@ -236,21 +239,44 @@ class Chart {
       const x = plot.valToPos(moment, "x", true);
       line(x, top, x, top + height);
     }
-    ctx.strokeStyle = ctx.fillStyle = colour("ink");
-    ctx.font = `${12 * devicePixelRatio}px system-ui, sans-serif`;
+    ctx.strokeStyle = colour("ink");
     ctx.setLineDash([2 * devicePixelRatio, 2 * devicePixelRatio]);
-    this.about.marks.forEach(([moment, label], k, all) => {
-      const x = plot.valToPos(moment, "x", true), left_of_it = x > left + width / 2;
+    for (const [moment] of this.about.marks) {
+      const x = plot.valToPos(moment, "x", true);
       line(x, top, x, top + height);
-      ctx.textAlign = left_of_it ? "right" : "left";
-      const y = top + (14 + 15 * k) * devicePixelRatio;
-      if (all.length > 4) return;
-      const at = x + (left_of_it ? -4 : 4) * devicePixelRatio, wide = ctx.measureText(label).width;
-      ctx.fillStyle = colour("paper");
-      ctx.fillRect(left_of_it ? at - wide : at, y - 11 * devicePixelRatio, wide, 14 * devicePixelRatio);
-      ctx.fillStyle = colour("ink");
-      ctx.fillText(label, at, y);
-    });
+    }
+    ctx.restore();
+  }
+
+  // The labels of few marks, each on the side that has more room, in lines that fit there.
+  labels(plot) {
+    const { ctx, bbox: { left, top, width } } = plot, pixel = devicePixelRatio;
+    if (this.about.marks.length > MOST_LABELS) return;
+    ctx.save();
+    ctx.font = `${12 * pixel}px system-ui, sans-serif`;
+    let y = top + 14 * pixel;
+    for (const [moment, label] of this.about.marks) {
+      const x = plot.valToPos(moment, "x", true), on_left = x > left + width / 2;
+      if (x < left || x > left + width) continue;
+      const room = (on_left ? x - left : left + width - x) - 8 * pixel, at = x + (on_left ? -4 : 4) * pixel;
+      const fits = words => ctx.measureText(words).width <= room, lines = [""];
+      for (const word of label.split(" ")) {
+        const longer = `${lines.at(-1)} ${word}`.trim();
+        if (fits(longer)) lines.splice(-1, 1, longer);
+        else lines.push(word);
+      }
+      ctx.textAlign = on_left ? "right" : "left";
+      for (const words of lines.filter(words => words)) {
+        const wide = ctx.measureText(words).width;
+        ctx.globalAlpha = 0.8;
+        ctx.fillStyle = colour("paper");
+        ctx.fillRect(on_left ? at - wide : at, y - 11 * pixel, wide, 14 * pixel);
+        ctx.globalAlpha = 1;
+        ctx.fillStyle = colour("ink");
+        ctx.fillText(words, at, y);
+        y += 15 * pixel;
+      }
+    }
     ctx.restore();
   }
 

@@ -19,7 +19,7 @@ from fdi_torch.report.html import Markup, folded, short, shown, table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.sections.study import TRIAL, group_panel
-from fdi_torch.report.style import INK, MARK, MODEL, OTHER, PAPER, SOFT, label_lines, panel
+from fdi_torch.report.style import INK, MARK, MODEL, OTHER, PAPER, SOFT, WIDTH, label_lines, panel
 
 PLACES = {"pumps": (PUMP,), "pipes and outlets": (PIPE, OUTLET), "tanks": (TANK, PAIR), "sensors": (SENSOR,)}
 Share = Mapping[str, Any]
@@ -142,7 +142,7 @@ def shares_panel(
     title: str, kinds: Sequence[str], own: Sequence[Share], others: Mapping[str, Sequence[Share]]
 ) -> Figure:
     """Share of right answers of each kind with its interval, and small marks for the baselines."""
-    figure, axes = panel(short(title), "right answers, %", "", height=1.1 + 0.3 * len(kinds))
+    figure, axes = panel(short(title), "right answers, %", "", height=1.4 + 0.3 * len(kinds))
     rows = np.arange(len(kinds))
     for (name, shares), colour, mark in zip(others.items(), (OTHER, SOFT, INK, MARK), "dx+^", strict=False):
         x = [100 * s["share"] if s else np.nan for s in shares]
@@ -152,14 +152,15 @@ def shares_panel(
     axes.plot(middle, rows, "o", color=MODEL, ms=6, label="fdi")
     axes.set_xlim(-3, 103)
     axes.set_yticks(rows, [f"{short(k, 16)} ({s['of']})" for k, s in zip(kinds, own, strict=True)])
-    axes.invert_yaxis()
-    label_lines(axes, columns=2)
+    axes.set_ylim(len(kinds) - 0.5, -0.5)
+    label_lines(axes)
     return figure
 
 
 def confusion_panel(title: str, rows: Sequence[str], columns: Sequence[str], counts: np.ndarray) -> Figure:
     """Counts (rows, columns) of the true cause against the answer; right answers are blue."""
-    figure, axes = panel(short(title), "", "", height=1.35 + 0.27 * len(rows))
+    width = max(WIDTH, 1.4 + 0.17 * len(columns))  # of slanted letters of 9 points beside each other
+    figure, axes = panel(short(title), "", "", width=width, height=1.35 + 0.27 * len(rows))
     for i, j in np.argwhere(counts > 0):
         right = rows[i] == columns[j] or columns[j] == "unknown, there"
         axes.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, facecolor=MODEL if right else MARK, edgecolor=PAPER))
@@ -182,7 +183,7 @@ def calibration_panel(title: str, bins: Sequence[Mapping[str, Any]]) -> Figure:
     axes.plot(at, [100 * b["stated"] for b in bins], "_", color=MARK, ms=22, mew=2.0)
     axes.set_xticks(at, [f"{b['low']:g}–{b['high']:g}\n({b['of']})" for b in bins])
     axes.set_xlim(-0.6, len(bins) - 0.4)
-    axes.set_ylim(-3, 103)
+    axes.set_ylim(-8, 108)
     return figure
 
 

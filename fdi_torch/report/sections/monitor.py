@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import orjson
 
-from fdi_torch.amounts import faults_in_words, rounded
+from fdi_torch.amounts import faults_in_words, percent_text, rounded
 from fdi_torch.clock import clock_text
 from fdi_torch.names import listed
-from fdi_torch.report.chart import Chart, Line
-from fdi_torch.report.html import Markup, shown, table, tag
+from fdi_torch.report.chart import FLAT, Chart, Line
+from fdi_torch.report.html import Markup, bullets, shown, table, tag, unbroken
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import as_float, number
 from fdi_torch.report.section import Section, channel_signals, signals
@@ -35,7 +35,7 @@ def residual_section(material: Material) -> Section | None:
     alarms, marks, pictures = _alarms(material), adoptions(material), []
     for k, name in enumerate(name for name in columns if name != "t" and not name.endswith(_SUFFIXES)):
         unit, lines = material.unit(RESIDUAL, name), [Line("measured − predicted", time, columns[name], MODEL)]
-        about: dict[str, Any] = {"level": 0.0, "events": alarms, "marks": marks, "clock": "monitor", "height": 2.1}
+        about: dict[str, Any] = {"level": 0.0, "events": alarms, "marks": marks, "clock": "monitor", "height": FLAT}
         about |= {"name": f"observer_residual_{k + 1}", "title": material.channel_words(name), "label": "residual"}
         pictures.append(channel_signals(si_unit=unit, lines=lines, channel=name, **about))
     words = f"Vertical lines: alarms.{mark_words(marks, 'the residuals are')}"
@@ -105,9 +105,28 @@ def _event_cells(event: Payload) -> list[Any]:
     """Cells of an event, empty where it has no onset or the recording has no dates."""
     time, onset, std = (as_float(event.get(name)) for name in ("t", "onset", "onset_std"))
     # A span of this class is not broken into two lines.
-    moments = [tag("span", text, class_="moment") if (text := clock_text(t)) else "" for t in (time, onset)]
-    since = ["", ""] if math.isnan(onset) else [rounded(onset, std), moments[1]]
-    return [number(time, 6), moments[0], event.get("event", ""), event.get("message", ""), *since]
+    kind, *moments = (
+        tag("span", text, class_="moment") if text else ""
+        for text in (event.get("event", ""), clock_text(time), clock_text(onset))
+    )
+    onsets = ["", ""] if math.isnan(onset) else [rounded(onset, std), moments[1]]
+    return [number(time, 6), moments[0], kind, _description(event), *onsets]
+
+
+def _description(event: Payload) -> Markup:
+    """The message, each of its statements on a line, and several explanations of an alarm as a list of all."""
+    message, names = str(event.get("message", "")), event.get("explanations")
+    rivals = list(zip(names, event.get("masses") or (), strict=False)) if isinstance(names, list) else []
+    before, named, after = message.partition(str(event.get("headline") or message))
+    if named and len(rivals) > 1:
+        items = [unbroken(f"{text}, {percent_text(as_float(mass))}") for text, mass in rivals]
+        return tag("div", before, *bullets(items), *_lines(after))
+    return tag("div", *_lines(message))
+
+
+def _lines(message: str) -> list[Markup]:
+    parts = message.removeprefix(", ").removeprefix("; ").split("; ")
+    return [tag("div", unbroken(part)) for part in parts if part]
 
 
 def rehearsal_section(material: Material) -> Section | None:

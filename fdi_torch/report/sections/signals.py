@@ -12,7 +12,7 @@ import torch
 
 from fdi_torch.logbook import Signals
 from fdi_torch.quantities import display_unit, quantity_text
-from fdi_torch.report.chart import Chart, Line, corner_points
+from fdi_torch.report.chart import FLAT, Chart, Line, corner_points
 from fdi_torch.report.gap_tables import MODEL_NAMES, has_causes
 from fdi_torch.report.html import Markup, shown, tag
 from fdi_torch.report.material import Material
@@ -127,7 +127,7 @@ def _output_panels(
         if model is not None:
             lines = [Line("measured − estimate", time, readings[:, i] - model[:, i], MODEL)]
             words = f"residual{suffix}_{i + 1}", f"{name}: residual", "residual"
-            column.append(channel_signals(*words, lines=lines, level=0.0, height=2.1, **about))
+            column.append(channel_signals(*words, lines=lines, level=0.0, height=FLAT, **about))
         columns.append(tuple(column))
     return columns
 
