@@ -17,6 +17,7 @@ from typing import Any
 
 import fdi_torch
 from fdi_torch.cli import COMMANDS, options_of
+from fdi_torch.cli.options import add_arguments
 from fdi_torch.config.key_reference import keys
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.logbook.schemas import TOPICS
@@ -107,7 +108,7 @@ def command(name: str) -> str:
 
 def parser_of(command: str) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog=f"fdi {command}", add_help=False)
-    import_module(f"fdi_torch.cli.options.{command}").add_arguments(parser)
+    add_arguments(parser, command)
     return parser
 
 

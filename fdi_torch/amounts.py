@@ -10,8 +10,7 @@ from fdi_torch.names import listed
 from fdi_torch.parameters import ParameterName
 from fdi_torch.quantities import display_unit, displayed_words, significant
 
-_DIGITS, _RAISED_DIGITS = "0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻"
-RAISED, LOWERED = str.maketrans(_DIGITS, _RAISED_DIGITS), str.maketrans(_RAISED_DIGITS, _DIGITS)
+RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def effect_words(effect: str, place: str) -> str:
@@ -93,6 +92,18 @@ def one_sided(value: float, std: float, end: str) -> str:
 def end_words(name: str, end: str) -> str:
     """The sentence about an estimate at the 'low' or 'high' end of its range."""
     return f"{name} lies at the {end} end of its range" if end else f"{name} lies at an end of its range"
+
+
+def probability_words(probability: float) -> str:
+    """A probability with significant digits only: 'over 99.9 %', '97.2 %'."""
+    if probability >= 0.9995:
+        return "over 99.9 %"
+    return f"{100.0 * probability:.1f} %" if probability >= 0.001 else "under 0.1 %"
+
+
+def percent_text(mass: float) -> str:
+    """The probability of an explanation of a monitor in whole percent: 'over 99 %', '60 %'."""
+    return "over 99 %" if mass > 0.99 else f"{100.0 * mass:.0f} %" if mass >= 0.01 else "under 1 %"
 
 
 def rounded(value: float, std: float) -> str:

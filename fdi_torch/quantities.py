@@ -76,7 +76,11 @@ def display_unit(si_unit: str, name: str = "") -> tuple[str, float]:
     if name in chosen:
         with suppress(ValueError):  # the channel of that name may be of another recording
             return chosen[name], 1.0 / unit_factor(chosen[name], si_unit)
-    return ("" if unit == "1" else unit), 1.0 if unit == si_unit else 1.0 / unit_factor(unit, si_unit)
+    try:
+        scale = 1.0 if unit == si_unit else 1.0 / unit_factor(unit, si_unit)
+    except ValueError:  # of an unknown unit in the log of another program
+        unit, scale = si_unit, 1.0
+    return ("" if unit == "1" else unit), scale
 
 
 def significant(value: float, digits: int) -> str:

@@ -142,7 +142,7 @@ class Recording(Shown):
             )
             for name, unit, values in zip(names, units, table.T, strict=True)
         ]
-        return Table.of_rows(("channel", "role", "unit", "lowest", "highest", "missing"), rows)
+        return Table(("channel", "role", "unit", "lowest", "highest", "missing"), rows)
 
     def to_pandas(self) -> Any:
         """A pandas.DataFrame (extra `pandas`): one column per channel in SI, indexed by time in s; masked readings are

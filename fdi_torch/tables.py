@@ -1,10 +1,11 @@
-"""Display of results in a session: a headline and a table, as text, as HTML, and for pandas.
+"""Tables and results as people see them: a table is built once, and shown on the terminal, on a page and in a notebook.
 
 Numbers are shown in the units of the plant file and of the recording from which the result was computed.
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,29 +14,33 @@ from html import escape
 from importlib import import_module
 from typing import Any, Self, TypeVar, cast
 
-from fdi_torch.amounts import rounded
+from fdi_torch.amounts import probability_words, rounded
 from fdi_torch.quantities import display_unit, displayed_in, displayed_units, significant
 
 MOST_ROWS = 60
 """Number of displayed rows; a data frame has all of them."""
 ERRORS = ("std error", "std")
-WITH_ERROR = ("value", "estimate", "median", *ERRORS, "95 % low", "95 % high")
+WITH_ERROR = ("value", "estimate", "median", "fitted", "with the causes", *ERRORS, "95 % low", "95 % high")
 """Columns whose displayed digits follow from the standard error in the same row."""
-LEFT, RIGHT = ' style="text-align: left"', ' style="text-align: right"'
-_NUMBER = re.compile(r"\(?[-−]?\d")
+SIDES = ' style="text-align: left"', ' style="text-align: right"'
+_NUMBER = re.compile(r"[(<>]? ?[-−]?\d")
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True, repr=False)
 class Table:
-    """Columns of equal length, by name."""
+    """Rows of numbers and texts under a header.
 
-    columns: Mapping[str, Sequence[Any]]
+    title: what the rows are. words: number of leading columns that hold words, if others than those without a number.
+    digits: of a number without a standard error. summary: the table in a sentence.
+    """
 
-    @classmethod
-    def of_rows(cls, names: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
-        """The table with these rows, each with one value per name."""
-        return cls({name: [row[k] for row in rows] for k, name in enumerate(names)})
+    header: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    title: str = ""
+    words: int | None = None
+    digits: int = 6
+    summary: str = ""
 
     def __repr__(self) -> str:
         return self.text()
@@ -44,50 +49,82 @@ class Table:
         return self.html()
 
     def __len__(self) -> int:
-        return len(next(iter(self.columns.values()), ()))
+        return len(self.rows)
 
-    def rows(self, most: int = MOST_ROWS) -> list[list[str]]:
+    @property
+    def columns(self) -> dict[str, list[Any]]:
+        """The columns by name."""
+        return {name: [row[k] for row in self.rows] for k, name in enumerate(self.header)}
+
+    @property
+    def records(self) -> list[dict[str, Any]]:
+        """The rows, each by the names of the columns."""
+        return [dict(zip(self.header, row, strict=True)) for row in self.rows]
+
+    @property
+    def left(self) -> int:
+        """Number of leading columns that are left-aligned: those of words."""
+        if self.words is not None:
+            return self.words
+        further = enumerate(self.header[1:], 1)
+        numbers = (any(_is_number(row[k]) for row in self.rows) and name != "unit" for k, name in further)
+        return 1 + next((k for k, holds_numbers in enumerate(numbers) if holds_numbers), len(self.header) - 1)
+
+    def cells(self, most: int | None = None) -> list[list[str]]:
         """The first rows as text."""
-        errors = next((self.columns[name] for name in ERRORS if name in self.columns), None)
-        columns = [
+        error = next((k for k, name in enumerate(self.header) if name in ERRORS), None)
+        return [
             [
-                _shown(name, value, errors[k] if errors and name in WITH_ERROR else None)
-                for k, value in enumerate(column[:most])
+                self._cell(name, value, row[error] if error is not None and name in WITH_ERROR else None)
+                for name, value in zip(self.header, row, strict=True)
             ]
-            for name, column in self.columns.items()
+            for row in self.rows[:most]
         ]
-        return [list(row) for row in zip(*columns, strict=True)]
+
+    def _cell(self, name: str, value: Any, std: float | None) -> str:
+        if value is None or value != value:
+            return ""
+        if isinstance(value, list | tuple):
+            return ", ".join(self._cell(name, each, None) for each in value)
+        if not isinstance(value, float):
+            return value if isinstance(value, str) else str(value)
+        if name.startswith("probability"):
+            return probability_words(value)
+        if not math.isfinite(value):
+            return "–"
+        return significant(value, self.digits) if std is None or std != std else rounded(value, std)
 
     def text(self) -> str:
-        lines = [list(self.columns), *self.rows()] if len(self) else []
-        widths = [max(len(line[k]) for line in lines) for k in range(len(self.columns))] if lines else []
+        lines = [list(self.header), *self.cells(MOST_ROWS)] if len(self) else []
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         shown = ["  ".join(cell.ljust(w) for cell, w in zip(line, widths, strict=True)).rstrip() for line in lines]
         return "\n".join([*shown, *self._rest()])
 
     def html(self) -> str:
-        sides = [RIGHT if _is_numeric(column) else LEFT for column in self.columns.values()]
-        head = "".join(f"<th{side}>{escape(name)}</th>" for side, name in zip(sides, self.columns, strict=True))
-        cells = [[f"<td{side}>{escape(c)}</td>" for side, c in zip(sides, row, strict=True)] for row in self.rows()]
-        body = "".join(f"<tr>{''.join(row)}</tr>" for row in cells)
+        sides = [SIDES[k >= self.left] for k in range(len(self.header))]
+        lines = [
+            "".join(f"<{tag}{side}>{escape(cell)}</{tag}>" for side, cell in zip(sides, row, strict=True))
+            for tag, rows in (("th", [self.header]), ("td", self.cells(MOST_ROWS)))
+            for row in rows
+        ]
+        body = "".join(f"<tr>{line}</tr>" for line in lines[1:])
         remark = "".join(f"<p>{line}</p>" for line in self._rest())
-        table = f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        table = f"<table><thead><tr>{lines[0]}</tr></thead><tbody>{body}</tbody></table>"
         return f'<div style="overflow-x: auto">{table}</div>{remark}' if len(self) else ""
 
     def to_pandas(self) -> Any:
         """A pandas.DataFrame. Raises ImportError, with the command to install pandas, if it is missing."""
-        return needed("pandas").DataFrame({name: list(column) for name, column in self.columns.items()})
+        return needed("pandas").DataFrame(self.columns)
 
     def _rest(self) -> list[str]:
         return [f"... and {len(self) - MOST_ROWS} more rows"] if len(self) > MOST_ROWS else []
 
 
-def _is_numeric(column: Sequence[Any]) -> bool:
-    """Whether a column holds numbers, also ones with their errors as text, such as '0.30 ± 0.01'."""
-    given = [value for value in column if value not in (None, "", "–")]
-    texts = (value if isinstance(value, str) else None for value in given)
-    plain = (isinstance(v, int | float) and not isinstance(v, bool) for v in given)
-    written = (text is not None and bool(_NUMBER.match(text)) for text in texts)
-    return bool(given) and all(a or b for a, b in zip(plain, written, strict=True))
+def _is_number(value: Any) -> bool:
+    """Whether a cell is a number, or a text that begins with one, such as '0.30 ± 0.01'."""
+    if isinstance(value, str):
+        return bool(_NUMBER.match(value))
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def in_its_units(method: Method) -> Method:
@@ -171,16 +208,3 @@ def needed(library: str, extra: str = "") -> Any:
             f"expected the library {library.partition('.')[0]}, got none; pip install 'fdi_torch[{extra or library}]'"
         )
         raise MissingExtraError(sentence) from None
-
-
-def _shown(column: str, value: Any, std: float | None) -> str:
-    """A cell; probabilities are known to three digits at most."""
-    return significant(value, 3) if column == "probability" and isinstance(value, float) else _cell(value, std)
-
-
-def _cell(value: Any, std: float | None = None) -> str:
-    if value is None or value != value:
-        return ""
-    if isinstance(value, float):
-        return rounded(value, std or 0.0)
-    return ", ".join(map(_cell, value)) if isinstance(value, list | tuple) else str(value)

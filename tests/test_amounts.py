@@ -103,5 +103,5 @@ def test_numbers_of_a_table_have_the_digits_of_their_error() -> None:
 
 
 def test_probabilities_in_a_table_have_three_digits() -> None:
-    shown = Table({"explanation": ["leak at A"], "probability": [0.697017]}).rows()
-    assert shown == [["leak at A", "0.697"]]
+    shown = Table(("explanation", "probability"), [("leak at A", 0.697017)]).cells()
+    assert shown == [["leak at A", "69.7 %"]]

@@ -97,7 +97,7 @@ def test_what_help_says_by_itself_is_what_the_jobs_do() -> None:
     assert (gap.MOST_CAUSES, options.START_SAMPLES) == (DEEPEST, START_SAMPLES)
     assert sorted(RIGS) == sorted(challenge.RIGS)
     parser = argparse.ArgumentParser()
-    challenge.add_arguments(parser)
+    options.add_arguments(parser, "challenge")
     assert f"({FEWEST}..{MOST})" in parser.format_help() and f"({CASES})" in parser.format_help()
     assert LOG in (challenge.__doc__ or "") + challenge.EXAMPLES
 
@@ -325,7 +325,7 @@ def test_traceback_on_request(rig: str) -> None:
 
 
 def command(run: Any) -> Any:
-    return SimpleNamespace(__doc__="", add_arguments=lambda parser: None, run=run)
+    return SimpleNamespace(__doc__="", run=run)
 
 
 def test_interruption_has_its_own_code(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

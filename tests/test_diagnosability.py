@@ -162,7 +162,7 @@ def test_the_tables_are_in_the_units_of_the_plant(capsys: pytest.CaptureFixture[
     offset = [line.split() for line in shown.splitlines() if line.startswith("Q1.pump_offset")]
     [bounds, effects] = offset
     assert bounds[1] == effects[1] == "cm^3/s" and 0.1 < float(effects[2]) < 1e3
-    assert any(line.split()[2] == "-" for line in shown.splitlines() if line.startswith("OUT2.plugging"))
+    assert any(line.split()[2] == "–" for line in shown.splitlines() if line.startswith("OUT2.plugging"))
 
 
 def test_inputs_may_come_from_a_file_that_maps_the_columns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

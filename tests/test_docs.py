@@ -18,6 +18,7 @@ import yaml
 
 import fdi_torch
 from fdi_torch.cli import COMMANDS
+from fdi_torch.cli.options import add_arguments
 from tests.sessions import check, run_page
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -86,7 +87,7 @@ def command_lines(text: str) -> Iterator[list[str]]:
 
 def options_of(command: str) -> set[str]:
     parser = argparse.ArgumentParser(add_help=False)
-    importlib.import_module(f"fdi_torch.cli.options.{command}").add_arguments(parser)
+    add_arguments(parser, command)
     return {option for action in parser._actions for option in action.option_strings} | COMMON
 
 

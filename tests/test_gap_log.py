@@ -135,7 +135,9 @@ def test_the_command_prints_the_verdict_and_writes_all_files(
     shown = capsys.readouterr().out
     assert re.match(r"The gap comes from pump gain at Q2, probability (over )?99\.[89] %\.", shown)
     assert "error of free runs on day5.csv, day7.csv, cm" in shown and "of the gap closes on data not used" in shown
-    assert "day7.csv: " in shown and f"next: with {better} as their plant, train and monitor" in shown
+    for name in ("day5.csv", "day7.csv"):
+        assert re.search(rf"^{name}( +[\d.]+){{4}} %$", shown, flags=re.M), "three errors and the share that closes"
+    assert f"next: with {better} as their plant, train and monitor" in shown
     answer = json.loads((tmp_path / "out" / "gap.json").read_text())
     found = load_plant(better)
     factor, constant = answer["causes"][0]["parameters"]["factor"], answer["constants"]["P13.discharge_coefficient"]

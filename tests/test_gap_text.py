@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from fdi_torch.amounts import probability_words
 from fdi_torch.cli.gap_text import next_steps, show
 from fdi_torch.cli.screen import Screen
 from fdi_torch.gap.answer import Amount, Answer, Cause, ProbableExplanation, adopted
-from fdi_torch.gap.verdict_words import causes_of, probability_words, verdict_sentence
+from fdi_torch.gap.verdict_words import causes_of, verdict_sentence
 from fdi_torch.jobs.python_results import GapResult
 from fdi_torch.quantities import displayed_in
-from fdi_torch.report.diagnosed_effects import flows_that_matter
-from fdi_torch.report.sections.gap import _cause_rows
+from fdi_torch.report.gap_tables import cause_table, flows_that_matter
 from tests.test_gap import nominal_plant
 
 LEAK = Cause("leak", "T1", {"size": Amount(0.2, 0.01, "1")})
@@ -232,8 +232,8 @@ def test_the_flow_of_a_leak_stands_beside_its_size(capsys: pytest.CaptureFixture
     with displayed_in({"m^3/s": "l/min"}):
         show(answer, nominal_plant(), [], Screen())
         assert re.search(r"leak +T1 +flow at mean levels +1.5 +l/min", capsys.readouterr().out)
-        page_rows = _cause_rows(answer.to_dict()["causes"][0])
-    assert page_rows[-1] == ["leak", "T1", "flow at mean levels", "1.5", "l/min"]
+        page_rows = cause_table(answer.to_dict()).cells()
+    assert page_rows[1] == ["leak", "T1", "flow at mean levels", "1.5", "", "l/min"]
     rows = GapResult(answer, nominal_plant(), Path("gap.mcap")).table().columns
     assert rows["parameter"] == ["size", "flow at mean levels"] and rows["value"][1] == pytest.approx(25.0)
     assert answer.to_dict()["causes"][0]["flow"] == 25e-6 and "flow" not in BOTH.to_dict()["causes"][0]

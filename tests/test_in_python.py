@@ -210,8 +210,8 @@ def test_a_rig_in_code_from_simulation_to_report(here: Path) -> None:
     assert "<b>Estimate of 3 parameters: converged</b>" in found.estimate._repr_html_()
     assert repr(found.estimate).startswith("Estimate: converged\nparameter") and "A.leak.size" in repr(found.estimate)
     # 200 cm^2 x 60 cm are 12 l, which leave in 2 A sqrt(H) / (0.6 * 0.5e-4 * sqrt(2 g)) = 233.17 s
-    sides = '<td style="text-align: left">A</td><td style="text-align: right">12</td>'
-    assert f'{sides}<td style="text-align: right">233</td>' in RIG._repr_html_()
+    sizes = "".join(f'<td style="text-align: right">{size}</td>' for size in (200, 60, 12, 233))
+    assert f'<td style="text-align: left">A</td>{sizes}' in RIG._repr_html_()
     for html in (found._repr_html_(), RIG._repr_html_(), fdi_torch.predict(RIG, recording)._repr_html_()):
         assert "<svg" in html and "var(--" not in html  # a notebook does not define the variables of our pages
         assert "max-width" in html
@@ -276,7 +276,9 @@ def test_runs_are_compared_in_python_as_by_the_command(tmp_path: Path) -> None:
         scale = 1000.0 if wanted == "mm" else 1.0
         numbers = [scale * x for pair in zip(result.values, result.std, strict=True) for x in pair]
         assert estimates[name] == (name, wanted, *map(pytest.approx, numbers), result.p_value, result.agree)
-    assert found.headline.startswith("seed3: Fault: leak at A") and found.headline.endswith("there they agree at 95 %.")
+    assert found.headline.startswith("seed3: Single fault: leak at A") and found.headline.endswith(
+        "there they agree at 95 %."
+    )
     assert "They read different recordings" in found.headline and not found.comparison.same_data
     shown = re.search(r"A.leak.size +1 +(\S+ ± \S+) +(\S+ ± \S+) +\S+ +yes", repr(found))
     assert repr(found).startswith("ComparisonResult: seed3: ") and shown

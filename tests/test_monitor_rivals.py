@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from fdi_torch.monitor.events import SMALLEST_SHARE, Explanation, Size, headline, percent_text
+from fdi_torch.amounts import percent_text
+from fdi_torch.monitor.events import SMALLEST_SHARE, Explanation, Size, headline
 from tests.sessions import BLOCK, run_command
 from tests.test_monitor import SPACE, followed, monitor, recorded, step_to
 

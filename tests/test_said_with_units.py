@@ -13,6 +13,7 @@ from fdi_torch.config.plant_file import build_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.config.simulation import reading_noise
 from fdi_torch.plant.description import PlantDescription, Sensor
+from fdi_torch.tables import Table
 
 
 def tower() -> PlantDescription:
@@ -77,7 +78,7 @@ def test_written_plant_files_keep_round_numbers() -> None:
 
 def test_a_table_in_a_pipe_is_whole(capsys: pytest.CaptureFixture[str]) -> None:
     words = "one cause and " * 40
-    Screen().table("causes", ("which", "probability"), [[words, "93.6 %"]])
+    Screen().show(Table(("which", "probability"), [[words, "93.6 %"]], "causes"))
     title, header, row = capsys.readouterr().out.splitlines()
     assert (title, header.split()) == ("causes", ["which", "probability"])
     assert row.startswith(words) and row.endswith("93.6 %")

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from fdi_torch.cli.study import _row
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.study_file import Study, load_study
 from fdi_torch.estimate.evolution import EvolutionResult, distant_members
@@ -308,8 +307,8 @@ def test_errors_are_in_the_unit_of_the_plant() -> None:
     score = Score("free", "Q.pump_offset.size", "m^3/s", -2e-6, 1e-6, 3e-6, None, None, None)
     summary = Summary("SNR 40 dB", 4, (score,), {"free": 0}, {"free": 0.0}, 4, 0, none)
     with displayed_in({"m^3/s": "l/min"}):
-        table = StudyResult((summary,), None, {}, 4, 1.0, Path("study.mcap")).table()
-        printed = _row(score)
+        result = StudyResult((summary,), None, {}, 4, 1.0, Path("study.mcap"))
+        table, ((printed,),) = result.table(), (table.cells() for table in result.tables())
     assert table.columns["unit"] == ["l/min"]
     assert table.columns["bias"] == pytest.approx([-0.12]) and table.columns["RMSE"] == pytest.approx([0.18])
     assert printed[:5] == ["free", "Q.pump_offset", "l/min", "-0.12 ± 0.12", "0.18"]

@@ -23,6 +23,7 @@ from fdi_torch.disk import replacing
 from fdi_torch.logbook import LogError, arrays, read_run
 from fdi_torch.logbook.sink import Sink
 from fdi_torch.logbook.topic_definitions import Channel
+from fdi_torch.tables import Table
 from fdi_torch.untrusted_input import MOST_LINE, MOST_UNPACKED, printable, printable_json
 
 HEADER = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm\n"
@@ -44,7 +45,7 @@ def test_every_way_of_text_to_the_screen_is_plain(name: str, capsys: pytest.Capt
     screen.say(name)
     screen.note(name)
     screen.complain(name)
-    screen.table(name, (name, "unit"), [[name, name]])
+    screen.show(Table((name, "unit"), [[name, name]], name))
     with screen.progress(name) as advance:
         advance(1.0, name)
     out, err = capsys.readouterr()

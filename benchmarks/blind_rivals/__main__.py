@@ -10,7 +10,7 @@ from benchmarks.blind_rivals.one_at_a_time import one_at_a_time
 from benchmarks.blind_rivals.regression_baselines import gaussian_process, sparse_regression, split_f_test
 from fdi_torch.blind.benchmark import Diagnosis
 from fdi_torch.cli import challenge
-from fdi_torch.cli.options.challenge import add_arguments
+from fdi_torch.cli.options import add_arguments
 from fdi_torch.cli.screen import Screen
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -27,7 +27,7 @@ def one_at_a_time_bic(
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.blind_rivals", description=__doc__)
-    add_arguments(parser)
+    add_arguments(parser, "challenge")
     parser.add_argument("--no-bic", action="store_true", help="without the slow one, one effect at a time by BIC")
     arguments = parser.parse_args()
     slow = {} if arguments.no_bic else {"one_at_a_time_bic": one_at_a_time_bic}

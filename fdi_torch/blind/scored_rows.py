@@ -8,7 +8,6 @@ import json
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from fdi_torch.blind.sizes import sizes
 from fdi_torch.blind.statistics import share_of
 from fdi_torch.disk import write_text
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.tables import Table
 
 ROWS = "rows.jsonl"
 EDGES = (0.0, 0.5, 0.9, 0.99, 1.0)
@@ -125,25 +125,15 @@ SIZES = {
     "cause_beside": "cause named beside an unknown",
 }
 CLOSURE = {
-    "closed_within": "`closed` within 3 points",
-    "median_closed_error": "median error of `closed`",
+    "closed_within": "closed within 3 points",
+    "median_closed_error": "median error of closed",
     "sec": "s a case",
     "median_sec": "median s a case",
 }
 MOST_MISSES = 200
 
 
-@dataclass(frozen=True)
-class Sheet:
-    """A table with a title; the first `left` columns are text."""
-
-    title: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    left: int = 1
-
-
-def sheets(by: Mapping[str, Scores]) -> list[Sheet]:
+def sheets(by: Mapping[str, Scores]) -> list[Table]:
     """All score tables of one rig, from the scores by diagnosis."""
     own, others = by[OWN], [name for name in by if name != OWN]
     strata = own["strata"]
@@ -151,43 +141,37 @@ def sheets(by: Mapping[str, Scores]) -> list[Sheet]:
     over_all = [
         [name, *(in_words(by[name]["strata"]["all"].get(c)) for c in (*NAMES, "utility"))] for name in (OWN, *others)
     ]
-    tables = [
-        Sheet("Names and places, by kind", ("kind", *NAMES.values()), _rows(strata, NAMES)),
-        Sheet("Alarm, size of the answer set and utility, by kind", ("kind", *SIZES.values()), _rows(strata, SIZES)),
-        Sheet("Closure and time, by kind", ("kind", *CLOSURE.values()), _rows(strata, CLOSURE)),
-        Sheet("Right answers, and those of the baselines", ("kind", OWN, *others), beside),
-        Sheet("All kinds together, and the baselines", ("", *NAMES.values(), "utility"), over_all),
-        Sheet(
-            "Calibration: how often the best explanation is true, by its stated probability",
+    bins = [[f"{b['low']:g} to {b['high']:g}", f"{b['stated']:.3f}", in_words(b)] for b in own["calibration"]]
+    tables = {
+        "Names and places, by kind": (("kind", *NAMES.values()), _rows(strata, NAMES)),
+        "Alarm, size of the answer set and utility, by kind": (("kind", *SIZES.values()), _rows(strata, SIZES)),
+        "Closure and time, by kind": (("kind", *CLOSURE.values()), _rows(strata, CLOSURE)),
+        "Right answers, and those of the baselines": (("kind", OWN, *others), beside),
+        "All kinds together, and the baselines": (("", *NAMES.values(), "utility"), over_all),
+        "Calibration: how often the best explanation is true, by its stated probability": (
             ("stated probability", "mean", "is true"),
-            [[f"{b['low']:g} to {b['high']:g}", f"{b['stated']:.3f}", in_words(b)] for b in own["calibration"]],
+            bins,
         ),
-        Sheet(
-            "Sizes of named causes, by effect: z against the truth",
+        "Sizes of named causes, by effect: z against the truth": (
             ("effect", "root mean square of z", "within 1.96 standard errors"),
             _rows(own["sizes"], ("rms", "within")),
         ),
-        Sheet(
-            "Cases with one cause, by effect; laws outside the library by their own name",
+        "Cases with one cause, by effect; laws outside the library by their own name": (
             ("effect", *NAMES.values()),
             _rows(own["by_effect"], NAMES),
         ),
-    ]
-    return [sheet for sheet in tables if sheet.rows]
+    }
+    return [Table(header, rows, title) for title, (header, rows) in tables.items() if rows]
 
 
-def misses(rows: Iterable[Row]) -> Sheet:
+def misses(rows: Iterable[Row]) -> Table:
     """Wrong answers of our diagnosis."""
-    wrong = [row for row in rows if row["by"] == OWN and not row["right"]]
-    return Sheet(
-        "Wrong answers",
-        ("kind", "rig", "seed", "case", "truth", "verdict", "best explanation"),
-        [
-            [r["kind"], r["rig"], str(r["seed"]), r["case"], _truth(r), r["verdict"], listed(r["causes"])]
-            for r in wrong[:MOST_MISSES]
-        ],
-        left=7,
-    )
+    wrong = [row for row in rows if row["by"] == OWN and not row["right"]][:MOST_MISSES]
+    header = ("kind", "rig", "seed", "case", "truth", "verdict", "best explanation")
+    answers = [
+        [r["kind"], r["rig"], str(r["seed"]), r["case"], _truth(r), r["verdict"], listed(r["causes"])] for r in wrong
+    ]
+    return Table(header, answers, "Wrong answers", words=len(header))
 
 
 def origin(rows: Iterable[Row]) -> str:
@@ -237,6 +221,6 @@ def _rows(strata: Mapping[str, Mapping[str, Any]], columns: Iterable[str]) -> li
     return [[name, *(in_words(scores.get(column)) for column in columns)] for name, scores in strata.items()]
 
 
-def _table(sheet: Sheet) -> str:
+def _table(sheet: Table) -> str:
     lines = [sheet.header, ["---"] * len(sheet.header), *sheet.rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)

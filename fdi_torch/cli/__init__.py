@@ -3,7 +3,7 @@
 Exit codes: 0 done, 2 wrong use (explained on standard error), 3 ran but did not converge, 4 converged, but the
 model does not explain the recording, 130 interrupted, 143 terminated.
 A command is a module `options/NAME.py` with its description, its STEP and SUMMARY in the overview, EXAMPLES,
-`add_arguments(parser)` and, if it takes more than a moment to start, LONG = True, or, if it usually computes nothing,
+ARGUMENTS and, if it takes more than a moment to start, LONG = True, or, if it usually computes nothing,
 QUICK = True; and a module `NAME.py` with `run(arguments, screen) -> exit code`. The latter is imported after the
 arguments are parsed, so that help does not wait for torch, and a QUICK command loads torch when it first uses it.
 """
@@ -24,7 +24,7 @@ from pkgutil import iter_modules
 from types import ModuleType
 from typing import Any, NoReturn
 
-from fdi_torch.cli.options import seconds
+from fdi_torch.cli.options import add_arguments, seconds
 from fdi_torch.disk import sentence
 from fdi_torch.interruption import Terminated, catch_signals
 from fdi_torch.names import nearest, unknown
@@ -246,7 +246,7 @@ def command_parser(name: str) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    options.add_arguments(parser)
+    add_arguments(parser, name)
     parser.add_argument("--json", action="store_true", help="print JSON and nothing else on standard output")
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
     parser.add_argument(

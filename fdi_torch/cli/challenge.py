@@ -141,8 +141,6 @@ def show(scores: Tables, rows: Sequence[Row], screen: Screen) -> None:
     for group, by in scores.items():
         screen.say(f"{group}, {by['fdi']['strata']['all']['cases']} cases, with 95 % intervals")
         for sheet in sheets(by):
-            screen.table(sheet.title, sheet.header, sheet.rows, sheet.left)
+            screen.show(sheet)
             screen.say()
-    missed = misses(rows)
-    if missed.rows:
-        screen.table(missed.title, missed.header, missed.rows, missed.left)
+    screen.show(misses(rows))

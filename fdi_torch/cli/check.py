@@ -8,7 +8,6 @@ recordings.plant_units.wrong_units → recordings.volume_balance.balance_along
 from __future__ import annotations
 
 import argparse
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,13 +17,13 @@ from fdi_torch.config.plant_file import PLACEHOLDERS, chosen_plant, placeholders
 from fdi_torch.config.yaml_files import find_plant
 from fdi_torch.names import counted
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
-from fdi_torch.plant.scales import emptying_time
-from fdi_torch.quantities import display_unit, significant
+from fdi_torch.plant.scales import tank_table
 from fdi_torch.recordings.csv_writing import header_of
 
 if TYPE_CHECKING:
     from fdi_torch.config.recording_config import RecordingConfig
-    from fdi_torch.recordings.check import ChannelSummary, RecordingCheck
+    from fdi_torch.recording import Recording
+    from fdi_torch.recordings.check import RecordingCheck
 
 WRONG = ("range", "slip", "unit")  # findings that no diagnosis accepts or survives
 
@@ -53,7 +52,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             recording, check = checked(config, plant, base)
             advance(1.0, "done")
         checks.append(check)
-        _show(check, screen)
+        _show(recording, check, screen)
         if spans := usable_spans(recording, config, plant):
             screen.say(f"usable with all inputs known: {spans}")
     wrong = bool(guesses) or any(f.kind in WRONG for check in checks for f in check.findings)
@@ -93,15 +92,7 @@ def _wanted(arguments: argparse.Namespace) -> tuple[PlantDescription, list[Recor
 
 def _show_plant(plant: PlantDescription, screen: Screen) -> None:
     screen.say(f"{plant.title}: {plant.counts}, {counted(len(plant.tolerances), 'constant')} with a tolerance")
-    (area, per_area), (height, per_height) = display_unit("m^2"), display_unit("m")
-    rows = []
-    for tank in plant.tanks:
-        sizes = (per_area * tank.area, per_height * tank.height, 1e3 * tank.area * tank.height)
-        time = emptying_time(plant, tank)
-        empties = significant(time, 3) if math.isfinite(time) else "never"
-        rows.append([tank.name, *(significant(size, 4) for size in sizes), empties])
-    header = ("tank", f"area, {area}", f"height, {height}", "volume, l", "empties from full in, s")
-    screen.table("", header, rows)
+    screen.show(tank_table(plant))
     if closed := _without_outlet(plant):
         screen.say(f"- {', '.join(closed)}: no water leaves but over a rim; if there is an outlet, add it under pipes")
 
@@ -116,21 +107,11 @@ def _without_outlet(plant: PlantDescription) -> list[str]:
     return [tank.name for tank in plant.tanks if tank.name not in drained]
 
 
-def _show(check: RecordingCheck, screen: Screen) -> None:
+def _show(recording: Recording, check: RecordingCheck, screen: Screen) -> None:
     screen.say()
-    screen.say(
-        f"{check.source}: {counted(check.samples, 'sample')}, {check.duration:g} s, one every {check.interval:.6g} s"
-    )
-    header = ("channel", "", "unit", "lowest", "highest", "mean", "smallest step", "missing", "masked")
-    screen.table("", header, [_row(channel) for channel in check.channels], left=3)
+    screen.say(recording.headline)
+    screen.show(check.table())
     for finding in check.findings:
         screen.say(f"- {finding.channel}: {finding.text}")
     if not check.findings:
         screen.say("nothing odd was found")
-
-
-def _row(channel: ChannelSummary) -> list[str]:
-    unit, scale = display_unit(channel.unit, channel.name)
-    numbers = (channel.low, channel.high, channel.mean, channel.resolution)
-    shown = [f"{scale * number:.5g}" for number in numbers]
-    return [channel.name, channel.role, unit or "share", *shown, str(channel.missing), str(channel.masked)]

@@ -14,9 +14,7 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import replacing
 from fdi_torch.jobs.report import ComparisonResult, compare
-from fdi_torch.report.comparison import result_table
-from fdi_torch.report.comparison_headline import left_out_words, setting_differences
-from fdi_torch.report.style import save
+from fdi_torch.report.page import write_pictures
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -28,9 +26,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         screen.say(f"table: {arguments.csv}")
     if arguments.pictures:
         pictures = compared.pictures
-        for picture in pictures:
-            for ending in (".png", ".svg"):
-                save(picture.figure, Path(arguments.pictures) / f"{picture.name}{ending}")
+        write_pictures(pictures, Path(arguments.pictures))
         screen.say(f"{len(pictures)} pictures: {arguments.pictures}")
     words = {"comparison": compared.comparison, "headline": compared.sentences}
     screen.result({"format": "fdi_torch.compare/1", **words})
@@ -39,21 +35,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 def show(compared: ComparisonResult, screen: Screen) -> None:
     """Print the comparison in the units of the first run."""
-    with compared.runs[0].in_its_units():
-        for sentence in compared.sentences:
-            screen.say(sentence)
-        _show_tables(compared, screen)
-
-
-def _show_tables(compared: ComparisonResult, screen: Screen) -> None:
-    comparison, runs = compared.comparison, compared.runs
-    settings, left_out = setting_differences(comparison, runs)
-    rows = [[key, *texts] for key, texts in settings.items()]
-    if rows and len({run.kind for run in runs}) == 1:  # runs of different kinds have different keys
+    for sentence in compared.sentences:
+        screen.say(sentence)
+    for table in compared.tables():
         screen.say()
-        screen.table("settings", ("key", *comparison.labels), rows, left=1 + len(comparison.labels))
-        if left_out:
-            screen.say(left_out_words(left_out))
-    if comparison.results:
-        screen.say()
-        screen.table("estimates", *result_table(comparison), left=2)
+        screen.show(table)

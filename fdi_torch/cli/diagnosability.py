@@ -6,7 +6,6 @@ Path: cli.diagnosability.run → monitor.monitor_setup.usual_faults → monitor.
 from __future__ import annotations
 
 import argparse
-import math
 from pathlib import Path
 
 import torch
@@ -20,8 +19,9 @@ from fdi_torch.effects.usual_faults import usual_faults
 from fdi_torch.monitor.diagnosability import Diagnosability, diagnosability
 from fdi_torch.plant.description import PlantDescription, uncertain_constants
 from fdi_torch.plant.scales import time_scale
-from fdi_torch.quantities import display_unit, parse_quantity, significant
+from fdi_torch.quantities import display_unit, parse_quantity
 from fdi_torch.recording import Recording
+from fdi_torch.tables import Table
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -69,33 +69,24 @@ def _inputs(arguments: argparse.Namespace, plant: PlantDescription) -> tuple[Rec
 
 def _show(report: Diagnosability, screen: Screen) -> None:
     screen.say(f"{report.rank} of {len(report.faults)} faults (or combinations) are determined together")
-    header = ("fault", "unit", "std error", "by correlation", "smallest detectable", "smallest isolable")
     columns = (report.std, report.std_by_correlation, report.smallest_detectable, report.smallest_isolable)
-    rows = []
-    for name, si_unit, *values in zip(report.faults, report.units, *columns, strict=True):
+    rows, shows = [], []
+    for name, si_unit, seen, *values in zip(report.faults, report.units, report.shows, *columns, strict=True):
         unit, scale = display_unit(si_unit, name)
-        rows.append([name, unit or "1", *(_number(scale * value) for value in values)])
-    screen.table("", header, rows, left=2)
+        rows.append([name, unit or "1", *(scale * value for value in values)])
+        shows.append([name, unit or "1", *(value / scale for value in seen)])
+    header = ("fault", "unit", "std error", "by correlation", "smallest detectable", "smallest isolable")
+    screen.show(Table(header, rows, digits=3))
     screen.say()
     screen.say("std error: of all faults estimated together; by correlation: with the correlation as objective")
-    screen.say("-: not determined by these inputs, or not at any size within the fault's range")
+    screen.say("–: not determined by these inputs, or not at any size within the fault's range")
     screen.say()
-    shows = []
-    for name, si_unit, row in zip(report.faults, report.units, report.shows, strict=True):
-        unit, scale = display_unit(si_unit, name)
-        shows.append([name, unit or "1", *(_number(value / scale) for value in row)])
-    title = (
-        "effect of one unit of each fault on each sensor, in standard deviations of its noise (all samples together)"
-    )
-    screen.table(title, ("fault", "unit", *report.sensors), shows, left=2)
+    effect = "effect of one unit of each fault on each sensor"
+    title = f"{effect}, in standard deviations of its noise (all samples together)"
+    screen.show(Table(("fault", "unit", *report.sensors), shows, title, digits=3))
     screen.say()
-    apart = [[str(i + 1), name, *(f"{v:.2f}" for v in row)] for i, (name, row) in
-             enumerate(zip(report.faults, report.apart, strict=True))]  # fmt: skip
-    numbers = tuple(str(i + 1) for i in range(len(report.faults)))
-    screen.table("sine of the angle between signatures (0: not distinguishable)", ("", "fault", *numbers), apart, 2)
+    angles = enumerate(zip(report.faults, report.apart, strict=True), 1)
+    apart = [[str(i), name, *(f"{v:.2f}" for v in row)] for i, (name, row) in angles]
+    title = "sine of the angle between signatures (0: not distinguishable)"
+    screen.show(Table(("", "fault", *(row[0] for row in apart)), apart, title, words=2))
     screen.points((*report.groups, *report.remarks))
-
-
-def _number(value: float) -> str:
-    """Three digits; a dash for what the experiment cannot determine or show."""
-    return significant(value, 3) if math.isfinite(value) else "-"

@@ -12,6 +12,7 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.effects.catalogue import Entry, effects
+from fdi_torch.tables import Table
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -22,9 +23,8 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
             _show(entry, bool(arguments.plant), screen)
     else:
         rows = [[e.name, ", ".join(e.at if arguments.plant else e.kinds), e.meaning] for e in entries]
-        screen.table(
-            catalogue.headline, ("effect", "at" if arguments.plant else "location", "description"), rows, left=3
-        )
+        header = ("effect", "at" if arguments.plant else "location", "description")
+        screen.show(Table(header, rows, catalogue.headline, words=len(header)))
         screen.say("fdi effects NAME shows the equation, parameters and units of an effect, and how to write it")
     screen.result({"format": "fdi_torch.effects/1", "effects": [_as_json(entry) for entry in entries]})
     return DONE
@@ -34,7 +34,7 @@ def _show(entry: Entry, of_plant: bool, screen: Screen) -> None:
     screen.say(f"{entry.name}: {entry.meaning}")
     screen.say(f"  location: {entry.where}" + (f": {', '.join(entry.at)}" if of_plant else ""))
     screen.say(f"  acts {entry.begins}")
-    screen.show(entry.table(), left=6)
+    screen.show(entry.table())
     screen.say(f"  in simulate.faults:     {entry.in_a_run_file}")
     screen.say(f"  in estimate.parameters: {entry.at[0]}.{entry.name}")
     screen.say(f"  in a plant's effects:   {entry.in_a_plant_file}")

@@ -19,7 +19,6 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     counts = Counter(table.columns["causality"])
     numbers = ", ".join(counted(counts[kind], kind) for kind in ("input", "output", "parameter"))
     screen.say(f"{arguments.fmu}: FMU for co-simulation (FMI 2.0) with {numbers}")
-    screen.show(table, left=4)
-    rows = [dict(zip(table.columns, row, strict=True)) for row in zip(*table.columns.values(), strict=True)]
-    screen.result({"format": "fdi_torch.export/1", "fmu": str(arguments.fmu), "variables": rows})
+    screen.show(table)
+    screen.result({"format": "fdi_torch.export/1", "fmu": str(arguments.fmu), "variables": table.records})
     return DONE

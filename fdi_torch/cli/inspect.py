@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -20,13 +20,12 @@ from fdi_torch.disk import named_errors, write_text
 from fdi_torch.logbook import Inspection, export, export_attachment, foxglove_layout, inspect_log, read_run
 from fdi_torch.logbook.reader import AT_BOUNDS
 from fdi_torch.names import counted
-from fdi_torch.report.numbers import HEADER, correlation_table, estimate_cells
+from fdi_torch.report.numbers import correlation_table, estimate_table
+from fdi_torch.tables import Table
 
 MOST_RESULTS, MOST_COLUMNS = 12, 11
 ESTIMATE = ("names", "units", "value", "std", "covariance", "covariance_shape")  # results that are shown as tables
 DRAWS = ("draws.parameter", "draws.unit", "draws.median", "draws.std")
-ShownTable = tuple[str, list[str], list[list[str]]]
-"""Title, header and rows."""
 IN_SI = {"noise_std": "noise_std, SI"}
 _FRACTION = re.compile(r"(?<=T\d\d:\d\d:\d\d)\.\d+")
 RECORDS = ("run", "status", "data", "seeds", "git")
@@ -83,7 +82,7 @@ def show(inspection: Inspection, screen: Screen) -> None:
     for record in RECORDS:
         values = {name: value for name, value in inspection.about.get(record, {}).items() if value}
         if values:
-            words = (f"{name} {_shortened(value)}" for name, value in values.items())
+            words = (f"{name} {_FRACTION.sub('', value)}" for name, value in values.items())
             screen.say(f"{record:<8}{', '.join(words)}")
     result = inspection.about.get("result", {})
     tables = estimate_tables(result)
@@ -97,60 +96,33 @@ def show(inspection: Inspection, screen: Screen) -> None:
         screen.say(f"result  {name} {text[:100]}")
     if len(results) > MOST_RESULTS:
         screen.say(f"result  and {len(results) - MOST_RESULTS} more: --json shows all")
-    for title, header, cells in tables:
+    for table in (*tables, inspection.table()):
         screen.say()
-        screen.table(title, header, cells, left=2)
-    rows = [
-        [info.topic, info.schema, str(info.messages), *info.span, str(info.size)] for info in inspection.topics.values()
-    ]
-    screen.say()
-    screen.table("", ("topic", "schema", "messages", "from", "to", "bytes"), rows, left=2)
+        screen.show(table)
     for item in inspection.attachments.values():
         screen.say(f"attachment {item.name}, {item.size} bytes")
     screen.say()
     state = "intact: all CRCs, indices and counts agree" if inspection.health.sound else "damaged"
-    content = f"{counted(inspection.messages, 'message')} in {counted(inspection.health.chunks, 'chunk')}"
-    screen.say(f"{inspection.size} bytes, {content}; {state}")
+    screen.say(f"{inspection.content}; {state}")
     for sentence in (*inspection.health.problems, inspection.advice):
         if sentence:
             screen.say(f"- {sentence}")
 
 
-def estimate_tables(result: Mapping[str, str]) -> list[ShownTable]:
+def estimate_tables(result: Mapping[str, str]) -> list[Table]:
     """Tables of the estimates, of their correlations if they are few, and of the draws; none if one is unreadable."""
     try:
-        names, units, values, std, covariance = (orjson.loads(result.get(key, "[]")) for key in ESTIMATE[:5])
-        at_bounds = {key.removeprefix(AT_BOUNDS): end for key, end in result.items() if key.startswith(AT_BOUNDS)}
+        *estimates, covariance = (orjson.loads(result.get(key, "[]")) for key in ESTIMATE[:5])
+        ends = {key.removeprefix(AT_BOUNDS): end for key, end in result.items() if key.startswith(AT_BOUNDS)}
         drawn = [orjson.loads(result.get(key, "[]")) for key in DRAWS]
-        tables = [("estimates", ["parameter", *HEADER], _rows(names, units, values, std, at_bounds))]
-        matrix = np.array(covariance, dtype=float).reshape(len(names), -1)
-        if matrix.shape == (len(names),) * 2 and len(names) > 1:
-            tables += [("correlations of the estimates", *correlation_table(names, matrix))]
-        tables += [("draws: median and standard deviation", ["parameter", *HEADER], _rows(*drawn))]
+        tables = [estimate_table("estimates", *estimates, ends=ends)]
+        tables.append(estimate_table("draws: median and standard deviation", *drawn))
+        matrix = np.array(covariance, dtype=float).reshape(len(estimates[0]), -1)
+        if matrix.shape == (len(matrix),) * 2 and len(matrix) > 1:
+            tables.insert(1, correlation_table(estimates[0], matrix))
     except (ValueError, TypeError, AttributeError):
         return []
-    return [(title, header, rows) for title, header, rows in tables if rows and len(header) <= MOST_COLUMNS]
-
-
-def _rows(
-    names: Sequence[str],
-    units: Sequence[str],
-    values: Sequence[float | None],
-    std: Sequence[float | None],
-    at_bounds: Mapping[str, str] | None = None,
-) -> list[list[str]]:
-    """The estimates; a value without a standard error is not determined. at_bounds: 'low' or 'high' by name."""
-    ends = at_bounds or {}
-    numbers = ((np.nan if v is None else v, np.inf if s is None else s) for v, s in zip(values, std, strict=True))
-    return [
-        [name, *estimate_cells(name, unit, *pair, ends.get(name, ""))]
-        for name, unit, pair in zip(names, units, numbers, strict=True)
-    ]
-
-
-def _shortened(text: str) -> str:
-    """A record's value; a date and time without the fractions of its seconds."""
-    return _FRACTION.sub("", text)
+    return [table for table in tables if len(table.header) <= MOST_COLUMNS]
 
 
 def result_text(text: str) -> str:

@@ -15,7 +15,6 @@ from typing import Any
 import torch
 
 from fdi_torch.cli.explained import exit_code, say_doubts, say_first
-from fdi_torch.cli.gap_text import MOVED
 from fdi_torch.cli.screen import Screen
 from fdi_torch.clock import MOMENTS
 from fdi_torch.config.channels import expect_columns
@@ -24,14 +23,17 @@ from fdi_torch.config.plant_file import chosen_plant, load_plant
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.yaml_files import YAML_ENDINGS, find_data
 from fdi_torch.effects import build_network
-from fdi_torch.estimate.misfit import Misfit, misfit_of
+from fdi_torch.estimate.misfit import Misfit
 from fdi_torch.gap.free_runs.prediction import Prediction, predict
+from fdi_torch.jobs.python_results import FreeRun, sensor_unit, shown_errors
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.quantities import display_unit, quantity_text
+from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import doubts_about
 from fdi_torch.report.fit_figure import fit_figure
+from fdi_torch.report.gap_tables import MOVED
 from fdi_torch.report.style import save
+from fdi_torch.tables import Table
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -43,12 +45,12 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         raise ValueError("expected a recording, got none; name a CSV, MCAP or YAML file")
     recordings = [r for name in names for r in _recordings(name, plant, arguments)]
     with screen.progress("predict") as advance:
-        predictions = []
+        runs = []
         for k, recording in enumerate(recordings):
             advance(k / len(recordings), Path(recording.source).name)
-            predictions.append((recording, _predict(plant, recording, arguments)))
+            runs.append(FreeRun(plant, recording, _predict(plant, recording, arguments)))
         advance(1.0, "done")
-    misfits = [misfit_of(prediction.rmse, [recording], plant) for recording, prediction in predictions]
+    misfits = [run.misfit for run in runs]
     worst = max(misfits, key=lambda misfit: misfit.ratio)
     name = Path(recordings[misfits.index(worst)].source).name
     which = [f"of {len(recordings)} free runs, that along {name} is the worst"] if len(recordings) > 1 else []
@@ -62,25 +64,23 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     if settle is None and max(map(len, recordings)) <= arguments.start_samples:
         first = "all samples: a longer recording would test the prediction"
     screen.say(f"free run of {plant.name}, initial levels from {first}")
-    before = [_predict(other, recording, arguments, vary=()) for recording in recordings] if other else []
+    before = [FreeRun(other, r, _predict(other, r, arguments, vary=())) for r in recordings] if other else []
     own_name, other_name = _names(plant.name, arguments)
-    rows = [[own_name, *_row(plant, recording, prediction)] for recording, prediction in predictions]
-    rows += [[other_name, *_row(plant, *each)] for each in zip(recordings, before, strict=bool(other))]
-    units = (f"{s.name}, {display_unit(s.unit, s.column)[0] or 'share'}" for s in plant.sensors)
+    rows = [(own_name, *_row(run, plant)) for run in runs] + [(other_name, *_row(run, plant)) for run in before]
+    units = (f"{s.name}, {sensor_unit(s)}" for s in plant.sensors)
     header = ("plant", "recording", "from, s", "to, s", *units, "start at")
     alone = 0 if other else 1  # without the column of plants
     title = "root mean square error" + ("" if settle is None else f" after the first {settle:g} s")
-    screen.table(title, header[alone:], [row[alone:] for row in rows], left=2 - alone)
-    for recording, prediction in predictions:
-        _own_constants(plant, recording, prediction, screen)
+    screen.show(Table(header[alone:], [row[alone:] for row in rows], title, digits=4))
+    for run in runs:
+        _own_constants(run, screen)
     if arguments.picture:
-        recording, prediction = predictions[-1]
-        runs = {other_name: before[-1].readings} if before else {}
-        runs[own_name] = prediction.readings
-        title = misfits[-1].headline(f"free run along {Path(recording.source).name}")
-        figure = fit_figure(recording, runs, title, plant, plant.outputs())
+        drawn = {other_name: before[-1].prediction.readings} if before else {}
+        drawn[own_name] = runs[-1].prediction.readings
+        title = misfits[-1].headline(f"free run along {Path(recordings[-1].source).name}")
+        figure = fit_figure(recordings[-1], drawn, title, plant, plant.outputs())
         screen.note(f"picture: {save(figure, Path(arguments.picture))}")
-    results = [_result(plant, *run, misfit, arguments) for run, misfit in zip(predictions, misfits, strict=True)]
+    results = [_result(run, misfit, arguments) for run, misfit in zip(runs, misfits, strict=True)]
     several = {"format": "fdi_torch.predictions/1", "runs": results}
     screen.result((results[0] if len(results) == 1 else several) | {"doubts": doubts})
     return exit_code(worst)
@@ -140,46 +140,38 @@ def _constants(arguments: argparse.Namespace, plant: PlantDescription) -> dict[s
     return columns
 
 
-def _own_constants(plant: PlantDescription, recording: Recording, prediction: Prediction, screen: Screen) -> None:
+def _own_constants(run: FreeRun, screen: Screen) -> None:
     """Print the constants whose values in this run are far out of their tolerances."""
-    constants = build_network(plant).constants
-    for name, value in prediction.own.items():
+    constants = build_network(run.plant).constants
+    for name, value in run.prediction.own.items():
         constant = constants[name]
         far = abs(value - constant.nominal) / constant.std
         if far > MOVED:
             screen.say(
-                f"- {Path(recording.source).name}: in its first samples {name} = "
+                f"- {Path(run.recording.source).name}: in its first samples {name} = "
                 f"{quantity_text(value, constant.unit, 3)}, {far:.2g} tolerances off: the plant file does not fit them"
             )
 
 
-def _row(plant: PlantDescription, recording: Recording, prediction: Prediction) -> list[str]:
-    errors = [
-        f"{display_unit(s.unit, s.column)[1] * prediction.rmse[s.name]:.4g}" if s.name in prediction.rmse else ""
-        for s in plant.sensors
-    ]
-    levels = ", ".join(f"{tank} {quantity_text(level, 'm')}" for tank, level in prediction.start_levels.items())
-    times = (f"{float(recording.time[i]):g}" for i in (0, -1))
-    return [Path(recording.source).name, *times, *errors, levels]
+def _row(run: FreeRun, plant: PlantDescription) -> tuple[Any, ...]:
+    """Recording, times, errors of the sensors of `plant`, initial levels."""
+    levels = ", ".join(f"{tank} {quantity_text(level, 'm')}" for tank, level in run.prediction.start_levels.items())
+    times = (float(run.recording.time[i]) for i in (0, -1))
+    return (Path(run.recording.source).name, *times, *shown_errors(plant, run.prediction.rmse), levels)
 
 
-def _result(
-    plant: PlantDescription,
-    recording: Recording,
-    prediction: Prediction,
-    misfit: Misfit,
-    arguments: argparse.Namespace,
-) -> dict[str, Any]:
+def _result(run: FreeRun, misfit: Misfit, arguments: argparse.Namespace) -> dict[str, Any]:
+    prediction = run.prediction
     return {
         "format": "fdi_torch.prediction/1",
-        "plant": plant.name,
-        "recording": recording.source,
+        "plant": run.plant.name,
+        "recording": run.recording.source,
         **misfit.to_dict(),
         "rmse": dict(prediction.rmse),
         "start_levels": dict(prediction.start_levels),
         "own": dict(prediction.own),
         "start_samples": arguments.start_samples,
         "settle": arguments.settle,
-        "time": recording.time.tolist(),
-        "readings": {s.name: prediction.readings[:, i].tolist() for i, s in enumerate(plant.sensors)},
+        "time": run.recording.time.tolist(),
+        "readings": {s.name: prediction.readings[:, i].tolist() for i, s in enumerate(run.plant.sensors)},
     }

@@ -10,7 +10,7 @@ import argparse
 from fdi_torch.cli.options import live, overrides
 from fdi_torch.cli.screen import Screen, log_words
 from fdi_torch.config.rehearsal_file import load_rehearsal
-from fdi_torch.jobs.study import RehearsalResult, rehearse
+from fdi_torch.jobs.study import rehearse
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -18,15 +18,11 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     with live(arguments, rehearsal.name, screen) as listener, screen.progress(rehearsal.name) as advance:
         done = rehearse(rehearsal, arguments.resume, advance, listener)
     for table in done.tables:
-        screen.table(table.title, table.header, table.rows, left=2)
+        screen.show(table)
         screen.say()
     screen.say(f"{done.computed} of {done.tasks} tasks in {done.seconds:.0f} s; {log_words(done.log)}")
-    screen.result(as_json(done))
+    tables = [{"title": table.title, "rows": table.records} for table in done.tables]
+    screen.result(
+        {"format": "fdi_torch.rehearsal/1", "tables": tables, "computed": done.computed, "log": str(done.log)}
+    )
     return 0
-
-
-def as_json(done: RehearsalResult) -> dict[str, object]:
-    tables = [
-        {"title": t.title, "rows": [dict(zip(t.header, row, strict=True)) for row in t.rows]} for t in done.tables
-    ]
-    return {"format": "fdi_torch.rehearsal/1", "tables": tables, "computed": done.computed, "log": str(done.log)}

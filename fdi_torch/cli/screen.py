@@ -13,7 +13,7 @@ import re
 import sys
 import textwrap
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -92,28 +92,30 @@ class Screen:
         for sentence in sentences:
             self.say(f"- {sentence}")
 
-    def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[str]], left: int = 1) -> None:
-        """Print a table whose first `left` columns are left-aligned; not with JSON.
+    def show(self, *tables: Shown) -> None:
+        """Print tables between their titles and summaries; not with JSON, and none without a row.
 
         A column whose cells are all empty is left out. On a narrow terminal words are folded and numbers stay whole;
         elsewhere lines are not folded.
         """
-        if self.json:
-            return
-        if title:
-            self.say(title)
+        for shown in tables:
+            if len(shown) and not self.json:
+                self._show(shown)
+
+    def _show(self, shown: Shown) -> None:
+        rows, left = shown.cells(), shown.left
+        if shown.title:
+            self.say(shown.title)
         table = Table(box=None, pad_edge=False, header_style="bold")
-        filled = [i for i in range(len(header)) if not rows or any(row[i] for row in rows)]
+        filled = [i for i in range(len(shown.header)) if any(row[i] for row in rows)]
         for i in filled:
-            word = i < left
-            table.add_column(_shown(header[i]), justify="left" if word else "right", overflow="fold", no_wrap=not word)
+            name, word = _shown(shown.header[i]), i < left
+            table.add_column(name, justify="left" if word else "right", overflow="fold", no_wrap=not word)
         for row in rows:
             table.add_row(*(_shown(row[i]) for i in filled))
         self._out.print(table, soft_wrap=False)
-
-    def show(self, table: Shown, left: int, title: str = "") -> None:
-        """Print a table of results, as it shows itself in a session; not with JSON."""
-        self.table(title, list(table.columns), table.rows(len(table)), left)
+        if shown.summary:
+            self.say(shown.summary)
 
     def result(self, data: Any) -> None:
         """Print the result as JSON if requested; dataclasses are allowed, and non-finite numbers become null."""

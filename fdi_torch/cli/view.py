@@ -17,7 +17,8 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.interruption import Terminated
 from fdi_torch.report.html import short
-from fdi_torch.view.log_list import LogList, selected
+from fdi_torch.tables import Table
+from fdi_torch.view.log_list import SORTS, LogList, selected
 
 LEAST_VERDICT = 24  # letters; a narrower terminal folds the row
 
@@ -44,14 +45,12 @@ def _print_list(folder: Path, words: str, screen: Screen) -> None:
     if not folder.is_dir():
         raise ValueError(f"{folder}: expected a folder of logs, got none")
     entries = selected(LogList(folder).entries(), words)
-    rows = [[e.name, e.started, e.kind, e.state, e.error_text, e.verdict] for e in entries]
-    header = ("log", "started, UTC", "kind", "state", "error", "verdict")
+    rows, header = [entry.cells for entry in entries], [*SORTS.values()]
     if rows:
-        screen.table("", header, _fitting(header, rows), left=len(header))
+        screen.show(Table(header, _fitting(header, rows), words=len(header)))
     else:
         screen.say(f"no log matches '{words}'" if words else f"no log in {folder}")
-    names = ("log", "started", "kind", "state", "error", "verdict")
-    screen.result({"format": "fdi_torch.view_list/1", "logs": [dict(zip(names, row, strict=True)) for row in rows]})
+    screen.result({"format": "fdi_torch.view_list/1", "logs": [dict(zip(SORTS, row, strict=True)) for row in rows]})
 
 
 def _fitting(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[list[str]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from fnmatch import fnmatchcase
@@ -27,9 +26,8 @@ from fdi_torch.plant.description import (
     Tank,
 )
 from fdi_torch.plant.flow_component import FlowComponent
-from fdi_torch.plant.scales import emptying_time
-from fdi_torch.quantities import significant
-from fdi_torch.tables import Table
+from fdi_torch.plant.scales import tank_table
+from fdi_torch.quantities import displayed_in
 
 if TYPE_CHECKING:
     from fdi_torch.simulate.ode import Inputs, PlantOde
@@ -148,12 +146,8 @@ class Plant(PlantDescription):
         from fdi_torch.report.schematic import schematic
         from fdi_torch.report.style import notebook_svg
 
-        times = [emptying_time(self, t) for t in self.tanks]
-        ends = [significant(time, 3) if math.isfinite(time) else "never" for time in times]
-        volumes = [significant(1e3 * t.area * t.height, 4) for t in self.tanks]
-        sizes = list(zip((t.name for t in self.tanks), volumes, ends, strict=True))
-        table = Table.of_rows(("tank", "volume, l", "empties from full in, s"), sizes)
-        return notebook_svg(schematic(self), f"plant-{self.name}", self.title) + table.html()
+        with displayed_in(self.units):
+            return notebook_svg(schematic(self), f"plant-{self.name}", self.title) + tank_table(self).html()
 
 
 def _listed(part: str, components: Iterable[Component], kind: type[Component]) -> tuple[Component, ...]:

@@ -110,7 +110,8 @@ class Entry(Shown):
         return rows
 
     def table(self) -> Table:
-        return Table.of_rows(("parameter", "unit", "nominal", "lowest", "highest", "meaning"), self.rows())
+        header = ("parameter", "unit", "nominal", "lowest", "highest", "meaning")
+        return Table(header, self.rows(), words=len(header))
 
 
 @dataclass(frozen=True, repr=False)
@@ -143,7 +144,7 @@ class Catalogue(Shown):
             (e.name, e.meaning, list(e.kinds), list(e.at), ", ".join(_named(p) for p in e.parameters), e.begins)
             for e in self.entries
         ]
-        return Table.of_rows(("effect", "meaning", "sits at a", "places", "parameters", "begins"), rows)
+        return Table(("effect", "meaning", "sits at a", "places", "parameters", "begins"), rows)
 
 
 def effects(plant: PlantDescription | None = None) -> Catalogue:

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from fdi_torch.amounts import with_error
+from fdi_torch.amounts import parameter_words, with_error
 from fdi_torch.estimate.information import Certainty, determined_combinations
 from fdi_torch.names import listed
 from fdi_torch.parameters import ParameterSpace
@@ -59,6 +59,16 @@ class Combination:
         """'a + 0.8 b = 0.0994 ± 0.0023', in the units for display."""
         unit, scale = display_unit(self.unit, self.parameters[0])
         return f"{self.formula} = {with_error(scale * self.value, scale * self.std)} {unit}".rstrip()
+
+    @property
+    def rivals(self) -> str:
+        """'leak at T2 or plugging at OUT2'."""
+        return listed([parameter_words(name) for name in self.parameters], "or")
+
+    @property
+    def sized_rivals(self) -> str:
+        """The rivals with what is known of their sizes."""
+        return f"{self.rivals} ({self.words})"
 
     def interval(self, confidence: float = 0.95) -> tuple[float, float]:
         """Confidence interval, from the normal distribution."""

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from fdi_torch.amounts import estimate_words, parameter_words, sized_words
 from fdi_torch.estimate.combinations import Combination
-from fdi_torch.estimate.misfit import NONE_EXPLAINS, NOT_ESTABLISHED, Misfit
-from fdi_torch.names import listed
+from fdi_torch.estimate.misfit import Misfit, fault_statement, kind_of
 from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace, common_name
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork
@@ -69,18 +68,13 @@ class Diagnosis:
         """'no fault', 'single fault', 'fault not isolated' or 'multiple faults'; 'not established' if the model does
         not explain the recording, because every test of a fault size assumes that it does.
         """
-        if not self.misfit.explained:
-            return NOT_ESTABLISHED
-        if self.not_isolated and not self.present:
-            return "fault not isolated"
-        return ("no fault", "single fault", "multiple faults")[min(len(self.present) + len(self.not_isolated), 2)]
+        return kind_of(len(self.present), len(self.not_isolated), self.misfit.explained)
 
     @property
     def statement(self) -> str:
         """Kind and names of the faults present: 'multiple faults: leak at T1, leak at T2 or plugging at OUT2'."""
-        names = ", ".join([*(parameter_words(f.name) for f in self.present), *map(_rivals, self.not_isolated)])
-        nothing = "no suspected fault differs significantly from nominal" if self.misfit.explained else NONE_EXPLAINS
-        return f"{self.kind}: {names or nothing}"
+        names = [parameter_words(f.name) for f in self.present]
+        return fault_statement(names, [c.rivals for c in self.not_isolated], self.misfit.explained)
 
     @property
     def headline(self) -> str:
@@ -89,15 +83,8 @@ class Diagnosis:
         It begins with a warning if the model does not explain the recording.
         """
         sizes = [sized_words(f.name, [estimate_words(f.name, f.unit, f.value, f.std)]) for f in self.present]
-        sizes += [f"{_rivals(c)} ({c.words})" for c in self.not_isolated]
-        if not sizes and not self.misfit.explained:
-            sizes = [NONE_EXPLAINS]
-        return self.misfit.headline(f"{self.kind}: {'; '.join(sizes)}" if sizes else self.kind)
-
-
-def _rivals(combination: Combination) -> str:
-    """'leak at T2 or plugging at OUT2'."""
-    return listed([parameter_words(name) for name in combination.parameters], "or")
+        not_isolated = [c.sized_rivals for c in self.not_isolated]
+        return self.misfit.headline(fault_statement(sizes, not_isolated, self.misfit.explained))
 
 
 def diagnose(

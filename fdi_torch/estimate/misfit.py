@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.repeated_readings import resolution
 from fdi_torch.sample_noise import sample_noise
@@ -38,6 +39,28 @@ def unreliable(ratio: float) -> str:
     """The warning about a model whose residuals are this multiple of the noise."""
     size = f" (residuals {float(f'{ratio:.2g}'):g} times the sensors' noise)" if math.isfinite(ratio) else ""
     return f"{UNRELIABLE}{size}"
+
+
+def kind_of(present: int, not_isolated: int, explained: bool) -> str:
+    """The kind of a diagnosis with so many faults; see `Diagnosis.kind`."""
+    if not explained:
+        return NOT_ESTABLISHED
+    if not_isolated and not present:
+        return "fault not isolated"
+    return ("no fault", "single fault", "multiple faults")[min(present + not_isolated, 2)]
+
+
+def fault_statement(present: Sequence[str], not_isolated: Sequence[str], explained: bool) -> str:
+    """The kind of a diagnosis, and its faults in words; the same on terminal, page and in a notebook."""
+    nothing = "no suspected fault differs significantly from nominal" if explained else NONE_EXPLAINS
+    return f"{kind_of(len(present), len(not_isolated), explained)}: {', '.join([*present, *not_isolated]) or nothing}"
+
+
+def flow_words(flow: float, hole: float | None, explained: bool) -> str:
+    """'changes the flow by 30 cm^3/s at the mean levels, as a sharp-edged hole of 4.8 mm would', from SI values."""
+    change = "changes" if explained else "would change"
+    words = f"{change} the flow by {quantity_text(flow, 'm^3/s', 3)} at the mean levels"
+    return f"{words}, as a sharp-edged hole of {1e3 * hole:.3g} mm would" if hole and math.isfinite(hole) else words
 
 
 @dataclass(frozen=True)

@@ -101,10 +101,12 @@ class Draws(Shown):
     @in_its_units
     def table(self) -> Table:
         """One row per parameter, in its unit for display."""
-        columns, amounts = self._summary(), ("median", "std", "95 % low", "95 % high")
-        numbers = zip(*(columns[name] for name in amounts), strict=True)
-        rows = [in_display_unit(name, u, *v) for name, u, v in zip(self.names, self.units, numbers, strict=True)]
-        return Table(columns | {name: [row[k] for row in rows] for k, name in enumerate(("unit", *amounts))})
+        columns = self._summary()
+        rows = [
+            (name, *in_display_unit(name, unit, *numbers[:4]), *numbers[4:])
+            for name, unit, *numbers in zip(*columns.values(), strict=True)
+        ]
+        return Table([*columns], rows)
 
     def _summary(self) -> dict[str, Any]:
         """Columns with one value per parameter, SI."""

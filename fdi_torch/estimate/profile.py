@@ -99,7 +99,7 @@ class Profile(Shown):
         """One row per value of the parameter, in its unit for display."""
         unit, *values = in_display_unit(self.name, self.unit, *self.x.tolist())
         name = self.name if unit == "1" else f"{self.name}, {unit}"
-        return Table({name: values, "likelihood ratio": self.ratio.tolist()})
+        return Table((name, "likelihood ratio"), [*zip(values, self.ratio.tolist(), strict=True)])
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON; an infinite limit becomes None."""

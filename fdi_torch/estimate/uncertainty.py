@@ -66,7 +66,7 @@ class Estimate(Shown):
         columns = [c.tolist() for c in (self.value, self.std, *self.interval())]
         by_parameter = zip(self.names, self.units, *columns, strict=True)
         rows = [(name, *in_display_unit(name, unit, *numbers)) for name, unit, *numbers in by_parameter]
-        return Table.of_rows(["parameter", "unit", "estimate", "std error", "95 % low", "95 % high"], rows)
+        return Table(["parameter", "unit", "estimate", "std error", "95 % low", "95 % high"], rows)
 
     @property
     def warning(self) -> str:

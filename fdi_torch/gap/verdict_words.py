@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fdi_torch.amounts import effect_words
+from fdi_torch.amounts import effect_words, probability_words
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import UNKNOWN
 from fdi_torch.names import listed
@@ -64,13 +64,6 @@ def cause_words(cause: Named) -> str:
 def explanation_words(causes: Sequence[Named]) -> str:
     """'leak at T1 and pump lag at Q1', or that nothing lies beyond tolerances; without the rounding of readings."""
     return listed([cause_words(cause) for cause in apart_from_rounding(causes)]) or "nothing beyond tolerances"
-
-
-def probability_words(probability: float) -> str:
-    """A probability with significant digits only: 'over 99.9 %', '97.2 %'."""
-    if probability >= 0.9995:
-        return "over 99.9 %"
-    return f"{100.0 * probability:.1f} %" if probability >= 0.001 else "under 0.1 %"
 
 
 def verdict_sentence(answer: Named, best: str = "") -> str:

@@ -22,7 +22,7 @@ def export_fmu(plant: AnyPlant, file: str | Path, *, effects: Sequence[str] = ()
     """
     variables = write_fmu(build_network(given_plant(plant), [_placement(name) for name in effects]), Path(file))
     columns = ("name", "causality", "variability", "unit", "start")
-    return Table({column: [getattr(variable, column) for variable in variables] for column in columns})
+    return Table(columns, [[getattr(variable, column) for column in columns] for variable in variables])
 
 
 def _placement(name: str) -> Placement:

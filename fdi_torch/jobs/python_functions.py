@@ -257,7 +257,7 @@ def refit(
         fit = refitted(plant, segments, step=step, tell=rounded(tell), **choices)
         trials = predicted_beside((plant, fit.plant), held_out, start_samples, settle=settle)
     doubts = doubts_about([*segments, *held_out], plant)
-    return RefitResult(fit, misfit_of(fit.rmse, segments, plant), doubts, tuple(trials))
+    return RefitResult(fit, misfit_of(fit.rmse, segments, plant), plant, doubts, tuple(trials))
 
 
 def study(

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fdi_torch.amounts import effect_words
+import torch
+
+from fdi_torch.amounts import end_words
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import Misfit, misfit_of
+from fdi_torch.estimate.uncertainty import parameters_at_bounds
 from fdi_torch.gap.answer import Answer, adopted
+from fdi_torch.gap.free_runs.between_runs import between_run_spread
 from fdi_torch.gap.free_runs.prediction import LeftOutRun, Prediction
 from fdi_torch.gap.free_runs.refit import Refit, narrowed
-from fdi_torch.gap.verdict_words import MEAN_FLOW, explanation_words, verdict_sentence
+from fdi_torch.gap.verdict_words import verdict_sentence
 from fdi_torch.logbook import read_run
 from fdi_torch.monitor.events import Event
 from fdi_torch.names import counted
-from fdi_torch.parameters import ParameterName
-from fdi_torch.plant.description import PlantDescription
-from fdi_torch.quantities import quantity_text
+from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import PlantDescription, Sensor
+from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import doubts_about
 from fdi_torch.report.fit_figure import fit_figure
+from fdi_torch.report.gap_tables import MOVED, cause_table, explanation_table
 from fdi_torch.report.material import gather
 from fdi_torch.report.sections.gap import posterior_bars
 from fdi_torch.report.sections.monitor import statistic_section
@@ -48,24 +53,13 @@ class GapResult(Shown):
         """One row per parameter of each cause, in its unit for display; without a cause, the explanations and their
         probabilities.
         """
-        rows = []
-        for cause in self.answer.causes:
-            for name, a in cause.parameters.items():
-                full = str(ParameterName(cause.location, cause.effect, name))
-                unit, value, std = in_display_unit(full, a.unit, a.value, a.std)
-                rows.append((effect_words(cause.effect, cause.location), name, value, std, unit))
-            if cause.flow is not None:
-                unit, flow = in_display_unit("", "m^3/s", cause.flow)
-                rows.append((effect_words(cause.effect, cause.location), MEAN_FLOW, flow, math.nan, unit))
-        return (
-            Table.of_rows(("cause", "parameter", "value", "std error", "unit"), rows) if rows else self.explanations()
-        )
+        causes = cause_table(self.answer.to_dict())
+        return causes if len(causes) else self.explanations()
 
+    @in_its_units
     def explanations(self) -> Table:
         """All explanations with their posterior probabilities, likeliest first."""
-        posterior = self.answer.to_dict()["posterior"]
-        rows = [(explanation_words(e["causes"]), e["probability"]) for e in posterior]
-        return Table.of_rows(("explanation", "probability"), rows)
+        return explanation_table(self.answer.to_dict())
 
     def picture(self) -> str:
         """The probabilities of the explanations, as SVG."""
@@ -101,14 +95,12 @@ class MonitorResult(Shown):
     def table(self) -> Table:
         """One row per event; sizes in the units of the column `units`."""
         names = ("time", "kind", "alarm", "text", "headline", "faults", "onset", "onset_std")
-        columns = {name: [getattr(event, name) for event in self.events] for name in names}
-        sizes = [
-            [in_display_unit(*s) for s in zip(e.faults, e.units, e.sizes, e.stds, strict=True)] for e in self.events
-        ]
-        amounts = {
-            name: [tuple(s[k] for s in each) for each in sizes] for k, name in enumerate(("units", "sizes", "stds"))
-        }
-        return Table(columns | amounts)
+        rows = []
+        for event in self.events:
+            sizes = zip(event.faults, event.units, event.sizes, event.stds, strict=True)
+            amounts = [*zip(*(in_display_unit(*size) for size in sizes), strict=True)] or [()] * 3
+            rows.append((*(getattr(event, name) for name in names), *amounts))
+        return Table((*names, "units", "sizes", "stds"), rows)
 
     @in_its_units
     def picture(self) -> str:
@@ -117,7 +109,7 @@ class MonitorResult(Shown):
         return notebook_svg(section.pictures[0].figure, self.log.stem, self.headline) if section else ""
 
     def brief(self) -> Table:
-        return Table.of_rows(("time, s", "event", "text"), [(e.time, e.kind, e.text) for e in self.events])
+        return Table(("time, s", "event", "text"), [(e.time, e.kind, e.text) for e in self.events])
 
 
 @dataclass(frozen=True, repr=False)
@@ -152,7 +144,7 @@ class FreeRun(Shown):
     def table(self) -> Table:
         """One row per sensor: root mean square error, in its unit for display."""
         rows = [(s.name, *in_display_unit(s.column, s.unit, self.prediction.rmse[s.name])) for s in self.plant.sensors]
-        return Table.of_rows(("sensor", "unit", "RMSE"), rows)
+        return Table(("sensor", "unit", "RMSE"), rows)
 
     @in_its_units
     def picture(self) -> str:
@@ -168,17 +160,19 @@ class FreeRun(Shown):
 
 @dataclass(frozen=True, repr=False)
 class RefitResult(Shown):
-    """plant: the plant with fitted constants and effects. fit: errors, values and standard errors, SI.
-    misfit: of all recordings. doubts: what limits the trust in these and in the hold-outs, one sentence each. trials:
-    errors (SI) of free runs along the hold-outs, of the plant as given and as refitted."""
+    """fit: errors, values and standard errors, SI. misfit: of all recordings. given: the plant before the fit. doubts:
+    what limits the trust in the recordings and the hold-outs, one sentence each. trials: errors (SI) of free runs along
+    the hold-outs, of the plant as given and as refitted."""
 
     fit: Refit
     misfit: Misfit
+    given: PlantDescription
     doubts: tuple[str, ...] = ()
     trials: tuple[LeftOutRun, ...] = ()
 
     @property
     def plant(self) -> PlantDescription:
+        """The plant with fitted constants and effects."""
         return self.fit.plant
 
     @property
@@ -190,11 +184,71 @@ class RefitResult(Shown):
 
     @in_its_units
     def table(self) -> Table:
-        """One row per value that all recordings share, in its unit for display."""
-        constants = build_network(self.plant).constants
-        rows = [(n, *in_display_unit(n, constants[n].unit, *pair)) for n, pair in self.fit.fitted.items()]
-        return Table.of_rows(("parameter", "unit", "value", "std error"), rows)
+        """One row per value that all recordings share, in its unit for display, beside the one in the plant file."""
+        constants = build_network(self.given).constants
+        rows = [
+            (name, *in_display_unit(name, constants[name].unit, constants[name].nominal, *pair))
+            for name, pair in self.fit.fitted.items()
+        ]
+        return Table(("parameter", "unit", "plant file", "fitted", "std error"), rows, "fitted to all recordings")
+
+    @in_its_units
+    def errors(self) -> Table:
+        """One row per sensor: root mean square error with the constants fitted and, if there are any, the effects."""
+        fits = {"constants fitted": self.fit.before, "constants and effects fitted": self.fit.rmse}
+        fits = fits if self.plant.effects else {"constants fitted": self.fit.rmse}
+        columns = zip(*(shown_errors(self.plant, rmse) for rmse in fits.values()), strict=True)
+        rows = [(s.name, *row, sensor_unit(s)) for s, row in zip(self.plant.sensors, columns, strict=True)]
+        return Table(("sensor", *fits, "unit"), rows, "root mean square error", digits=4)
+
+    def remarks(self) -> list[str]:
+        """Values that are far from those of the plant file, or at an end of their range."""
+        constants = build_network(self.given).constants
+        space = ParameterSpace([constants[name] for name in self.fit.fitted])
+        values = torch.tensor([value for value, _ in self.fit.fitted.values()], dtype=torch.float64)
+        far = {p.name: abs(value - p.nominal) / p.std for p, value in zip(space, values.tolist(), strict=True)}
+        remarks = [
+            f"{name} lies {tolerances:.2g} tolerances from its value in the plant file"
+            for name, tolerances in far.items()
+            if tolerances > MOVED
+        ]
+        return [*remarks, *(end_words(*each) for each in parameters_at_bounds(space, values).items())]
+
+    @in_its_units
+    def by_recording(self) -> Table:
+        """Values that differ by recording, and their between-run variation."""
+        constants, rows = build_network(self.plant).constants, list[tuple[Any, ...]]()
+        for name in dict.fromkeys(own.name for own in self.fit.own):
+            unit, scale = display_unit(constants[name].unit, name)
+            each = [own for own in self.fit.own if own.name == name]
+            rows += [(name, Path(o.source).name, o.start, scale * o.value, scale * o.std, unit) for o in each]
+            if variation := between_run_spread(each, constants[name].std):
+                std, low, high = (f"{scale * x:.2g}" for x in (variation.std, variation.low, variation.high))
+                mean, of = f"{scale * variation.mean:.4g}", f"mean and standard deviation of {variation.count}"
+                rows.append((name, of, None, mean, f"{std} (95 %: {low} to {high})", unit))
+        header = ("parameter", "recording", "from, s", "value", "std error", "unit")
+        return Table(header, rows, "values of each recording")
 
     def narrowed(self) -> PlantDescription:
         """The plant with the standard errors of the fit as tolerances where these are smaller."""
         return self.fit.narrowed()
+
+
+def sensor_unit(sensor: Sensor) -> str:
+    """The unit for display of a sensor's readings."""
+    return display_unit(sensor.unit, sensor.column)[0] or "share"
+
+
+def shown_errors(plant: PlantDescription, rmse: Mapping[str, float]) -> list[float | None]:
+    """Errors of the plant's sensors, SI by sensor, in their units for display; None for a sensor without one."""
+    scales = {s.name: display_unit(s.unit, s.column)[1] for s in plant.sensors}
+    return [scale * rmse[name] if name in rmse else None for name, scale in scales.items()]
+
+
+def error_table(trials: Sequence[LeftOutRun], plant: PlantDescription, refitted: str) -> Table:
+    """One row per free run: errors of the plant file, and of the refitted plant. refitted: to what, in words."""
+    errors = [[*shown_errors(plant, t.as_is), *shown_errors(plant, t.refitted)] for t in trials]
+    rows = [(Path(t.source).name, t.start, t.stop, *each) for t, each in zip(trials, errors, strict=True)]
+    names = (f"{s.name} {of}, {sensor_unit(s)}" for of in ("as is", "refitted") for s in plant.sensors)
+    title = f"root mean square error of free runs; {refitted}"
+    return Table(("run", "from, s", "to, s", *names), rows, title, digits=4)

@@ -15,10 +15,9 @@ from fdi_torch.logbook import Comparison, Run, read_run
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.progress import Tell, rounded, silent
 from fdi_torch.report.comparison import comparison_section, in_words, result_table
-from fdi_torch.report.comparison_headline import comparison_headline, setting_differences
+from fdi_torch.report.comparison_headline import comparison_headline, setting_table
 from fdi_torch.report.html import Markup
 from fdi_torch.report.material import Material, gather
-from fdi_torch.report.numbers import lowered
 from fdi_torch.report.page import RunReport, page, report_of, write_pictures
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.style import notebook_svg
@@ -41,7 +40,7 @@ class Report(Shown):
 
     def table(self) -> Table:
         """One row per log."""
-        return Table({"log": list(self.headlines), "says": list(self.headlines.values())})
+        return Table(("log", "says"), list(self.headlines.items()))
 
 
 def report(
@@ -69,9 +68,9 @@ def report(
     written: list[Path] = []
     for k, each in enumerate(reports if pictures else ()):
         several = f"{k + 1}_" if len(reports) > 1 else ""
-        written += write_pictures(each, target.with_suffix("") / several if several else target.with_suffix(""))
+        written += write_pictures(each.pictures, target.with_suffix("") / several)
     tell(1.0, "done")
-    headlines = {str(each.material.run.path): lowered(headline(each.material)) for each in reports}
+    headlines = {str(each.material.run.path): headline(each.material) for each in reports}
     return Report(target, tuple(written), headlines, tuple(notes))
 
 
@@ -145,17 +144,23 @@ class ComparisonResult(Shown):
         for each in self.comparison.results:
             numbers = [number for pair in zip(each.values, each.std, strict=True) for number in pair]
             rows.append((each.name, *in_display_unit(each.name, each.unit, *numbers), each.p_value, each.agree))
-        return Table.of_rows(("parameter", "unit", *sum(errors, ()), "p", "agree"), rows)
+        return Table(("parameter", "unit", *sum(errors, ()), "p", "agree"), rows)
 
     def settings(self) -> Table:
         """One row per setting that differs, in words; what parts that not every run has differ in is left out."""
-        rows = [(key, *texts) for key, texts in setting_differences(self.comparison, self.runs)[0].items()]
-        return Table.of_rows(("key", *self.comparison.labels), rows)
+        return setting_table(self.comparison, self.runs)
+
+    @in_its_units
+    def tables(self) -> list[Table]:
+        """The settings that differ, unless the runs are of different kinds, whose keys differ; and the estimates."""
+        of_one_kind = len({run.kind for run in self.runs}) == 1
+        tables = [*([self.settings()] if of_one_kind else []), result_table(self.comparison)]
+        return [table for table in tables if len(table)]
 
     @in_its_units
     def brief(self) -> Table:
         """The estimates with their errors, as `fdi compare` prints them; without any, the settings."""
-        return Table.of_rows(*result_table(self.comparison)) if self.comparison.results else self.settings()
+        return result_table(self.comparison) if self.comparison.results else self.settings()
 
     @property
     def pictures(self) -> list[Picture]:
@@ -175,5 +180,5 @@ def compare(logs: Sequence[str | Path]) -> ComparisonResult:
     comparison = logbook.compare(logs)
     runs = tuple(gather(log, plant_of(log, [])) for log in map(read_run, logs))
     with runs[0].in_its_units():
-        sentences = tuple(lowered(s) for s in (*comparison_headline(comparison, runs), *in_words(comparison, runs)))
+        sentences = (*comparison_headline(comparison, runs), *in_words(comparison, runs))
         return ComparisonResult(comparison, runs, sentences)

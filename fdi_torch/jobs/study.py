@@ -16,9 +16,9 @@ from fdi_torch.config.study_file import Study
 from fdi_torch.jobs.log_paths import RESUMES, log_to_write
 from fdi_torch.logbook import Listener, RunLog
 from fdi_torch.logbook.reader import Run as LoggedRun
-from fdi_torch.monitor.monte_carlo.simulated_runs import ResultTable
 from fdi_torch.names import counted
 from fdi_torch.progress import Tell, silent
+from fdi_torch.report.setting_tables import setting_tables
 from fdi_torch.study.cluster import run_on_cluster
 from fdi_torch.study.monte_carlo import Trial, run_blocks
 from fdi_torch.study.study_plan import Plan
@@ -45,6 +45,12 @@ class StudyResult(Shown):
         return f"{counted(len(self.trials), 'trial')} in {counted(len(self.summaries), 'setting')}"
 
     @in_its_units
+    def tables(self) -> list[Table]:
+        """The scores of each setting, as `fdi study` prints them."""
+        units = {score.parameter: score.unit for summary in self.summaries for score in summary.scores}
+        return setting_tables([(s.setting, s.trials, s.numbers()) for s in self.summaries], units)
+
+    @in_its_units
     def table(self) -> Table:
         """One row per setting, estimator and parameter; bias and RMSE in the parameter's unit for display."""
         names = ("setting", "estimator", "parameter", "unit", "bias", "RMSE", "RMSE / bound", "coverage")
@@ -53,7 +59,7 @@ class StudyResult(Shown):
             ratios = [None if ratio is None else ratio.value for ratio in (e.over_bound, e.coverage)]
             bias = in_display_unit(e.parameter, e.unit, e.bias, e.rmse)
             rows.append((setting, e.estimator, e.parameter, *bias, *ratios))
-        return Table.of_rows(names, rows)
+        return Table(names, rows)
 
 
 def run_study(
@@ -143,7 +149,7 @@ def log_summary(study: Study, trials: Mapping[int, Trial], log: RunLog) -> tuple
 class RehearsalResult:
     """tables: one per plan. tasks: all; computed: those of this run, in `seconds` s. log: path."""
 
-    tables: tuple[ResultTable, ...]
+    tables: tuple[Table, ...]
     tasks: int
     computed: int
     seconds: float
@@ -180,7 +186,7 @@ def rehearse(
     return RehearsalResult(tables, len(tasks), len(results) - earlier, time.monotonic() - started, path)
 
 
-def result_tables(rehearsal: Rehearsal, results: Sequence[tuple[str, Mapping[str, Any]]]) -> tuple[ResultTable, ...]:
+def result_tables(rehearsal: Rehearsal, results: Sequence[tuple[str, Mapping[str, Any]]]) -> tuple[Table, ...]:
     """Result table of each plan."""
     groups: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
     for group, numbers in results:

@@ -38,6 +38,7 @@ from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.progress import Tell, rounded, silent
 from fdi_torch.recordings.check import doubts_about
 from fdi_torch.report.fit_figure import fit_figure
+from fdi_torch.report.numbers import estimate_table
 from fdi_torch.report.style import notebook_svg, save
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units, needed
 
@@ -75,14 +76,21 @@ class TrainResult(Shown):
     @in_its_units
     def table(self) -> Table:
         """One row per parameter, in its unit for display."""
-        columns = {"nominal": self.fitting.space.nominal().tolist()}
-        if self.truth:
-            columns["simulated"] = [self.truth.get(p.name, math.nan) for p in self.fitting.space]
-        shown = {
-            name: [in_display_unit(p.name, p.unit, v)[1] for p, v in zip(self.fitting.space, values, strict=True)]
-            for name, values in columns.items()
-        }
-        return Table({**self.estimate.table().columns, **shown})
+        table, values = self.estimate.table(), [self.fitting.space.nominal().tolist()]
+        values += [[self.truth.get(p.name, math.nan) for p in self.fitting.space]] if self.truth else []
+        rows = [
+            (*row, *in_display_unit(p.name, p.unit, *exact)[1:])
+            for row, p, *exact in zip(table.rows, self.fitting.space, *values, strict=True)
+        ]
+        return Table([*table.header, *("nominal", "simulated")[: len(values)]], rows)
+
+    @in_its_units
+    def brief(self) -> Table:
+        """The estimates and their determined combinations, as `fdi train` prints them."""
+        final, space = self.estimate, self.fitting.space
+        exact = {"nominal": {p.name: p.nominal for p in space}, "simulated": self.truth}
+        columns = (final.names, final.units, final.value.tolist(), final.std.tolist())
+        return estimate_table("", *columns, ends=final.at_bounds, combinations=final.combinations, exact=exact)
 
     @in_its_units
     def picture(self) -> str:

@@ -24,6 +24,8 @@ from fdi_torch.logbook.compare import AXES
 from fdi_torch.logbook.errors import LogError, log_error
 from fdi_torch.logbook.reader import Attachment, Message, Run, read_run
 from fdi_torch.logbook.scan import Damage, Frame, body_of, stream_of
+from fdi_torch.names import counted
+from fdi_torch.tables import Table
 
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 
@@ -192,6 +194,17 @@ class Inspection:
     def messages(self) -> int:
         return sum(info.messages for info in self.topics.values())
 
+    @property
+    def content(self) -> str:
+        """'60 messages on 3 topics in 1 chunk, 9000 bytes'."""
+        counts = f"{counted(self.messages, 'message')} on {counted(len(self.topics), 'topic')}"
+        return f"{counts} in {counted(self.health.chunks, 'chunk')}, {self.size} bytes"
+
+    def table(self) -> Table:
+        """One row per topic."""
+        rows = [(i.topic, i.schema, i.messages, *i.span, i.size) for i in self.topics.values()]
+        return Table(("topic", "schema", "messages", "from", "to", "bytes"), rows)
+
 
 def inspect_log(path: str | Path) -> Inspection:
     """Read and check a whole log of this or another program. Raises LogError if it is not an MCAP file."""
@@ -230,9 +243,9 @@ def _summary(run: Run, messages: int) -> Iterator[str]:
         if crc and zlib.crc32(run.data[: part.start]) != crc:
             yield "the CRC over the data differs"
     for part in _frames(run, Opcode.STATISTICS):
-        counted = Statistics.read(stream_of(body_of(run.data, part))).message_count
-        if counted != messages:
-            yield f"the summary counts {counted} messages, the file holds {messages}"
+        count = Statistics.read(stream_of(body_of(run.data, part))).message_count
+        if count != messages:
+            yield f"the summary counts {count} messages, the file holds {messages}"
     indexed = [ChunkIndex.read(stream_of(body_of(run.data, part))) for part in _frames(run, Opcode.CHUNK_INDEX)]
     places = {(index.chunk_start_offset, index.chunk_start_offset + index.chunk_length) for index in indexed}
     chunks = {(part.start, part.end) for part in _frames(run, Opcode.CHUNK)}

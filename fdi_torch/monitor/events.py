@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
-from fdi_torch.amounts import amount_words, estimate_words, parameter_words, sized_words
+from fdi_torch.amounts import amount_words, estimate_words, parameter_words, percent_text, sized_words
 from fdi_torch.clock import clock_text
 from fdi_torch.estimate.uncertainty import end_reached, plain_value
 from fdi_torch.monitor.alarm_state import State
@@ -242,10 +242,6 @@ def _by_effect(sizes: Sequence[Size]) -> list[list[Size]]:
     for size in sizes:
         grouped.setdefault(ParameterName.parse(size.name).prefix, []).append(size)
     return list(grouped.values())
-
-
-def percent_text(mass: float) -> str:
-    return "over 99 %" if mass > 0.99 else f"{100.0 * mass:.0f} %" if mass >= 0.01 else "under 1 %"
 
 
 def size_of(p: Parameter, size: float, std: float, rate: float | None = None) -> Size:

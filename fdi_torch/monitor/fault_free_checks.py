@@ -7,9 +7,10 @@ from dataclasses import replace
 
 from torch import Tensor
 
+from fdi_torch.amounts import percent_text
 from fdi_torch.estimate.evidence import posterior
 from fdi_torch.monitor.detection import DRIFT, VERY_LONG, Detector
-from fdi_torch.monitor.events import Explanation, percent_text, size_of
+from fdi_torch.monitor.events import Explanation, size_of
 from fdi_torch.monitor.flow_noise_estimate import with_usual_flows
 from fdi_torch.monitor.hypothesis import Fault, HypothesisFit
 from fdi_torch.monitor.hypothesis_fit import changes_of

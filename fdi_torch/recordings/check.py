@@ -19,6 +19,7 @@ from fdi_torch.recordings.input_sampling import undersampled_inputs
 from fdi_torch.recordings.plant_limits import ChannelFinding, plant_findings
 from fdi_torch.recordings.repeated_readings import resolution
 from fdi_torch.recordings.sensor_findings import irregular, reading_findings
+from fdi_torch.tables import Table, in_display_unit
 
 MANY_RUNS = 5
 """More segments without an input than this are reported in one sentence."""
@@ -54,6 +55,15 @@ class RecordingCheck:
     interval: float
     channels: tuple[ChannelSummary, ...]
     findings: tuple[ChannelFinding, ...]
+
+    def table(self) -> Table:
+        """One row per channel, in its unit for display."""
+        rows = []
+        for c in self.channels:
+            unit, *numbers = in_display_unit(c.name, c.unit, c.low, c.high, c.mean, c.resolution)
+            rows.append([c.name, c.role, "share" if unit == "1" else unit, *numbers, c.missing, c.masked])
+        measured = ("lowest", "highest", "mean", "smallest step", "missing", "masked")
+        return Table(("channel", "", "unit", *measured), rows, digits=5)
 
 
 def check_recording(recording: Recording, plant: PlantDescription) -> RecordingCheck:

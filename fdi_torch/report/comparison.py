@@ -5,24 +5,28 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from fdi_torch.amounts import with_error
 from fdi_torch.effects import EFFECTS
 from fdi_torch.logbook import Comparison, align
 from fdi_torch.logbook.compare import Result
 from fdi_torch.names import counted, listed
 from fdi_torch.parameters import ParameterName
+from fdi_torch.quantities import display_unit
 from fdi_torch.report.chart import Chart, Line
-from fdi_torch.report.comparison_headline import comparison_headline, left_out_words, setting_differences
+from fdi_torch.report.comparison_headline import comparison_headline, setting_table
 from fdi_torch.report.diagnosed_effects import diagnosed_effects
-from fdi_torch.report.html import folded, short, table, tag
+from fdi_torch.report.html import folded, short, shown, tag
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import number, plain_unit, raised, with_error
+from fdi_torch.report.numbers import number
 from fdi_torch.report.predictions import residuals
 from fdi_torch.report.section import Picture, Section, channel_signals, signals
 from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT
+from fdi_torch.tables import Table
 
 MOST_LETTERS = 160  # of a setting or result that differs; a longer one, such as a covariance, is cut
 PIPE_CAPACITY = re.compile(r"plant\.pipes\..*\.(area|discharge_coefficient)")
@@ -45,22 +49,17 @@ def _section(compared: Comparison, runs: Sequence[Material]) -> Section:
         tag("h3", first),
         *(tag("p", sentence) for sentence in (*sentences, *in_words(compared, runs))),
     ]
-    if compared.results:
-        header, rows = result_table(compared)
-        blocks.append(table(header, [[name, raised(unit), *cells] for name, unit, *cells in rows], left=2))
+    blocks += [shown(result_table(compared))] if compared.results else []
     pictures = [*_convergence(compared, runs), *_residuals(compared, runs)]
     blocks += [pictures] if pictures else []
-    settings, left_out = setting_differences(compared, runs)
-    in_settings = ("config", "seeds")
-    others = {name: entries for name, entries in compared.differences.items() if name not in in_settings}
-    for name, entries in {"settings": settings, **others}.items():
-        if name == "result":  # its lists of numbers are the table above
-            entries = {key: texts for key, texts in entries.items() if not any(t.startswith("[") for t in texts)}
-        rows = [[key, *(short(text, MOST_LETTERS) for text in texts)] for key, texts in entries.items()]
-        if rows:
-            shown = table(["key", *compared.labels], rows, len(compared.labels) + 1)
-            note = [tag("p", left_out_words(left_out))] if name == "settings" and left_out else []
-            blocks.append(folded(f"{name}: {len(rows)} differ", shown, *note))
+    tables = {"settings": replace(setting_table(compared, runs), title="")}
+    for name in (name for name in compared.differences if name not in ("config", "seeds")):
+        rows = [(key, *texts) for key, texts in compared.differences[name].items()]
+        rows = [row for row in rows if name != "result" or not any(text.startswith("[") for text in row[1:])]
+        tables[name] = replace(tables["settings"], rows=rows, summary="")
+    for name, each in tables.items():  # lists of numbers in the results are the table above
+        rows = [(key, *(short(text, MOST_LETTERS) for text in texts)) for key, *texts in each.rows]
+        blocks += [folded(f"{name}: {len(rows)} differ", shown(replace(each, rows=rows)))] if rows else []
     return Section("Comparison", blocks)
 
 
@@ -118,21 +117,19 @@ def _name_different_faults(runs: Sequence[Material]) -> bool:
     return len({frozenset(f.words for f in diagnosed_effects(run) if f.present) for run in runs}) > 1
 
 
-def result_table(compared: Comparison) -> tuple[list[str], list[list[str]]]:
-    """Header and rows: parameter, unit, value and error of each run and, if runs share one, p-value and agreement."""
+def result_table(compared: Comparison) -> Table:
+    """Parameter, unit, value and error of each run and, if runs share one, p-value and agreement."""
     verdicts = {True: "yes", False: "no", None: ""}
     rows = []
     for result in compared.results:
-        unit, scale = plain_unit(result.unit, result.name)
+        unit, scale = display_unit(result.unit, result.name)
         ends = result.ends or [""] * len(result.values)
         numbers = zip(result.values, result.std, ends, strict=True)
-        values = [with_error(scale * v, scale * s, end) for v, s, end in numbers]
-        p_value = "< 0.0001" if result.p_value < 1e-4 else number(result.p_value, 2)
+        values = ["–" if math.isnan(v) else with_error(scale * v, scale * s, end) for v, s, end in numbers]
+        chance = "" if math.isnan(result.p_value) else number(result.p_value, 2)
+        p_value = "< 0.0001" if result.p_value < 1e-4 else chance
         rows.append([result.name, unit or "1", *values, p_value, verdicts[result.agree]])
-    header = ["parameter", "unit", *compared.labels, "p", "agree"]
-    if all(result.agree is None for result in compared.results):
-        return header[:-2], [row[:-2] for row in rows]
-    return header, rows
+    return Table(("parameter", "unit", *compared.labels, "p", "agree"), rows, "estimates")
 
 
 def _convergence(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:

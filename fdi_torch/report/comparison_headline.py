@@ -20,6 +20,7 @@ from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import percent
 from fdi_torch.report.predictions import sensor_residuals
 from fdi_torch.report.verdict import headline, kind_words
+from fdi_torch.tables import Table
 from fdi_torch.units import UnitError, in_unit, number_and_unit
 
 MOST_LISTED, MOST_LETTERS = 4, 60
@@ -205,12 +206,15 @@ def _are_one_amount(texts: Sequence[str]) -> bool:
         return False
 
 
-def left_out_words(left_out: int) -> str:
-    """The sentence about the settings that `setting_differences` leaves out."""
-    return (
+def setting_table(compared: Comparison, runs: Sequence[Material]) -> Table:
+    """The settings that differ, in words, with a sentence about those that are left out."""
+    settings, left_out = setting_differences(compared, runs)
+    rows, header = [(key, *texts) for key, texts in settings.items()], ("key", *compared.labels)
+    summary = (
         f"{counted(left_out, 'setting')} of parts that not every run has are left out; "
         "fdi compare --csv FILE lists all of them."
     )
+    return Table(header, rows, "settings", words=len(header), summary=summary if left_out else "")
 
 
 def plain_text(text: str) -> str:

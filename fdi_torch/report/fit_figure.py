@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.report.chart import thinned
-from fdi_torch.report.html import short
-from fdi_torch.report.numbers import axis, sentence, shown_unit
+from fdi_torch.report.html import short, typeset
+from fdi_torch.report.numbers import axis, shown_unit
 from fdi_torch.report.style import MARK, MODEL, SOFT, label_lines, set_panel_title, set_title, styled
 
 ABREAST = 4
@@ -47,7 +47,7 @@ def fit_figure(
             _draw_sensor(upper, lower, recording, recording.output_names.index(column), of_sensor)
         for unused in (axis for pair in pairs[len(columns) :] for axis in pair):
             unused.remove()
-        set_title(figure, sentence(title))
+        set_title(figure, typeset(title))
     return figure
 
 

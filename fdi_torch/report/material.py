@@ -62,6 +62,16 @@ class Material:
     def kind(self) -> str:
         return self.about("run").get("kind", "")
 
+    @property
+    def status(self) -> str:
+        """How the run ended, such as 'not converged'; empty without an end."""
+        return self.about("status").get("status", "").replace("_", " ")
+
+    @property
+    def started(self) -> str:
+        """Date and time of the start, UTC; empty if unknown."""
+        return self.about("run").get("started", "")[:19].replace("T", " ")
+
     def of(self, topic: str) -> list[Payload]:
         return self.events.get(topic, [])
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from fdi_torch.logbook import labels_of
 from fdi_torch.report.html import Markup, bullets, join, tag, unbroken
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import sentence
 from fdi_torch.report.section import Maker, Picture, Section, section_html
 from fdi_torch.report.sections import SECTIONS
 from fdi_torch.report.sections.origin import RIG
@@ -88,15 +87,15 @@ def document(title: str, content: Sequence[Markup], style: str = "", refresh: in
     return f"<!doctype html>\n{tag('html', tag('head', head), tag('body', tag('main', *content)), lang='en')}\n"
 
 
-def write_pictures(report: RunReport, folder: Path) -> list[Path]:
+def write_pictures(pictures: Sequence[Picture], folder: Path) -> list[Path]:
     """Write every picture as PNG and SVG."""
-    return [save(p.figure, folder / f"{p.name}{ending}") for p in report.pictures for ending in (".png", ".svg")]
+    return [save(p.figure, folder / f"{p.name}{ending}") for p in pictures for ending in (".png", ".svg")]
 
 
 def _article(report: RunReport, prefix: str) -> Markup:
     material = report.material
     top = [tag("h1", f"{kind_words(material)} · {material.run.path.stem}"), tag("h2", unbroken(headline(material)))]
-    top += bullets(f"Doubt about the recording: {sentence(str(doubt))}" for doubt in material.listed("doubts"))
+    top += bullets(f"Doubt about the recording: {doubt}" for doubt in material.listed("doubts"))
     top.append(tag("p", how_it_ended(material), class_="meta"))
     named = {f"{prefix}s{k}": section for k, section in enumerate(report.sections)}
     ordered = dict(sorted(named.items(), key=lambda each: not each[1].lead))

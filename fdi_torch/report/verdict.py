@@ -7,15 +7,15 @@ from collections.abc import Mapping
 from contextlib import suppress
 from typing import Any
 
-from fdi_torch.amounts import parameter_words
+from fdi_torch.amounts import parameter_words, with_error
 from fdi_torch.clock import clock_text
-from fdi_torch.estimate.misfit import NONE_EXPLAINS, NOT_ESTABLISHED, unreliable
+from fdi_torch.estimate.misfit import fault_statement, unreliable
 from fdi_torch.estimate.uncertainty import convergence_warning
 from fdi_torch.gap.verdict_words import verdict_sentence
 from fdi_torch.names import counted, listed
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import as_float, number, sentence, with_error
+from fdi_torch.report.numbers import as_float, number
 from fdi_torch.report.sections.monitor import rehearsal_tables
 from fdi_torch.report.sections.study import SHOWN
 from fdi_torch.report.sections.windows import logged_windows
@@ -43,9 +43,8 @@ def headline(material: Material) -> str:
     with material.in_its_units():
         if words := next(filter(None, (of_kind(material) for of_kind in kinds)), ""):
             return unreliable_words(material) + words
-    status = material.about("status")
-    words = status.get("status", "did not end").replace("_", " ").capitalize()
-    return f"{words}: {status['reason']}" if status.get("reason") else words
+    words, reason = (material.status or "did not end").capitalize(), material.about("status").get("reason")
+    return f"{words}: {reason}" if reason else words
 
 
 def unreliable_words(material: Material) -> str:
@@ -59,25 +58,14 @@ def unreliable_words(material: Material) -> str:
 
 
 def fault_words(material: Material) -> str:
-    """The faults that are present, with their sizes; those that are not isolated with their determined combination.
-
-    If the model does not explain the recording, they are called not established.
-    """
+    """The faults that are present, with their sizes; those that are not isolated with their determined combination."""
     effects = diagnosed_effects(material)
     if not effects:
         return ""
     present = [f.sized for f in effects if f.present]
-    not_isolated = [
-        f"{' or '.join(map(parameter_words, combination.parameters))} ({combination.words})"
-        for combination in combinations_of(material, "not_isolated")
-    ]
-    if material.unexplained:
-        return f"{NOT_ESTABLISHED.capitalize()}: {listed(present + not_isolated) or NONE_EXPLAINS}"
-    if not present and not not_isolated:
-        return "No fault found"
-    count = len(present) + len(not_isolated)
-    kind = f"{count} faults" if count > 1 else "Fault" if present else "Fault not isolated"
-    return f"{kind}: {listed(present + not_isolated)}"
+    not_isolated = [combination.sized_rivals for combination in combinations_of(material, "not_isolated")]
+    words = fault_statement(present, not_isolated, not material.unexplained)
+    return words[:1].upper() + words[1:]
 
 
 def gap_words(material: Material) -> str:
@@ -97,7 +85,7 @@ def monitor_words(material: Material) -> str:
     ended = [f"{m['headline']}" for n, m in last.items() if states[n] == "recovered"]
     parts = [_latest("open alarms", still_open)] if still_open else []
     parts += [f"recovered: {_latest('alarms', ended)}"] if ended else []
-    text = sentence("; ".join(parts))
+    text = "; ".join(parts)
     return text[:1].upper() + text[1:]
 
 
@@ -181,11 +169,10 @@ def windows_words(material: Material) -> str:
 
 def how_it_ended(material: Material) -> str:
     """Status, start and duration of the run."""
-    status, run = material.about("status"), material.about("run")
-    ended = status.get("status", "no end in the log").replace("_", " ")
+    status = material.about("status")
     reason = f" ({status['reason']})" if status.get("reason") else ""
-    parts = [f"{ended}{reason}"]
-    parts += [f"started {run['started'][:19].replace('T', ' ')} UTC"] if run.get("started") else []
+    parts = [f"{material.status or 'no end in the log'}{reason}"]
+    parts += [f"started {material.started} UTC"] if material.started else []
     # The log of a blind benchmark has only the time of its writing, after all diagnoses.
     seconds = "" if material.kind == "challenge" else status.get("wall_seconds", "")
     with suppress(ValueError):

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from fdi_torch.jobs.report import plant_of
 from fdi_torch.logbook import being_written, read_run
+from fdi_torch.quantities import quantity_text
 from fdi_torch.report.material import gather
-from fdi_torch.report.numbers import amount
 from fdi_torch.report.predictions import Progress, progress_of, residual_size
 from fdi_torch.report.verdict import headline, kind_words
 
@@ -38,6 +38,11 @@ class Entry:
     state: str
     started: str
     progress: Progress
+
+    @property
+    def cells(self) -> list[str]:
+        """The entry below the headers of `SORTS`."""
+        return [self.name, self.started, self.kind, self.state, self.error_text, self.verdict]
 
     @property
     def text(self) -> str:
@@ -89,12 +94,10 @@ def _read(name: str, path: Path, running: bool) -> Entry:
         material = gather(log, plant_of(log, []))
         error, unit, sensor = residual_size(material)
         with material.in_its_units():
-            error_text = amount(error, unit, 3, sensor) if error == error else ""
-        status = material.about("status").get("status", NO_END).replace("_", " ")
-        started = material.about("run").get("started", "")[:19].replace("T", " ")
+            error_text = quantity_text(error, unit, 3, sensor) if error == error else ""
         kind, progress = kind_words(material), progress_of(material)
-        state, verdict = (RUNNING, progress.text) if running else (status, headline(material))
-        return Entry(name, path, kind, verdict, error, error_text, state, started, progress)
+        state, verdict = (RUNNING, progress.text) if running else (material.status or NO_END, headline(material))
+        return Entry(name, path, kind, verdict, error, error_text, state, material.started, progress)
     except UNSHOWN as problem:
         return _unreadable(name, path, str(problem), running)
 
@@ -105,8 +108,9 @@ def _unreadable(name: str, path: Path, problem: str, running: bool) -> Entry:
     return Entry(name, path, "", verdict, math.nan, "", state, "", Progress(verdict))
 
 
-SORTS = ("started", "log", "kind", "verdict", "error", "state")
-"""Columns that the list can be sorted by."""
+_PLAIN = {name: name for name in ("log", "started", "kind", "state", "error", "verdict")}
+SORTS = _PLAIN | {"started": "started, UTC"}
+"""Headers of the columns of the list, by which it can be sorted."""
 
 
 def selected(

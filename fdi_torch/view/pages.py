@@ -8,16 +8,15 @@ from dataclasses import dataclass
 from urllib.parse import urlencode
 
 from fdi_torch.names import counted
-from fdi_torch.report.html import Markup, clean, folded, join, table, tag, unbroken
+from fdi_torch.report.html import Markup, clean, escape, folded, join, table, tag, unbroken
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import number, sentence
+from fdi_torch.report.numbers import number
 from fdi_torch.report.page import document
 from fdi_torch.report.predictions import Progress
 from fdi_torch.view.log_list import RUNNING, SORTS, UNREADABLE, Entry
 
 SECONDS_BETWEEN_UPDATES = 2
 NEWEST = 20
-COLUMNS = {"log": "log", "started": "started, UTC", "kind": "kind", "state": "state", "verdict": "verdict"}
 STYLE = """
 form { display: flex; flex-wrap: wrap; gap: .6rem; align-items: center; margin: .6rem 0; }
 form > div { flex-basis: 100%; min-width: 0; }
@@ -77,12 +76,12 @@ def _filter(kinds: Sequence[str], query: Query) -> Markup:
 
 def _choice(entries: Sequence[Entry], query: Query) -> Markup:
     """The table of logs, with a box to tick in each row."""
-    header = ["", *(_sorting(key, name, query) for key, name in COLUMNS.items()), _sorting("error", "error", query)]
+    header = ["", *(_sorting(key, name, query) for key, name in SORTS.items())]
     rows = [_row(entry) for entry in entries]
     return tag(
         "form",
         tag("button", "Compare the ticked logs"),
-        tag("div", table(header, rows, left=1 + len(COLUMNS), most=max(len(rows), 1))),
+        tag("div", table(header, rows, left=len(header), most=max(len(rows), 1))),
         tag("p", "error: root mean square of measured − model over all sensors", class_="note"),
         action="/report",
     )
@@ -95,16 +94,16 @@ def _sorting(key: str, name: str, query: Query) -> Markup:
 
 def _row(entry: Entry) -> list[Markup | str]:
     """A log in the list; one that cannot be read has neither box nor link."""
-    box, name, state = "", entry.name, entry.state
+    box, (name, started, kind, state, error, verdict) = "", entry.cells
     if entry.state != UNREADABLE:
         box = _field(type="checkbox", name="log", value=entry.name, aria_label=f"compare {entry.name}")
         page = "/follow" if entry.state == RUNNING else "/report"
-        name = tag("a", entry.name, href=address(page, log=entry.name))
+        name = tag("a", escape(entry.name), href=address(page, log=entry.name))
     if entry.state == RUNNING:
         state = join([tag("span", RUNNING, class_="good"), " ", _bar(entry.progress)])
     elif entry.state != "completed":
         state = tag("span", entry.state, class_="bad")
-    return [box, name, entry.started, entry.kind, state, unbroken(entry.verdict), entry.error_text]
+    return [box, name, started, kind, state, error, unbroken(verdict)]
 
 
 def _bar(progress: Progress) -> Markup:
@@ -123,7 +122,7 @@ def follow_page(entry: Entry, material: Material | None) -> str:
     content.append(tag("p", tag("a", "report of what is logged so far", href=address("/report", log=entry.name))))
     if material is not None:
         messages = [*material.of("/observer/alarm"), *material.of("/log")]
-        rows = [[number(float(m.get("t", math.nan)), 6), sentence(str(m.get("message", "")))] for m in messages]
+        rows = [[number(float(m.get("t", math.nan)), 6), m.get("message", "")] for m in messages]
         if rows:
             content.append(
                 tag("section", tag("h3", "Newest events"), table(("t, s", "event"), rows[-NEWEST:][::-1], 2))

@@ -276,7 +276,7 @@ def test_units_on_the_terminal_are_written_as_in_files(tmp_path: Path, capsys: p
     assert "30 cm^3/s" in capsys.readouterr().out
     assert "30 cm³/s" in (tmp_path / "a.html").read_text()
     offset = Result("Q1.pump_offset.size", "m^3/s", (1e-6, 1.1e-6), (1e-8, 1e-8), 0.5)
-    _, (row,) = result_table(Comparison(("a", "b"), {}, (offset,), False, True))
+    (row,) = result_table(Comparison(("a", "b"), {}, (offset,), False, True)).rows
     assert row[1] == "cm^3/s"
 
 

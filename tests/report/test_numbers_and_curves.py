@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from fdi_torch.amounts import probability_words, with_error
 from fdi_torch.report.chart import corner_points, thinned
-from fdi_torch.report.html import MOST_ROWS, short, table, tag
-from fdi_torch.report.numbers import number, percent, probability_text, raised, shown_unit, with_error
+from fdi_torch.report.html import MOST_ROWS, short, table, tag, typeset
+from fdi_torch.report.numbers import number, percent, shown_unit
 
 
 @pytest.mark.parametrize(
@@ -23,16 +24,19 @@ from fdi_torch.report.numbers import number, percent, probability_text, raised, 
     ],
 )
 def test_the_error_says_how_many_digits_count(value: float, std: float, shown: str) -> None:
-    assert with_error(value, std) == shown
+    assert typeset(with_error(value, std)) == shown
 
 
 def test_units_and_odd_numbers() -> None:
     assert shown_unit("m^3/s") == ("cm³/s", pytest.approx(1e6))
     assert shown_unit("bananas") == ("bananas", 1.0)
-    assert raised("m^-2 s^10") == "m⁻² s¹⁰"
-    assert [number(v) for v in (float("nan"), float("inf"), -1.5)] == ["–", "∞", "−1.5"]
+    assert (
+        typeset("m^-2 s^10") == "m⁻² s¹⁰"
+        and typeset("2026-11-24, hA-hB, 1e-05, x^y") == "2026-11-24, hA-hB, 1e-05, x^y"
+    )
+    assert [number(v) for v in (float("nan"), float("inf"), -1.5)] == ["–", "∞", "-1.5"]
     assert percent(0.1234) == "12.3 %"
-    assert [probability_text(p) for p in (0.9979, 0.00202, 2.06e-59)] == ["99.8 %", "0.202 %", "< 0.1 %"]
+    assert [probability_words(p) for p in (0.9979, 0.00202, 2.06e-59)] == ["99.8 %", "0.2 %", "under 0.1 %"]
 
 
 def test_a_spike_and_a_hole_survive_thinning() -> None:

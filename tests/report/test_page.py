@@ -49,10 +49,10 @@ def text(reported: RunReport) -> str:
 
 
 def test_the_verdict_comes_first_in_words(log: Path, text: str) -> None:
-    assert headline(material_of(log)) == "Fault: leak at T1 (size 0.3004 ± 0.0020, 30 cm³/s)"
-    assert text.index("Fault: leak at T1") < text.index("<svg")
+    assert headline(material_of(log)) == "Single fault: leak at T1 (size 0.3004 ± 0.0020, 30 cm^3/s)"
+    assert text.index("Single fault: leak at T1") < text.index("<svg")
     assert "0.3004 ± 0.0020" in text
-    assert "leak at T1 changes the flow by 30 cm³/s, as a sharp-edged hole of 4.8 mm would" in text
+    assert "leak at T1 changes the flow by 30 cm³/s at the mean levels, as a sharp-edged hole of 4.8 mm would" in text
 
 
 def test_each_section_is_there_that_the_log_has_something_for(log: Path, reported: RunReport) -> None:
@@ -90,7 +90,7 @@ def test_a_message_that_makes_no_sense_costs_its_section_only(tmp_path: Path) ->
         log.write("/estimate/final", {"names": ["a", "b"], "values": [1.0], "std": [1.0]})
         log.write("/diagnosis/fault", {"fault": "leak", "location": "T1", "present": True, "size": "large"})
     report = report_of(material_of(tmp_path / "odd.mcap"))
-    assert headline(report.material) == "Fault: leak at T1"
+    assert headline(report.material) == "Single fault: leak at T1"
     assert "The log cannot be shown here: ValueError" in page([report])
     assert "Integrity of the log" in [s.title for s in report.sections]
 
@@ -103,8 +103,8 @@ def test_a_torn_log_is_shown_and_said_to_be_torn(log: Path, tmp_path: Path) -> N
 
 
 def test_pictures_are_written_as_png_and_svg_and_repeat(log: Path, tmp_path: Path) -> None:
-    first = write_pictures(report_of(material_of(log)), tmp_path / "a")
-    again = write_pictures(report_of(material_of(log)), tmp_path / "b")
+    first = write_pictures(report_of(material_of(log)).pictures, tmp_path / "a")
+    again = write_pictures(report_of(material_of(log)).pictures, tmp_path / "b")
     assert {p.suffix for p in first} == {".png", ".svg"}
     assert [p.read_bytes() for p in first] == [p.read_bytes() for p in again]
     assert first[0].read_bytes().startswith(b"\x89PNG")
@@ -114,7 +114,7 @@ def test_the_command_writes_the_page_beside_the_log(log: Path, capsys: pytest.Ca
     assert cli.main(["report", str(log), "--pictures", "--quiet"]) == cli.DONE
     assert log.with_suffix(".html").read_text(encoding="utf-8").startswith("<!doctype html>")
     assert (log.with_suffix("") / "rig.svg").exists()
-    assert "Fault: leak at T1" in capsys.readouterr().out
+    assert "Single fault: leak at T1" in capsys.readouterr().out
 
 
 def test_a_page_that_would_overwrite_a_log_is_refused(log: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,8 +13,9 @@ from fdi_torch.config.plant_file import load_plant
 from fdi_torch.logbook import RunLog, compare
 from fdi_torch.report.comparison import result_table
 from fdi_torch.report.page import page, report_of
-from fdi_torch.report.sections.monitor import _texts, adoptions
+from fdi_torch.report.sections.monitor import adoptions
 from fdi_torch.report.verdict import headline
+from fdi_torch.tables import Table
 
 
 def test_numbers_of_a_monitor_have_the_digits_that_their_standard_errors_justify(tmp_path: Path) -> None:
@@ -45,15 +46,16 @@ def test_an_estimate_at_an_end_of_its_range_has_a_one_sided_interval(tmp_path: P
     assert ">0.000<" in text and ">below 0.051<" in text and "0.000 ±" not in text
     assert "B.leak.size lies at the low end of its range" in text
     compared = result_table(compare([tmp_path / "a.mcap", tmp_path / "b.mcap"]))
-    assert compared[1][0][2:4] == ["below 0.051", "above 0.949"]
+    assert compared.rows[0][2:4] == ["below 0.051", "above 0.949"]
 
 
 def test_the_headline_of_a_monitor_is_set_as_the_rest_of_its_page(tmp_path: Path) -> None:
     with RunLog(tmp_path / "run.mcap", "monitor", env={}, git={}) as log:
         held = "pump offset at Q (-11.07 ± 0.87 cm^3/s), by hA-hB"
         log.alarm(764.0, "isolated", "Q.pump_offset", held, alarm=1, state="isolated", headline=held)
-    made = headline(material_of(tmp_path / "run.mcap"))
-    assert made == "Pump offset at Q (−11.07 ± 0.87 cm³/s), by hA-hB (isolated)"
+    material = material_of(tmp_path / "run.mcap")
+    assert headline(material) == "Pump offset at Q (-11.07 ± 0.87 cm^3/s), by hA-hB (isolated)"
+    assert "Pump offset at Q (−11.07 ± 0.87 cm³/s), by hA-hB" in page([report_of(material)]).replace("\u00a0", " ")
 
 
 def test_a_page_of_a_monitor_marks_when_its_model_took_a_fault_in(tmp_path: Path) -> None:
@@ -93,8 +95,9 @@ def test_runs_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> Non
 
 
 def test_words_of_a_table_are_left_aligned() -> None:
-    assert _texts([["5 %", "fixed", "20"], ["20 %", "cusum", "7"]]) == 2
-    assert _texts([["white", "24 (18 .. 40)"]]) == 1 and _texts([]) == 1
+    assert Table(("size", "detector", "runs"), [["5 %", "fixed", "20"], ["20 %", "cusum", "7"]]).left == 2
+    assert Table(("noise", "alarms"), [["white", "24 (18 .. 40)"]]).left == 1 and Table(("noise",), []).left == 1
+    assert Table(("fault", "unit", "size"), [["leak", "1", 0.3]]).left == 2, "a unit is a word, also the unit 1"
 
 
 def test_an_unfinished_study_names_its_parameters(tmp_path: Path) -> None:

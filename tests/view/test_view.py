@@ -154,7 +154,7 @@ def test_nothing_can_be_changed_and_nothing_outside_the_folder_be_read(client: C
 def test_the_list_has_every_log_with_its_verdict_and_error(client: Client) -> None:
     page = client.page("/")
     assert set(page.boxes) > {"coarse.mcap", "may/fine.mcap", "gap.mcap"} and "broken.mcap" not in page.boxes
-    assert "Fault: leak at T1" in page.words and "expected an MCAP file" in page.words
+    assert "Single fault: leak at T1" in page.words and "expected an MCAP file" in page.words
     assert "\n2 cm\n" in page.words or "\n2.00 cm\n" in page.words
 
 

@@ -1,7 +1,7 @@
 """The options of each command, one module per command, and options that several commands share.
 
-A command's module has its description (the docstring), EXAMPLES and `add_arguments(parser)`. None of them imports
-torch, so that help is shown immediately.
+A module has the description of its command (the docstring), EXAMPLES, and ARGUMENTS, for `add_argument` by their names.
+None of them imports torch, so that help is shown immediately.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from fdi_torch.logbook import Listener
 
 LIVE = "127.0.0.1:8765"
+Arguments = dict[str, dict[str, Any]]
 RECORDING = "a recording (CSV, Excel, Parquet, Feather, MATLAB, HDF5 or MCAP), or a YAML file with `recordings`"
 
 
@@ -37,30 +38,22 @@ class ShowKeys(argparse.Action):
         parser.exit()
 
 
-def add_keys(parser: argparse.ArgumentParser, what: str, *models: str) -> None:
-    """Add --keys, which prints the keys of a file. models: its models as 'module:Model'."""
+def keys(what: str, *models: str) -> Arguments:
+    """--keys, which prints the keys of a file. models: its models as 'module:Model'."""
     text = f"print every key of {what} with its default and meaning, and exit"
-    parser.add_argument("--keys", action=ShowKeys, models=models, help=text)
+    return {"--keys": {"action": ShowKeys, "models": models, "help": text}}
 
 
-def add_config(
-    parser: argparse.ArgumentParser,
-    *models: str,
-    required: bool = False,
-    kind: str = "run",
-    example: str = "estimate.search.population=40",
-) -> None:
-    """Add --config and --set. models: models of the file as 'module:Model'. kind: of the file. example: of --set."""
-    parser.add_argument("--config", metavar="FILE", required=required, help=f"{kind} file (YAML)")
-    if models:
-        add_keys(parser, "such a file", *models)
-    parser.add_argument(
-        "--set",
-        metavar="KEY=VALUE",
-        action="append",
-        default=[],
-        help=f"change one value of the file, as in --set {example}; may be repeated",
-    )
+def config(
+    *models: str, required: bool = False, kind: str = "run", example: str = "estimate.search.population=40"
+) -> Arguments:
+    """--config and --set. models: models of the file as 'module:Model'. kind: of the file. example: of --set."""
+    change = f"change one value of the file, as in --set {example}; may be repeated"
+    return {
+        "--config": {"metavar": "FILE", "required": required, "help": f"{kind} file (YAML)"},
+        **(keys("such a file", *models) if models else {}),
+        "--set": {"metavar": "KEY=VALUE", "action": "append", "default": [], "help": change},
+    }
 
 
 def seconds(text: str) -> float:
@@ -91,7 +84,7 @@ def overrides(arguments: argparse.Namespace) -> list[str]:
 
 START_SAMPLES = 50
 _NAMES = {"type": names, "default": ()}
-_SHARED: dict[str, dict[str, Any]] = {
+_SHARED: Arguments = {
     "--plant": {"metavar": "NAME|FILE", "help": "a shipped plant, or a plant file"},
     "--recording": {"metavar": "FILE", "help": RECORDING},
     "--holdout": {
@@ -147,13 +140,18 @@ _SHARED: dict[str, dict[str, Any]] = {
         "machine only; 0.0.0.0:PORT opens it to the whole network without a password; needs the extra `live`)",
     },
 }
-"""Options of several commands, as arguments of `add_argument`."""
+"""Options of several commands."""
 
 
-def add(parser: argparse.ArgumentParser, *options: str, **changes: Any) -> None:
-    """Add shared options. changes: arguments of `add_argument` in which they differ in this command."""
-    for option in options:
-        parser.add_argument(option, **_SHARED[option] | changes)
+def shared(*options: str, **changes: Any) -> Arguments:
+    """Options of several commands. changes: arguments of `add_argument` in which they differ in this command."""
+    return {option: _SHARED[option] | changes for option in options}
+
+
+def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
+    """Add the arguments of a command to a parser."""
+    for names_of, settings in import_module(f"{__name__}.{command}").ARGUMENTS.items():
+        parser.add_argument(*names_of.split(), **settings)
 
 
 def host_and_port(option: str, address: str, example: str) -> tuple[str, int]:

@@ -5,13 +5,10 @@ every recording without the key, then opens the key and scores the answers by ki
 two answers without skill. Everything is written to --out; repeating the command resumes an interrupted benchmark.
 """
 
-from __future__ import annotations
-
-import argparse
 import math
 
 from fdi_torch.blind.kind_meanings import KIND_MEANINGS
-from fdi_torch.cli.options import add, names
+from fdi_torch.cli.options import names, shared
 
 RIGS = ("cascaded_tanks", "quadruple_tank", "three_tank")
 
@@ -34,23 +31,21 @@ examples:
   fdi challenge --leave-out all --cases 24 --out logs/denied
   fdi challenge --join logs/seven logs/denied --out docs/gap     one set of tables from several folders
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--cases", metavar="N", type=int, help="number of recordings over all kinds (22)")
-    add(parser, "--seed", help="seed of causes, places, noise and inputs (0)")
-    add(parser, "--out", default="logs/challenge", help="folder (logs/challenge)")
-    parser.add_argument("--rig", choices=RIGS, help="hidden rig (three_tank)")
-    add(parser, "--plant", help="instead of --rig: a rig like this plant file, or network")
-    parser.add_argument("--tanks", metavar="N..M", help="number of tanks of random networks (3..12)")
-    parser.add_argument(
-        "--kinds",
-        metavar="KIND,...",
-        type=names,
-        default=(),
-        help="kinds of cases (default: those of the first list; of networks, the second)",
-    )
-    add(parser, "--leave-out", help="effects to remove from the library, or all, one per case")
-    parser.add_argument("--minutes", metavar="M", type=float, default=math.inf, help="start no case after this time")
-    add(parser, "--cluster")
-    parser.add_argument("--join", metavar="DIR", nargs="+", help="no diagnosis: merge the answers of these folders")
+ARGUMENTS = {
+    "--cases": {"metavar": "N", "type": int, "help": "number of recordings over all kinds (22)"},
+    **shared("--seed", help="seed of causes, places, noise and inputs (0)"),
+    **shared("--out", default="logs/challenge", help="folder (logs/challenge)"),
+    "--rig": {"choices": RIGS, "help": "hidden rig (three_tank)"},
+    **shared("--plant", help="instead of --rig: a rig like this plant file, or network"),
+    "--tanks": {"metavar": "N..M", "help": "number of tanks of random networks (3..12)"},
+    "--kinds": {
+        "metavar": "KIND,...",
+        "type": names,
+        "default": (),
+        "help": "kinds of cases (default: those of the first list; of networks, the second)",
+    },
+    **shared("--leave-out", help="effects to remove from the library, or all, one per case"),
+    "--minutes": {"metavar": "M", "type": float, "default": math.inf, "help": "start no case after this time"},
+    **shared("--cluster"),
+    "--join": {"metavar": "DIR", "nargs": "+", "help": "no diagnosis: merge the answers of these folders"},
+}

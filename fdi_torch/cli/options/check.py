@@ -4,11 +4,7 @@ Exit code 4 if the plant file still has placeholders of `fdi new plant`, or if r
 other.
 """
 
-from __future__ import annotations
-
-import argparse
-
-from fdi_torch.cli.options import add, add_config, add_keys
+from fdi_torch.cli.options import config, keys, shared
 
 STEP, SUMMARY = "describe", "examine a plant and a recording before any fit"
 QUICK = True
@@ -21,11 +17,10 @@ examples:
   fdi check --config own.yaml                      all recordings of a run file
   fdi check --keys                                 the keys of a plant file
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", nargs="?", help="a recording, as --recording FILE")
-    add(parser, "--recording", "--plant")
-    parser.add_argument("--picture", metavar="FILE", help="draw the rig (PNG or SVG)")
-    add_config(parser)
-    add_keys(parser, "a plant file", "fdi_torch.config.plant_file:PlantConfig")
+ARGUMENTS = {
+    "file": {"nargs": "?", "help": "a recording, as --recording FILE"},
+    **shared("--recording", "--plant"),
+    "--picture": {"metavar": "FILE", "help": "draw the rig (PNG or SVG)"},
+    **config(),
+    **keys("a plant file", "fdi_torch.config.plant_file:PlantConfig"),
+}

@@ -1,9 +1,5 @@
 """Print a script with which a shell completes commands, options, their choices and file names."""
 
-from __future__ import annotations
-
-import argparse
-
 SHELLS = ("bash", "zsh", "fish")
 STEP, SUMMARY = "use", "print a script with which a shell completes commands and options"
 QUICK = True
@@ -12,7 +8,4 @@ examples:
   fdi completion bash > ~/.local/share/bash-completion/completions/fdi    in each new shell from then on
   fdi completion zsh > ~/.zsh/_fdi                                        likewise, if ~/.zsh is in $fpath
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("shell", choices=SHELLS, help="the shell that reads the script")
+ARGUMENTS = {"shell": {"choices": SHELLS, "help": "the shell that reads the script"}}

@@ -4,11 +4,7 @@ The constants with a tolerance in the plant file are uncertain, as in `fdi train
 size is missed with a probability of 5 %, at a false-alarm rate of 0.1 %.
 """
 
-from __future__ import annotations
-
-import argparse
-
-from fdi_torch.cli.options import add, names, seconds
+from fdi_torch.cli.options import names, seconds, shared
 
 STEP, SUMMARY = "plan", "which faults an experiment can detect and distinguish, and from which size"
 EXAMPLES = """
@@ -17,25 +13,24 @@ examples:
   fdi diagnosability --plant rig.yaml --input run.csv --noise '2 mm'              the inputs of a recording
   fdi diagnosability --plant rig.yaml --input '20 m^3/h,50 %' --duration '1 day' --faults A.leak,link.plugging
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add(parser, "--plant", required=True)
-    parser.add_argument(
-        "--faults", metavar="NAME,...", type=names, default=(), help="such as T1.leak.size (default: the usual faults)"
-    )
-    parser.add_argument(
-        "--input",
-        "--recording",
-        metavar="FILE|AMOUNTS",
-        required=True,
-        help="a recording (or a YAML file that lists one) whose inputs are used, or constant inputs "
+ARGUMENTS = {
+    **shared("--plant", required=True),
+    "--faults": {
+        "metavar": "NAME,...",
+        "type": names,
+        "default": (),
+        "help": "such as T1.leak.size (default: the usual faults)",
+    },
+    "--input --recording": {
+        "metavar": "FILE|AMOUNTS",
+        "required": True,
+        "help": "a recording (or a YAML file that lists one) whose inputs are used, or constant inputs "
         "such as '50 cm^3/s,50 cm^3/s'",
-    )
-    parser.add_argument(
-        "--duration",
-        metavar="TIME",
-        type=seconds,
-        help="duration of constant inputs, such as '2 h' (default: 1000 s for three_tank, longer for slower plants)",
-    )
-    add(parser, "--noise")
+    },
+    "--duration": {
+        "metavar": "TIME",
+        "type": seconds,
+        "help": "duration of constant inputs, such as '2 h' (default: 1000 s for three_tank, longer for slower plants)",
+    },
+    **shared("--noise"),
+}

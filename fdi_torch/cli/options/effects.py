@@ -1,10 +1,6 @@
 """The catalogue of faults and unmodelled effects: locations, parameters, onset, and how to write them."""
 
-from __future__ import annotations
-
-import argparse
-
-from fdi_torch.cli.options import add
+from fdi_torch.cli.options import shared
 
 STEP, SUMMARY = "describe", "show the catalogue of faults and unmodelled effects"
 QUICK = True
@@ -14,8 +10,7 @@ examples:
   fdi effects --plant rig.yaml                     list those that this plant can have, with their locations
   fdi effects leak pump_lag --plant rig.yaml       show equation, parameters with units, and how to write them
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("names", nargs="*", metavar="EFFECT", help="effects to show in full")
-    add(parser, "--plant", help="plant whose locations and ranges are shown")
+ARGUMENTS = {
+    "names": {"nargs": "*", "metavar": "EFFECT", "help": "effects to show in full"},
+    **shared("--plant", help="plant whose locations and ranges are shown"),
+}

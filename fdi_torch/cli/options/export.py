@@ -4,11 +4,7 @@ The FMU is self-contained and runs on machines of the same kind as this one. Inp
 outputs its levels and readings, parameters its constants and the parameters of its effects, all in SI.
 """
 
-from __future__ import annotations
-
-import argparse
-
-from fdi_torch.cli.options import add
+from fdi_torch.cli.options import shared
 
 STEP, SUMMARY = "use", "export a plant as an FMU for other simulation tools"
 EXAMPLES = """
@@ -16,15 +12,13 @@ examples:
   fdi export --plant rig.yaml --fmu rig.fmu                         the plant with the effects in its file
   fdi export --plant three_tank --fmu rig.fmu --effect T1.leak      with a leak whose size is 0 until it is set
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add(parser, "--plant", required=True)
-    parser.add_argument("--fmu", metavar="FILE", required=True, help="FMU to write")
-    parser.add_argument(
-        "--effect",
-        metavar="PLACE.EFFECT",
-        action="append",
-        default=[],
-        help="a further effect, absent until one of its parameters is set",
-    )
+ARGUMENTS = {
+    **shared("--plant", required=True),
+    "--fmu": {"metavar": "FILE", "required": True, "help": "FMU to write"},
+    "--effect": {
+        "metavar": "PLACE.EFFECT",
+        "action": "append",
+        "default": [],
+        "help": "a further effect, absent until one of its parameters is set",
+    },
+}

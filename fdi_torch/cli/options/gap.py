@@ -9,11 +9,7 @@ repeats the diagnosis from its log. `fdi plan` lists beforehand what planned inp
 causes that were adopted together with all constants.
 """
 
-from __future__ import annotations
-
-import argparse
-
-from fdi_torch.cli.options import add
+from fdi_torch.cli.options import shared
 
 MOST_CAUSES = 4
 
@@ -28,22 +24,22 @@ examples:
   fdi gap --plant rig.yaml --recording run.csv --library pump_lag,T1.leak
   fdi gap --plant rig.yaml --recording runs.yaml --most 8              several recordings together, many causes
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add(parser, "--plant", "--recording", required=True)
-    add(parser, "--holdout", "--library", "--leave-out")
-    default = "for about 1500 steps, not below that of the samples; shorter where levels move fast"
-    add(parser, "--step", help=f"integration step (default: {default})")
-    parser.add_argument(
-        "--most", metavar="N", type=int, default=MOST_CAUSES, help=f"largest number of effects ({MOST_CAUSES})"
-    )
-    parser.add_argument("--named-only", action="store_true", help="report the best named effect instead of `unknown`")
-    add(parser, "--adopt", help="write the plant file with the causes added to its effects")
-    add(parser, "--replace")
-    parser.add_argument(
-        "--with-constants", action="store_true", help="--adopt also writes the constants fitted with the causes"
-    )
-    standard_errors = "with the constants' standard errors as tolerances where smaller"
-    add(parser, "--narrow", help=f"as --with-constants, {standard_errors}")
-    add(parser, "--out", default="logs", help="folder for log, gap.json and next_input.csv")
+_DEFAULT = "for about 1500 steps, not below that of the samples; shorter where levels move fast"
+_STANDARD_ERRORS = "with the constants' standard errors as tolerances where smaller"
+ARGUMENTS = {
+    **shared("--plant", "--recording", required=True),
+    **shared("--holdout", "--library", "--leave-out"),
+    **shared("--step", help=f"integration step (default: {_DEFAULT})"),
+    "--most": {
+        "metavar": "N",
+        "type": int,
+        "default": MOST_CAUSES,
+        "help": f"largest number of effects ({MOST_CAUSES})",
+    },
+    "--named-only": {"action": "store_true", "help": "report the best named effect instead of `unknown`"},
+    **shared("--adopt", help="write the plant file with the causes added to its effects"),
+    **shared("--replace"),
+    "--with-constants": {"action": "store_true", "help": "--adopt also writes the constants fitted with the causes"},
+    **shared("--narrow", help=f"as --with-constants, {_STANDARD_ERRORS}"),
+    **shared("--out", default="logs", help="folder for log, gap.json and next_input.csv"),
+}

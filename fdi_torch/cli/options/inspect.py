@@ -1,9 +1,5 @@
 """Show what a log contains and whether it is intact (any MCAP file), or with --topic export its messages."""
 
-from __future__ import annotations
-
-import argparse
-
 STEP, SUMMARY = "look", "show what a log contains and whether it is intact, or export its messages"
 FORMATS = ("csv", "ndjson", "npz")  # those of logbook.export
 EXAMPLES = """
@@ -13,16 +9,14 @@ examples:
   fdi inspect logs/own.mcap --layout own.json      to be imported in Foxglove or Lichtblick
   fdi inspect logs/own.mcap --attachment config.yaml
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("log", metavar="RUN.mcap", help="an MCAP file, complete or not")
-    parser.add_argument("--topic", metavar="T", help="write the messages of this topic instead")
-    parser.add_argument("--format", choices=FORMATS, default="csv", help="output format (default: csv)")
-    parser.add_argument("--attachment", metavar="NAME", help="write this attachment instead, such as config.yaml")
-    parser.add_argument(
-        "--layout", metavar="FILE.json", help="write a layout for Foxglove and Lichtblick that shows this very log"
-    )
-    parser.add_argument(
-        "--out", metavar="FILE|DIR", help="file for the messages (default: standard output), folder for an attachment"
-    )
+ARGUMENTS = {
+    "log": {"metavar": "RUN.mcap", "help": "an MCAP file, complete or not"},
+    "--topic": {"metavar": "T", "help": "write the messages of this topic instead"},
+    "--format": {"choices": FORMATS, "default": "csv", "help": "output format (default: csv)"},
+    "--attachment": {"metavar": "NAME", "help": "write this attachment instead, such as config.yaml"},
+    "--layout": {"metavar": "FILE.json", "help": "write a layout for Foxglove and Lichtblick that shows this very log"},
+    "--out": {
+        "metavar": "FILE|DIR",
+        "help": "file for the messages (default: standard output), folder for an attachment",
+    },
+}

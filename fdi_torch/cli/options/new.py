@@ -1,9 +1,5 @@
 """Write a commented minimal file: a plant, or a run, monitor, rehearsal or study of a plant."""
 
-from __future__ import annotations
-
-import argparse
-
 STEP, SUMMARY = "describe", "write a commented minimal file: a plant, run, monitor, rehearsal or study"
 QUICK = True
 EXAMPLES = """
@@ -15,14 +11,12 @@ examples:
   fdi new rehearsal --plant rig.yaml       validates a monitor by simulation: fdi rehearse --config rehearsal.yaml
   fdi new study --plant three_tank
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("kind", choices=("plant", "run", "monitor", "rehearsal", "study"), help="kind of file")
-    parser.add_argument("--plant", metavar="NAME|FILE", default="three_tank", help="its plant (three_tank)")
-    parser.add_argument(
-        "--recording",
-        metavar="FILE",
-        help="a recording: its columns make the plant; a run or monitor reads it, a monitor also a URL such as mqtt://HOST",
-    )
-    parser.add_argument("--out", metavar="FILE", help="the new file (KIND.yaml); existing files are never replaced")
+ARGUMENTS = {
+    "kind": {"choices": ("plant", "run", "monitor", "rehearsal", "study"), "help": "kind of file"},
+    "--plant": {"metavar": "NAME|FILE", "default": "three_tank", "help": "its plant (three_tank)"},
+    "--recording": {
+        "metavar": "FILE",
+        "help": "a recording: its columns make the plant; a run or monitor reads it, a monitor also a URL such as mqtt://HOST",
+    },
+    "--out": {"metavar": "FILE", "help": "the new file (KIND.yaml); existing files are never replaced"},
+}

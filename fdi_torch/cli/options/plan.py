@@ -4,11 +4,7 @@ The recording needs times and inputs only; readings in it are ignored. `fdi gap`
 distinguishes its two likeliest explanations (next_input.csv).
 """
 
-from __future__ import annotations
-
-import argparse
-
-from fdi_torch.cli.options import add
+from fdi_torch.cli.options import shared
 
 STEP, SUMMARY = "plan", "list what planned inputs cannot show, before an experiment"
 EXAMPLES = """
@@ -16,8 +12,4 @@ examples:
   fdi plan --plant rig.yaml --recording planned.csv
   fdi plan --plant rig.yaml --recording planned.csv --noise '0.5 mm' --library leak,plugging
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add(parser, "--plant", "--recording", required=True)
-    add(parser, "--library", "--noise")
+ARGUMENTS = {**shared("--plant", "--recording", required=True), **shared("--library", "--noise")}

@@ -4,11 +4,7 @@ The error of the whole run is printed in each sensor's unit; with --settle, the 
 an input becomes unknown, and a new one starts where it is known again.
 """
 
-from __future__ import annotations
-
-import argparse
-
-from fdi_torch.cli.options import RECORDING, add, seconds
+from fdi_torch.cli.options import RECORDING, seconds, shared
 
 STEP, SUMMARY = "diagnose", "run a plant freely along a recording and report the error"
 EXAMPLES = """
@@ -21,24 +17,20 @@ examples:
   fdi predict --plant rig.yaml --recording run.csv --settle 60 --vary 'q?.gain'    and the pumps' gains of this run
   fdi predict --plant rig.yaml --recording run.csv --constant q1_cmd=0    an input that was not recorded
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("recordings", metavar="recording", nargs="*", help="recordings, as --recording FILE")
-    add(parser, "--recording", action="append", default=[], help=f"{RECORDING}; may be repeated")
-    add(parser, "--plant", required=True)
-    add(parser, "--start-samples", "--settle")
-    add(parser, "--vary", help="constants with a tolerance that are estimated there too (* matches any name)")
-    parser.add_argument("--from", metavar="TIME", dest="start", type=seconds, help="first time used of each file")
-    parser.add_argument("--to", metavar="TIME", dest="stop", type=seconds, help="last time used: 300, or '2 h'")
-    parser.add_argument("--picture", metavar="FILE", help="draw the run (PNG or SVG); of several, the last")
-    parser.add_argument(
-        "--beside", metavar="PLANT", help="another plant in the same table and picture, such as the previous one"
-    )
-    parser.add_argument(
-        "--constant",
-        metavar="INPUT=VALUE",
-        action="append",
-        default=[],
-        help="an input that was not recorded, SI or with its unit",
-    )
+ARGUMENTS = {
+    "recordings": {"metavar": "recording", "nargs": "*", "help": "recordings, as --recording FILE"},
+    **shared("--recording", action="append", default=[], help=f"{RECORDING}; may be repeated"),
+    **shared("--plant", required=True),
+    **shared("--start-samples", "--settle"),
+    **shared("--vary", help="constants with a tolerance that are estimated there too (* matches any name)"),
+    "--from": {"metavar": "TIME", "dest": "start", "type": seconds, "help": "first time used of each file"},
+    "--to": {"metavar": "TIME", "dest": "stop", "type": seconds, "help": "last time used: 300, or '2 h'"},
+    "--picture": {"metavar": "FILE", "help": "draw the run (PNG or SVG); of several, the last"},
+    "--beside": {"metavar": "PLANT", "help": "another plant in the same table and picture, such as the previous one"},
+    "--constant": {
+        "metavar": "INPUT=VALUE",
+        "action": "append",
+        "default": [],
+        "help": "an input that was not recorded, SI or with its unit",
+    },
+}

@@ -5,11 +5,7 @@ tolerance and every number of an effect is fitted; values under `varying` belong
 sensor is reported, with each value and its standard error.
 """
 
-from __future__ import annotations
-
-import argparse
-
-from fdi_torch.cli.options import add, names
+from fdi_torch.cli.options import names, shared
 
 STEP, SUMMARY = "diagnose", "fit all effects and constants of a plant file together, without a search"
 LONG = True
@@ -20,26 +16,23 @@ examples:
   fdi refit --plant rig.yaml --recording run.csv --hold 'h?.offset,*.sensor_lag.*'
   fdi refit --plant rig.yaml --recording runs.yaml --leave-one-file-out --settle 30   predict each file without it
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add(parser, "--plant", "--recording", required=True)
-    add(parser, "--holdout", help="other recordings of the same rig, whose error before and after the fit is shown")
-    add(parser, "--leave-out")
-    add(parser, "--step", help="integration step (default: half the sampling interval)")
-    parser.add_argument(
-        "--hold", metavar="NAME,...", type=names, default=(), help="do not fit these (* matches any name)"
-    )
-    add(parser, "--vary", help="values that may differ by recording; their variation is reported (* matches any name)")
-    parser.add_argument(
-        "--white", metavar="STD", help="treat errors as white, with this standard deviation of a level, such as '3 mm'"
-    )
-    parser.add_argument(
-        "--leave-one-file-out",
-        action="store_true",
-        help="also predict every file (every --holdout, if any) freely by a fit to all others",
-    )
-    add(parser, "--start-samples", "--settle")
-    add(parser, "--adopt", help="write the plant file with the fitted values")
-    add(parser, "--replace")
-    add(parser, "--narrow", help="there, use the standard errors of the fit as tolerances where smaller")
+ARGUMENTS = {
+    **shared("--plant", "--recording", required=True),
+    **shared("--holdout", help="other recordings of the same rig, whose error before and after the fit is shown"),
+    **shared("--leave-out"),
+    **shared("--step", help="integration step (default: half the sampling interval)"),
+    "--hold": {"metavar": "NAME,...", "type": names, "default": (), "help": "do not fit these (* matches any name)"},
+    **shared("--vary", help="values that may differ by recording; their variation is reported (* matches any name)"),
+    "--white": {
+        "metavar": "STD",
+        "help": "treat errors as white, with this standard deviation of a level, such as '3 mm'",
+    },
+    "--leave-one-file-out": {
+        "action": "store_true",
+        "help": "also predict every file (every --holdout, if any) freely by a fit to all others",
+    },
+    **shared("--start-samples", "--settle"),
+    **shared("--adopt", help="write the plant file with the fitted values"),
+    **shared("--replace"),
+    **shared("--narrow", help="there, use the standard errors of the fit as tolerances where smaller"),
+}

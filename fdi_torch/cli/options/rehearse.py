@@ -3,11 +3,7 @@
 The work consists of tasks of seconds to minutes; Ctrl-C keeps those that are done, and --resume continues.
 """
 
-from __future__ import annotations
-
-import argparse
-
-from fdi_torch.cli.options import add, add_config
+from fdi_torch.cli.options import config, shared
 
 STEP, SUMMARY = "monitor", "validate a monitor on simulated runs: false alarms, delays, isolation"
 EXAMPLES = """
@@ -15,10 +11,7 @@ examples:
   fdi rehearse --config rehearsal.yaml             fdi new rehearsal --plant rig.yaml writes such a file
   fdi rehearse --config rehearsal.yaml --resume    continue a stopped run
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(
-        parser, "fdi_torch.config.rehearsal_file:RehearsalConfig", required=True, kind="rehearsal", example="seed=2"
-    )
-    add(parser, "--out", "--resume", "--live")
+ARGUMENTS = {
+    **config("fdi_torch.config.rehearsal_file:RehearsalConfig", required=True, kind="rehearsal", example="seed=2"),
+    **shared("--out", "--resume", "--live"),
+}

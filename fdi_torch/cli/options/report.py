@@ -3,19 +3,14 @@
 The page needs no network and no scripts. It is written next to the (first) log, or where --out says.
 """
 
-from __future__ import annotations
-
-import argparse
-
 STEP, SUMMARY = "look", "make one HTML page of one or more logs"
 EXAMPLES = """
 examples:
   fdi report logs/own.mcap                         writes logs/own.html
   fdi report logs/before.mcap logs/after.mcap --out both.html --pictures
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("logs", nargs="+", metavar="RUN.mcap", help="logs, which may be unfinished or damaged")
-    parser.add_argument("--out", metavar="FILE|DIR", help="the page, or the folder for it")
-    parser.add_argument("--pictures", action="store_true", help="also write every picture as PNG and SVG")
+ARGUMENTS = {
+    "logs": {"nargs": "+", "metavar": "RUN.mcap", "help": "logs, which may be unfinished or damaged"},
+    "--out": {"metavar": "FILE|DIR", "help": "the page, or the folder for it"},
+    "--pictures": {"action": "store_true", "help": "also write every picture as PNG and SVG"},
+}

@@ -3,11 +3,7 @@
 The trials run in this process or, with --cluster, on a Dask cluster, with the same numbers.
 """
 
-from __future__ import annotations
-
-import argparse
-
-from fdi_torch.cli.options import add, add_config
+from fdi_torch.cli.options import config, shared
 
 STEP, SUMMARY = "validate", "repeat an experiment many times: errors against their bounds, coverage, failures"
 LONG = True
@@ -17,8 +13,7 @@ examples:
   fdi study --config study.yaml --resume           continue a stopped run
   fdi study --config study.yaml --cluster local    on all cores, with Dask
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, "fdi_torch.config.study_file:StudyFile", required=True, kind="study", example="study.trials=100")
-    add(parser, "--out", "--seed", "--device", "--live", "--resume", "--cluster")
+ARGUMENTS = {
+    **config("fdi_torch.config.study_file:StudyFile", required=True, kind="study", example="study.trials=100"),
+    **shared("--out", "--seed", "--device", "--live", "--resume", "--cluster"),
+}

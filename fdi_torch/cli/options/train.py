@@ -4,11 +4,7 @@ Without --config it runs the built-in example: three tanks with four faults (Tab
 simulated and diagnosed.
 """
 
-from __future__ import annotations
-
-import argparse
-
-from fdi_torch.cli.options import add, add_config
+from fdi_torch.cli.options import config, shared
 
 STEP, SUMMARY = "diagnose", "estimate the sizes of faults in a recording"
 LONG = True
@@ -19,8 +15,7 @@ examples:
   fdi train --config own.yaml --set estimate.search.population=40 --seed 3
   fdi train --config own.yaml --resume             continue a stopped run
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_config(parser, "fdi_torch.config.run_file:RunConfig")
-    add(parser, "--out", "--seed", "--device", "--live", "--resume")
+ARGUMENTS = {
+    **config("fdi_torch.config.run_file:RunConfig"),
+    **shared("--out", "--seed", "--device", "--live", "--resume"),
+}

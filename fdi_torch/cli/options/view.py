@@ -3,10 +3,6 @@
 The pages need no scripts and no network; only this machine can reach them. Ctrl-C ends the command.
 """
 
-from __future__ import annotations
-
-import argparse
-
 STEP, SUMMARY = "look", "show the logs of a folder as local pages: list, compare, follow running jobs"
 QUICK = True
 EXAMPLES = """
@@ -15,22 +11,19 @@ examples:
   fdi view /data/runs --port 8080 --open
   fdi view --list "2026-11-24 leak"                the logs of that day about a leak, on the terminal
 """
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "folder",
-        metavar="FOLDER",
-        nargs="?",
-        default="logs",
-        help="folder of logs, with its subfolders (default: logs)",
-    )
-    parser.add_argument(
-        "--list",
-        metavar="WORDS",
-        nargs="?",
-        const="",
-        help="only print the logs, latest first; WORDS: those with them in name, kind, start, verdict or state",
-    )
-    parser.add_argument("--port", metavar="N", type=int, default=0, help="port of the pages (default: any free one)")
-    parser.add_argument("--open", action="store_true", help="open the list in the browser")
+ARGUMENTS = {
+    "folder": {
+        "metavar": "FOLDER",
+        "nargs": "?",
+        "default": "logs",
+        "help": "folder of logs, with its subfolders (default: logs)",
+    },
+    "--list": {
+        "metavar": "WORDS",
+        "nargs": "?",
+        "const": "",
+        "help": "only print the logs, latest first; WORDS: those with them in name, kind, start, verdict or state",
+    },
+    "--port": {"metavar": "N", "type": int, "default": 0, "help": "port of the pages (default: any free one)"},
+    "--open": {"action": "store_true", "help": "open the list in the browser"},
+}

@@ -21,7 +21,6 @@ from fdi_torch.monitor.monte_carlo.isolation_plan import confusions, isolate_run
 from fdi_torch.monitor.monte_carlo.simulated_runs import (
     FaultSchedule,
     Numbers,
-    ResultTable,
     SimulatedRig,
     Task,
     fault_free_schedule,
@@ -33,6 +32,7 @@ from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.quantities import significant
+from fdi_torch.tables import Table
 
 
 def detectors(every: float, sampling: float, channels: int, learnt: Whitening | None = None) -> list[Detector]:
@@ -135,7 +135,7 @@ class DetectionPlan:
         onset = torch.full((count,), self.onset, dtype=theta.dtype)
         return FaultSchedule(theta, onset, torch.zeros_like(onset)), [space.names[c] for c in which]
 
-    def result_table(self, numbers: Mapping[str, Sequence[Mapping[str, Any]]]) -> ResultTable:
+    def result_table(self, numbers: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:
         rows, totals = [], [0, 0, 0, 0]
         for size in self.sizes:
             results = numbers.get(f"{NAME}/{size:g}", ())
@@ -162,7 +162,7 @@ class DetectionPlan:
                 )
         header = ("size", "detector", "runs", "delay, s (5 … 95 %)", "missed", "early", "named right", "mostly wrong")
         summary = f"{totals[0]} of {totals[1]} faults missed, {totals[2]} of {totals[3]} named right"
-        return ResultTable("faults found", header, tuple(rows), summary if rows else "")
+        return Table(header, rows, "faults found", summary=summary if rows else "")
 
 
 def _short(names: str) -> str:
@@ -216,7 +216,7 @@ class FalseAlarmPlan:
             counts[f"{detector.chart} interval"] = interval
         return {**counts, "expected": seconds / self.every}
 
-    def result_table(self, numbers: Mapping[str, Sequence[Mapping[str, Any]]]) -> ResultTable:
+    def result_table(self, numbers: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:
         """Achieved and designed mean times, for all calibrations together and their range."""
         rows, agreeing, total = [], 0, 0
         for kind in self.rigs:
@@ -234,9 +234,7 @@ class FalseAlarmPlan:
         what = ("noise", "detector", "calibrations", "alarms (asked)")
         header = (*what, "time between, s", "95 %", "single calibrations, s", "within own 95 %")
         summary = f"{agreeing} of {total} calibrations alarm falsely as often as they predict" if total else ""
-        return ResultTable(
-            f"false alarms; configured: one in {significant(self.every, 3)} s", header, tuple(rows), summary
-        )
+        return Table(header, rows, f"false alarms; configured: one in {significant(self.every, 3)} s", summary=summary)
 
 
 def mean_time(counts: Sequence[int], every: float, expected: float) -> tuple[float, float, float]:

@@ -22,7 +22,6 @@ from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monte_carlo.simulated_runs import (
     FaultSchedule,
     Numbers,
-    ResultTable,
     SimulatedRig,
     Task,
     fault_free_schedule,
@@ -35,6 +34,7 @@ from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.state_update import advance_observer
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.scales import time_scale
+from fdi_torch.tables import Table
 
 RUNS_PER_TASK = 10
 NAME = "naming"
@@ -128,7 +128,7 @@ class IsolationPlan:
         up = p.high - p.nominal >= p.nominal - p.low
         return p.nominal + (1.0 if up else -1.0) * self.times * smallest
 
-    def result_table(self, numbers: Mapping[str, Sequence[Mapping[str, Any]]]) -> ResultTable:
+    def result_table(self, numbers: Mapping[str, Sequence[Mapping[str, Any]]]) -> Table:
         results = numbers.get(f"{NAME}/{self.loop}", ())
         truth, named_faults = [t for n in results for t in n["fault"]], [s for n in results for s in n["named"]]
         right = sum(t.partition(" ")[0] == s for t, s in zip(truth, named_faults, strict=True))
@@ -145,7 +145,7 @@ class IsolationPlan:
         header = ("loop", "runs", "named right", "missed", "false alarms", "delay, s (50, 95 %)", "wrong")
         title = f"faults of {self.times:g} times the smallest isolable size"
         title += f", drawn from {results[0]['ways']:.0f}" if results else ""
-        return ResultTable(title, header, tuple(rows) if results else (), summary)
+        return Table(header, rows if results else (), title, summary=summary)
 
 
 TRIAL_SIZE = 0.01  # fault size for signatures, as a share of the parameter's range

@@ -217,16 +217,6 @@ class Task:
     compute: Callable[[], Numbers]
 
 
-@dataclass(frozen=True)
-class ResultTable:
-    """A table of texts. summary: its main result in one sentence, for a headline."""
-
-    title: str
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    summary: str = ""
-
-
 def seeded_generator(*numbers: int) -> torch.Generator:
     """A random generator that is determined by the numbers."""
     seed = 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,8 @@ from matplotlib.patches import Rectangle
 from fdi_torch.blind.kind_meanings import KIND_MEANINGS
 from fdi_torch.blind.places import EFFECTS, OUTLET, PAIR, PIPE, PUMP, SENSOR, TANK
 from fdi_torch.blind.score import Row
-from fdi_torch.blind.scored_rows import OWN, Scores, Sheet, group_of, misses, sheets, tables
-from fdi_torch.report.html import Markup, folded, short, table, tag
+from fdi_torch.blind.scored_rows import OWN, Scores, group_of, misses, sheets, tables
+from fdi_torch.report.html import Markup, folded, short, shown, table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.sections.study import TRIAL, group_panel
@@ -50,8 +51,8 @@ def scores_section(material: Material) -> Section | None:
         own = [row for row in rows if row["by"] == OWN and group_of(row) == group]
         first, *more = sheets(by)
         blocks += [tag("h4", f"{group}, {len(own)} cases"), _pictures(by, own, f"challenge_{k + 1}")]
-        further = [part for sheet in more for part in (tag("h4", sheet.title), _shown(sheet))]
-        blocks += [_shown(first), folded("Further scores, baselines, and effect by effect", *further)]
+        first = replace(first, title="")  # that of the section
+        blocks += [shown(first), folded("Further scores, baselines, and effect by effect", *map(shown, more))]
     return Section("Right answers", blocks)
 
 
@@ -98,7 +99,7 @@ def confusion_section(material: Material) -> Section | None:
 def misses_section(material: Material) -> Section | None:
     """Every wrong answer."""
     sheet = misses(benchmark_rows(material))
-    return Section(sheet.title, [_shown(sheet)]) if sheet.rows else None
+    return Section(sheet.title, [shown(replace(sheet, title=""))]) if sheet.rows else None
 
 
 def _row(message: Payload) -> Row:
@@ -135,10 +136,6 @@ def _confusion(name: str, title: str, pairs: Sequence[tuple[str, str]], columns:
 
 def _words(names: Iterable[str]) -> list[str]:
     return [name.replace("_", " ") for name in names]
-
-
-def _shown(sheet: Sheet) -> Markup:
-    return table([name.replace("`", "") for name in sheet.header], sheet.rows, left=sheet.left)
 
 
 def shares_panel(

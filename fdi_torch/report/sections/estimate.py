@@ -5,19 +5,20 @@ uncertainty.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from fdi_torch.amounts import end_words
-from fdi_torch.estimate.misfit import NOT_ESTABLISHED
+from fdi_torch.estimate.misfit import NOT_ESTABLISHED, flow_words
 from fdi_torch.names import counted
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
-from fdi_torch.report.html import bullets, table, tag
+from fdi_torch.report.html import bullets, shown, table, tag
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import HEADER, amount, correlation_table, estimate_cells, number, shown_unit, signed
+from fdi_torch.report.numbers import correlation_table, estimate_table, number, shown_unit, signed
 from fdi_torch.report.section import Picture, Section, channel_signals, signals
 from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT, ellipse_panel
 
@@ -30,16 +31,14 @@ def estimate_section(material: Material) -> Section | None:
     if final is None:
         return None
     names, units = [str(name) for name in final["names"]], final.get("units") or [""] * len(final["names"])
-    rows = []
-    for name, unit, value, std in zip(names, units, final["values"], final["std"], strict=True):
-        cells = estimate_cells(name, str(unit), float(value), float(std), material.run.at_bounds.get(name, ""))
-        rows.append([name, _finding(material, name), *cells, _simulated(material, str(unit), (name,), (1.0,))])
-    for c in combinations_of(material, "combinations"):
-        deviates = c in combinations_of(material, "not_isolated") and not material.unexplained
-        found = tag("span", "present", class_="bad") if deviates else ""
-        cells = estimate_cells(c.parameters[0], c.unit, c.value, c.std)
-        rows.append([c.formula, found, *cells, _simulated(material, c.unit, c.parameters, c.coefficients)])
-    header = ("parameter", "finding", *HEADER, "simulated")  # without the columns that are empty
+    combinations, truth = combinations_of(material, "combinations"), {"simulated": material.truth}
+    numbers = (names, units, final["values"], final["std"])
+    estimates = estimate_table("", *numbers, ends=material.run.at_bounds, combinations=combinations, exact=truth)
+    deviating = () if material.unexplained else combinations_of(material, "not_isolated")
+    findings = [_finding(material, name) for name in names]
+    findings += [tag("span", "present", class_="bad") if c in deviating else "" for c in combinations]
+    rows = [[name, finding, *row] for finding, (name, *row) in zip(findings, estimates.rows, strict=True)]
+    header = ("parameter", "finding", *estimates.header[1:])
     notes = [str(note) for note in final.get("unidentifiable") or ()]
     notes += [end_words(str(name), material.run.at_bounds.get(str(name), "")) for name in final.get("at_bound") or ()]
     return Section("Estimate", [table(header, rows, left=3), *_water(material), *bullets(notes)], lead=True)
@@ -61,7 +60,7 @@ def posterior_section(material: Material) -> Section | None:
     pictures = [_ellipse(material, final, covariance, pair, k) for k, pair in enumerate(ranked)]
     words = "Regions with 50 % and 95 % of the probability, most correlated pairs first."
     words += " The green cross marks the simulated values." if material.truth else ""
-    grid = table(*correlation_table(names, covariance))
+    grid = shown(replace(correlation_table(names, covariance), title=""))
     return Section("Uncertainty", [words, pictures, grid]) if pictures else None
 
 
@@ -75,12 +74,6 @@ def covariance_of(final: Payload) -> np.ndarray | None:
     """Covariance (P, P); None if the message has none of that size."""
     flat, count = np.asarray(final.get("covariance", ()), dtype=float), len(final["names"])
     return flat.reshape(count, count) if flat.size == count * count else None
-
-
-def _simulated(material: Material, unit: str, names: Sequence[str], coefficients: Sequence[float]) -> str:
-    """The simulated value of a combination; empty if one of its parameters has none."""
-    value = sum(c * material.truth.get(name, np.nan) for c, name in zip(coefficients, names, strict=True))
-    return number(shown_unit(unit, names[0])[1] * value) if np.isfinite(value) else ""
 
 
 def _finding(material: Material, name: str) -> Any:
@@ -98,15 +91,8 @@ def _finding(material: Material, name: str) -> Any:
 
 def _water(material: Material) -> list[Any]:
     """Sizes as flows and equivalent holes, if the log has them."""
-    lines = []
-    for finding in diagnosed_effects(material):
-        if finding.present and np.isfinite(finding.flow):
-            change = "would change" if material.unexplained else "changes"
-            text = f"{finding.words} {change} the flow by {amount(finding.flow, 'm^3/s', 3)}"
-            if np.isfinite(finding.hole):
-                text += f", as a sharp-edged hole of {number(1e3 * finding.hole, 3)} mm would"
-            lines.append(text)
-    return bullets(lines)
+    moving = [f for f in diagnosed_effects(material) if f.present and np.isfinite(f.flow)]
+    return bullets(f"{f.words} {flow_words(f.flow, f.hole, not material.unexplained)}" for f in moving)
 
 
 def _ellipse(material: Material, final: Payload, covariance: np.ndarray, pair: tuple[int, int], k: int) -> Picture:

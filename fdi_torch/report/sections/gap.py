@@ -5,31 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from fdi_torch.amounts import kind_words
-from fdi_torch.clock import clock_unit
+from fdi_torch.amounts import probability_words
 from fdi_torch.gap.verdict_words import (
     FORMAT_1,
-    MEAN_FLOW,
     apart_from_rounding,
     causes_of,
     explanation_words,
     rounding_words,
 )
-from fdi_torch.report.diagnosed_effects import flows_that_matter, has_causes
-from fdi_torch.report.html import bullets, table
+from fdi_torch.report.gap_tables import cause_table, flow_table, has_causes
+from fdi_torch.report.html import bullets, shown, table
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import (
-    as_float,
-    number,
-    percent,
-    probability_text,
-    sentence,
-    shown_unit,
-    with_error,
-)
+from fdi_torch.report.numbers import as_float, number, percent
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.style import BAR_NAME, bar_panel
 
@@ -51,7 +40,7 @@ def where_section(material: Material) -> Section | None:
     for _, place in ranked:
         p = place.get("p_value")
         chance = f"  (p {number(float(p), 2)})" if isinstance(p, int | float) else ""
-        texts.append(probability_text(float(place["share"])) + chance)
+        texts.append(probability_words(float(place["share"])) + chance)
     likeliest = [cause for item in material.answer.get("posterior", [])[:1] for cause in causes_of(item)]
     guilty = {str(c["location"]) for c in apart_from_rounding([*material.answer.get("causes", []), *likeliest])}
     names = [name for name, _ in ranked]
@@ -67,11 +56,9 @@ def causes_section(material: Material) -> Section | None:
     answer = material.answer
     if not answer:
         return None
-    header = ("effect", "at", "parameter", "value", "unit")
-    causes = answer.get("causes", [])
-    rows = [row for cause in apart_from_rounding(causes) for row in _cause_rows(cause)]
-    blocks: list[Any] = [table(header, rows, left=3)] if rows else []
-    blocks += [words] if (words := rounding_words(causes)) else []
+    causes = cause_table(answer)
+    blocks: list[Any] = [table(causes.header, causes.cells(), causes.left)] if len(causes) else []
+    blocks += [words] if (words := rounding_words(answer.get("causes") or [])) else []
     certain = apart_from_rounding(answer.get("certain") or [])
     if certain and answer.get("verdict") != "named":
         blocks.append(f"With 95 % probability, whichever explanation is true: {explanation_words(certain)}.")
@@ -80,26 +67,15 @@ def causes_section(material: Material) -> Section | None:
     if len(plausible) > 1 and (not bars or max(map(len, plausible)) > BAR_NAME):
         blocks += ["Explanations with 95 % of the probability together:", *bullets(plausible)]
     blocks += bars
-    blocks += bullets(sentence(str(remark)) for remark in answer.get("remarks") or ())
+    blocks += bullets(answer.get("remarks") or ())
     return Section("What causes it", blocks, lead=True) if blocks else None
 
 
 def disturbances_section(material: Material) -> Section | None:
     """Random flows into the tanks that matter, estimated together with the likeliest explanation."""
-    rows = []
-    for tank, flow in flows_that_matter(material.answer, material.plant).items():
-        unit, scale = shown_unit(str(flow.get("unit", "")))
-        time = as_float(flow.get("correlation_time"))
-        std = number(scale * as_float(flow.get("std")), 3)
-        rows.append([tank, std, unit, f"{number(time, 3)} s" if time else "none"])
-    if not rows:
-        return None
-    words = (
-        "Random disturbance flows into each tank, estimated together with the likeliest explanation: waves, pulsation, "
-        "splashing. They are no fault."
-    )
-    header = ("into", "standard deviation", "unit", "correlation time")
-    return Section("Random flows", [words, table(header, rows)])
+    flows = flow_table(material.answer, material.plant)
+    words = "They are estimated together with the likeliest explanation: waves, pulsation, splashing."
+    return Section("Random flows", [shown(flows), words]) if len(flows) else None
 
 
 def _content(answer: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
@@ -127,7 +103,7 @@ def posterior_bars(answer: Mapping[str, Any]) -> list[list[Picture]]:
     if not names:
         return []
     percents = [100.0 * chance for chance in chances]
-    texts = [probability_text(0.01 * percent) for percent in percents]
+    texts = [probability_words(0.01 * percent) for percent in percents]
     figure = _bars("probability, %", names, percents, texts, within)
     caption = f"All contain {explanation_words(shared)}. " if shared else ""
     return [
@@ -147,18 +123,3 @@ def _bars(label: str, *bars: Any) -> Figure:
     axes = figure.axes[0]
     axes.set_xticks([tick for tick in axes.get_xticks() if 0.0 <= tick <= 100.0])
     return figure
-
-
-def _cause_rows(cause: Mapping[str, Any]) -> list[list[str]]:
-    location = str(cause["location"])
-    effect, rows = kind_words(str(cause["effect"]), location), []
-    for name, amount in (cause.get("parameters") or {}).items():
-        full = f"{location}.{cause['effect']}.{name}"
-        unit, scale = shown_unit(str(amount.get("unit", "")), full)
-        value, std = scale * as_float(amount.get("value")), scale * as_float(amount.get("std"))
-        rows.append([effect, location, str(name).replace("_", " "), with_error(value, std)])
-        rows[-1].append(clock_unit(unit, name, value))
-    if np.isfinite(flow := as_float(cause.get("flow"))):
-        unit, scale = shown_unit("m^3/s")
-        rows.append([effect, location, MEAN_FLOW, number(scale * flow, 3), unit])
-    return rows or [[effect, location, "", "", ""]]

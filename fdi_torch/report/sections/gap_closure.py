@@ -6,7 +6,6 @@ next experiment.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -14,20 +13,27 @@ from matplotlib.figure import Figure
 
 from fdi_torch.gap.verdict_words import closed_sentence, explanation_words
 from fdi_torch.report.chart import PLANNED, Line
-from fdi_torch.report.diagnosed_effects import has_causes, reference_models
-from fdi_torch.report.html import bullets, folded, short, table
+from fdi_torch.report.gap_tables import (
+    absorbed_sentence,
+    constant_table,
+    error_tables,
+    has_causes,
+    hidden_effects,
+    inseparable_pairs,
+    reference_models,
+    reliability_sentences,
+)
+from fdi_torch.report.html import bullets, folded, short, shown
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import as_float, as_vector, axis, number, percent, shown_unit, with_error
+from fdi_torch.report.numbers import as_float, as_vector, axis, number, shown_unit
 from fdi_torch.report.section import Picture, Section, channel_signals
 from fdi_torch.report.style import MARK, MODEL, SOFT, bar_panel, label_lines, panel
-
-FROZEN = {"recalibrated": "constants recalibrated without them", "nominal": "nominal constants"}
 
 
 def closure_section(material: Material) -> Section | None:
     """Errors on data that no fit has seen, if there are causes that could close a gap."""
     closure = material.answer.get("closure") or {}
-    stages = _stages(material)
+    stages = reference_models(material.answer)
     if not stages or not has_causes(material.answer):
         return None
     unit = str(closure.get("unit", ""))
@@ -41,74 +47,16 @@ def closure_section(material: Material) -> Section | None:
 
 def errors_section(material: Material) -> Section | None:
     """The errors behind the closure: by model and sensor, and by hold-out."""
-    closure = material.answer.get("closure") or {}
-    stages = _stages(material)
-    if not stages:
-        return None
-    unit = str(closure.get("unit", ""))
-    named = stages.get("augmented")
-    frozen = (closure.get("frozen") or {}) if named else {}
-    extra = [(f"{named}, {other}", as_float(frozen.get(key))) for key, other in FROZEN.items() if key in frozen]
-    units, sensors = closure.get("units") or {}, {str(s): e for s, e in (closure.get("per_sensor") or {}).items()}
-    several = len(set(units.values())) > 1
-    header = [f"plant{', error in ' + unit if unit else ''}", "all"]
-    header += [f"{s}, {units[s]}" if several and s in units else s for s in sensors]
-    rows = [
-        [name, *(number(e, 3) for e in (float(closure[m]), *(as_float(errors.get(m)) for errors in sensors.values())))]
-        for m, name in stages.items()
-    ]
-    rows += [[name, number(value, 3), *[""] * (len(header) - 2)] for name, value in extra]
-    blocks: list[Any] = [table(header, rows)]
-    blocks += _each_holdout(closure, unit, stages)
-    if extra and "ceiling" in closure:
-        blocks.append(
-            "Free functions of the component's own variables, added to the causes, show the best that better "
-            "equations could reach. If the errors with other constants are far larger, recalibration without the "
-            "causes had absorbed part of the gap; using both would count that part twice."
-        )
-    return Section("Errors on data not used for fitting", blocks)
-
-
-def _stages(material: Material) -> dict[str, str]:
-    """Names of the models that have an error, by their key in the closure."""
-    closure = material.answer.get("closure") or {}
-    models = reference_models(material.answer).items()
-    return {key: name for key, name in models if isinstance(closure.get(key), int | float)}
+    blocks = [*map(shown, error_tables(material.answer))]
+    sentence = absorbed_sentence(material.answer)
+    return Section("Errors on data not used for fitting", [*blocks, *filter(None, [sentence])]) if blocks else None
 
 
 def constants_section(material: Material) -> Section | None:
     """Nominal value of each calibration constant, and its values without and with the causes, if there are any."""
-    constants = material.answer.get("constants") or {}
-    causes = has_causes(material.answer)
-    rows = []
-    for name, c in constants.items():
-        unit, scale = shown_unit(str(c.get("unit", "1")), str(name))
-        values = {key: scale * as_float(c.get(key)) for key in ("nominal", "tolerance", "recalibrated", "augmented")}
-        off = [(values[m] - values["nominal"]) / values["tolerance"] for m in ("recalibrated", "augmented")]
-        fitted = with_error(values["augmented"], scale * as_float(c.get("std")))
-        nominal = with_error(values["nominal"], values["tolerance"])
-        without = [number(values["recalibrated"]), number(off[0], 2)] if causes else ["", ""]
-        rows.append([str(name), nominal, *without, fitted, number(off[1], 2), unit])
-    if not rows:
-        return None
-    last = "with the causes" if causes else "fitted"
-    header = ["constant", "nominal", "recalibrated", "tolerances off", last, "tolerances off", "unit"]
+    constants = constant_table(material.answer)
     words = "Constants with a tolerance are always refitted; a value far outside it compensates for a model error."
-    return Section("Calibration constants", [words, table(header, rows)])
-
-
-def _each_holdout(closure: Mapping[str, Any], unit: str, stages: Mapping[str, str]) -> list[Any]:
-    """One row per file, if there are several; the share that closes if there are causes."""
-    shown = {key: name for key, name in stages.items() if key in ("recalibrated", "augmented", "noise_floor")}
-    rows = []
-    for one in closure.get("per_holdout") or []:
-        share = one.get("closed")
-        closed = percent(share) if isinstance(share, int | float) else "undefined"
-        name = PurePath(str(one.get("source", ""))).name
-        errors = [number(as_float(one.get(key)), 3) for key in shown]
-        rows.append([name, *errors, closed if "augmented" in shown else ""])
-    header = (f"hold-out, error in {unit}", *shown.values(), "closed")
-    return [table(header, rows)] if rows else []
+    return Section("Calibration constants", [words, shown(constants)]) if len(constants) else None
 
 
 MOST_LISTED = 40
@@ -132,15 +80,11 @@ def next_input_section(material: Material) -> Section | None:
 
 def limits_section(material: Material) -> Section | None:
     """Effects that these inputs hide or confuse, and how often another cause would have got this name."""
-    excitation = material.answer.get("excitation") or {}
-    confusability = material.answer.get("impostors") or {}
-    blocks: list[Any] = _confusability_words(confusability)
-    hidden = [explanation_words([cause]) for cause in excitation.get("hidden") or []]
-    pairs = [" and ".join(explanation_words([c]) for c in p["between"]) for p in excitation.get("inseparable") or []]
+    blocks: list[Any] = reliability_sentences(material.answer)
     small = "Effects that these inputs do not show at their typical size"
-    for title, items in ((small, hidden), ("Pairs of effects with the same signature under these inputs", pairs)):
-        if items:
-            blocks.append(folded(f"{title}: {len(items)}", *bullets(items[:MOST_LISTED])))
+    same = "Pairs of effects with the same signature under these inputs"
+    for title, items in {small: hidden_effects(material.answer), same: inseparable_pairs(material.answer)}.items():
+        blocks += [folded(f"{title}: {len(items)}", *bullets(items[:MOST_LISTED]))] if items else []
     return Section("Limits of these inputs", blocks) if blocks else None
 
 
@@ -153,27 +97,6 @@ def _next_words(proposal: Mapping[str, Any]) -> str:
         return f"{words} It is too short to distinguish them with certainty."
     count = f" ({samples} samples)" if isinstance(samples, int) else ""
     return f"{words} They are expected to be distinguishable after {number(float(when))} s{count}."
-
-
-def _confusability_words(confusability: Mapping[str, Any]) -> list[str]:
-    sentences = []
-    best, unexplained = confusability.get("best"), confusability.get("left_open")
-    if best and isinstance(unexplained, int | float):
-        sentences.append(
-            f"If the library had lacked the cause, the best explanation would have been {explanation_words(best)}, "
-            f"with {percent(unexplained)} of the gap unexplained."
-        )
-    simulated = confusability.get("simulated")
-    if isinstance(simulated, dict):
-        passed_for = [explanation_words([c]) for c in simulated.get("passed_for") or []]
-        mostly = f", mostly for {', '.join(passed_for[:3])}" if passed_for else ""
-        rivals, draws = simulated.get("rivals"), simulated.get("draws")
-        sentences.append(
-            f"Reliability of the name: of {draws} recordings simulated with linearized effects, with a gap of this "
-            f"size from one of {rivals} other causes, {simulated.get('confused')} were given this name, and "
-            f"{simulated.get('passed')} if the library lacked the true cause{mostly}."
-        )
-    return sentences
 
 
 MOST_CURVES = 12

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from fdi_torch.amounts import AT_95, with_error
 from fdi_torch.estimate.uncertainty import chi_square_quantile
+from fdi_torch.quantities import display_unit
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import bullets, table
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import AT_95, as_float, as_vector, axis, number, shown_unit, with_error
+from fdi_torch.report.numbers import as_float, as_vector, axis, number
 from fdi_torch.report.section import Column, Picture, Section, signals
 from fdi_torch.report.sections.estimate import last_estimate
 from fdi_torch.report.style import MODEL, OTHER
@@ -32,7 +34,7 @@ def intervals_section(material: Material) -> Section | None:
     for i, name in enumerate(map(str, final["names"])):
         if name not in profiles and name not in draws:
             continue
-        unit, scale = shown_unit(final["units"][i] if final.get("units") else "", name)
+        unit, scale = display_unit(final["units"][i] if final.get("units") else "", name)
         rows.append(
             [
                 name,

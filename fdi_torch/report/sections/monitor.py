@@ -5,22 +5,22 @@ Carlo validation.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import orjson
 
-from fdi_torch.amounts import faults_in_words
+from fdi_torch.amounts import faults_in_words, percent_text, rounded
 from fdi_torch.clock import clock_text
 from fdi_torch.names import listed
 from fdi_torch.report.chart import FLAT, Chart, Line
-from fdi_torch.report.html import Markup, bullets, table, tag, unbroken
+from fdi_torch.report.html import Markup, bullets, shown, table, tag, unbroken
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import as_float, number, probability_text, rounded_number, sentence
+from fdi_torch.report.numbers import as_float, number
 from fdi_torch.report.section import Section, channel_signals, signals
 from fdi_torch.report.style import MARK, MODEL
+from fdi_torch.tables import Table
 
 RESIDUAL, ALARM = "/observer/residual", "/observer/alarm"
 _SUFFIXES = ("_statistic", "_threshold")
@@ -109,7 +109,7 @@ def _event_cells(event: Payload) -> list[Any]:
         tag("span", text, class_="moment") if text else ""
         for text in (event.get("event", ""), clock_text(time), clock_text(onset))
     )
-    onsets = ["", ""] if math.isnan(onset) else [rounded_number(onset, std), moments[1]]
+    onsets = ["", ""] if math.isnan(onset) else [rounded(onset, std), moments[1]]
     return [number(time, 6), moments[0], kind, _description(event), *onsets]
 
 
@@ -119,32 +119,25 @@ def _description(event: Payload) -> Markup:
     rivals = list(zip(names, event.get("masses") or (), strict=False)) if isinstance(names, list) else []
     before, named, after = message.partition(str(event.get("headline") or message))
     if named and len(rivals) > 1:
-        items = [unbroken(f"{sentence(str(text))}, {probability_text(as_float(mass))}") for text, mass in rivals]
-        return tag("div", sentence(before), *bullets(items), *_lines(after))
+        items = [unbroken(f"{text}, {percent_text(as_float(mass))}") for text, mass in rivals]
+        return tag("div", before, *bullets(items), *_lines(after))
     return tag("div", *_lines(message))
 
 
 def _lines(message: str) -> list[Markup]:
     parts = message.removeprefix(", ").removeprefix("; ").split("; ")
-    return [tag("div", unbroken(sentence(part))) for part in parts if part]
+    return [tag("div", unbroken(part)) for part in parts if part]
 
 
 def rehearsal_section(material: Material) -> Section | None:
     """Every table under its title."""
-    blocks: list[Markup | str] = []
+    blocks: list[Markup] = []
     for entry in rehearsal_tables(material):
         title, header, rows = (entry.get(name) for name in ("title", "header", "rows"))
         if isinstance(header, list) and isinstance(rows, list):
             complete = [row for row in rows if isinstance(row, list) and len(row) == len(header)]
-            words = str(title)
-            blocks += [tag("h4", words[:1].upper() + words[1:]), table(header, complete, _texts(complete))]
+            blocks.append(shown(Table(header, complete, str(title))))
     return Section("Validation of the monitor", blocks) if blocks else None
-
-
-def _texts(rows: Sequence[Sequence[Any]]) -> int:
-    """Number of leading columns that hold no number, at least one."""
-    columns = list(zip(*rows, strict=True))[1:]
-    return 1 + next((k for k, column in enumerate(columns) if re.search(r"\d", " ".join(map(str, column)))), 0)
 
 
 def rehearsal_tables(material: Material) -> list[dict[str, Any]]:

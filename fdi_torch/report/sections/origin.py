@@ -10,13 +10,12 @@ import numpy as np
 
 from fdi_torch.amounts import kind_words
 from fdi_torch.estimate.misfit import NOT_ESTABLISHED
-from fdi_torch.names import counted
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.quantities import quantity_text
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
-from fdi_torch.report.html import bullets, folded, pairs, table, tag
+from fdi_torch.report.html import bullets, escape, folded, pairs, shown, tag, typeset
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import number, sentence, shown_unit
 from fdi_torch.report.schematic import Overlay, schematic
 from fdi_torch.report.section import Picture, Section
 
@@ -70,9 +69,10 @@ def marks_of(material: Material) -> dict[str, list[str]]:
     marks: dict[str, list[str]] = {}
     for finding in diagnosed_effects(material):
         if finding.present:
-            unit, scale = shown_unit(finding.unit)
-            size = "" if math.isnan(finding.size) else f" {number(scale * finding.size, 3)} {unit}".rstrip()
-            marks.setdefault(finding.location, []).append(f"{kind_words(finding.effect, finding.location)}{size}")
+            size = "" if math.isnan(finding.size) else f" {quantity_text(finding.size, finding.unit, 3)}"
+            marks.setdefault(finding.location, []).append(
+                typeset(f"{kind_words(finding.effect, finding.location)}{size}")
+            )
     for combination in combinations_of(material, "not_isolated"):
         for fault in map(ParameterName.of_effect, combination.parameters):
             marks.setdefault(fault.place, []).append(f"{kind_words(fault.effect, fault.place)}, not isolated")
@@ -97,7 +97,7 @@ def configuration_section(material: Material) -> Section | None:
     if not text:
         return None
     cut = [tag("p", "The remainder is in the log.", class_="note")] if len(text) > MOST_TEXT else []
-    return Section("Configuration", [folded("original file (YAML)", tag("pre", text[:MOST_TEXT]), *cut)])
+    return Section("Configuration", [folded("original file (YAML)", tag("pre", escape(text[:MOST_TEXT])), *cut)])
 
 
 def provenance_section(material: Material) -> Section | None:
@@ -117,24 +117,17 @@ def health_section(material: Material) -> Section | None:
     inspection = material.inspection
     problems = [*inspection.health.problems, *material.problems]
     state = tag("span", "damaged", class_="bad") if problems else tag("span", "intact", class_="good")
-    topics, chunks = inspection.topics.values(), counted(inspection.health.chunks, "chunk")
-    content = f"{counted(inspection.messages, 'message')} on {counted(len(topics), 'topic')} in {chunks}"
-    rows = [[info.topic, str(info.messages), *info.span] for info in topics]
     messages = [
-        tag(
-            "li",
-            f"{_LEVELS[level]}: " if (level := m.get("level")) in _LEVELS else "",
-            sentence(str(m.get("message", ""))),
-        )
+        tag("li", f"{_LEVELS[level]}: " if (level := m.get("level")) in _LEVELS else "", m.get("message", ""))
         for m in material.of("/log")
     ]
     return Section(
         "Integrity of the log",
         [
-            tag("p", "The file is ", state, f": {content}, {inspection.size} bytes."),
+            tag("p", "The file is ", state, f": {inspection.content}."),
             *bullets(problems),
             *([inspection.advice] if inspection.advice else []),
             *([folded(f"Log messages ({len(messages)})", tag("ul", *messages))] if messages else []),
-            folded("Topics", table(("topic", "messages", "from", "to"), rows)),
+            folded("Topics", shown(inspection.table())),
         ],
     )

@@ -11,16 +11,18 @@ import numpy as np
 import torch
 
 from fdi_torch.logbook import Signals
+from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.report.chart import FLAT, Chart, Line, corner_points
-from fdi_torch.report.diagnosed_effects import MODEL_NAMES, has_causes
-from fdi_torch.report.html import table, tag
+from fdi_torch.report.gap_tables import MODEL_NAMES, has_causes
+from fdi_torch.report.html import Markup, shown, tag
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import amount, as_float, axis, number, shown_unit
+from fdi_torch.report.numbers import as_float, axis, shown_unit
 from fdi_torch.report.predictions import holdout_prefix, predicted
 from fdi_torch.report.section import Column, Picture, Section, channel_signals, signals
 from fdi_torch.report.sections.monitor import adoptions
 from fdi_torch.report.style import MODEL, OTHER, SOFT
 from fdi_torch.sample_noise import sample_noise
+from fdi_torch.tables import Table
 
 
 def fit_section(material: Material) -> Section | None:
@@ -28,15 +30,13 @@ def fit_section(material: Material) -> Section | None:
     blocks: list[str | list[Column]] = []
     fitted = False
     for k, (recording, group) in enumerate(zip(material.recordings, material.groups, strict=True)):
-        several = len(material.recordings) > 1
-        model = predicted(material, k)
+        model, suffix = predicted(material, k), _suffix(material, k)
         fitted |= model is not None
-        blocks += [tag("h4", recording_name(group))] if several else []
+        blocks += [tag("h4", recording_name(group))] if suffix else []
         sensors = [material.channel_words(name) for name in recording.output_names]
         followed = None if model is not None else _followed(material, recording)
         marks = [] if followed is None else adoptions(material)
         blocks += [FOLLOWED] if followed is not None else []
-        suffix = f"_{k + 1}" if several else ""
         blocks.append(_output_panels(recording, sensors, (model, followed), suffix, clock_of(group), marks))
         if model is not None:
             blocks += [_misfit_table(recording, sensors, model)]
@@ -64,26 +64,26 @@ def inputs_section(material: Material) -> Section | None:
     """Inputs: panels for those that vary, text for constant ones."""
     blocks: list[str | list[Picture]] = []
     for k, (recording, group) in enumerate(zip(material.recordings, material.groups, strict=True)):
-        several = len(material.recordings) > 1
-        suffix = f"_{k + 1}" if several else ""
-        pictures, constant = [], []
+        suffix, pictures, constant = _suffix(material, k), [], []
         for i, name in enumerate(map(material.channel_words, recording.input_names)):
             unit, channel, values = recording.input_units[i], recording.input_names[i], recording.inputs[:, i]
             if np.isfinite(values).any() and np.nanmin(values) == np.nanmax(values):
-                constant.append(f"{name} at {amount(float(np.nanmax(values)), unit, name=channel)}")
+                constant.append(f"{name} at {quantity_text(float(np.nanmax(values)), unit, name=channel)}")
                 continue
             held = recording.hold == "zero_order"
             time, corners = corner_points(recording.time, values) if held else (recording.time, values)
             line = Line("command", time, corners, MODEL, steps=held)
-            title = f"{name}, {recording_name(group).lower()}" if several else name
-            clock = clock_of(group)
-            pictures.append(
-                channel_signals(f"input{suffix}_{i + 1}", title, "command", unit, [line], channel, clock=clock)
-            )
-        of = f"{recording_name(group)}, constant" if several else "Constant"
+            words = f"input{suffix}_{i + 1}", f"{name}, {recording_name(group).lower()}" if suffix else name, "command"
+            pictures.append(channel_signals(*words, unit, [line], channel, clock=clock_of(group)))
+        of = f"{recording_name(group)}, constant" if suffix else "Constant"
         blocks += [f"{of}: {', '.join(constant)}."] if constant else []
         blocks += [pictures] if pictures else []
     return Section("Inputs", blocks) if blocks else None
+
+
+def _suffix(material: Material, k: int) -> str:
+    """What the names of the pictures of recording k end with; empty if there is only one."""
+    return f"_{k + 1}" if len(material.recordings) > 1 else ""
 
 
 def recording_name(group: str) -> str:
@@ -132,32 +132,20 @@ def _output_panels(
     return columns
 
 
-def _misfit_table(recording: Signals, sensors: Sequence[str], model: np.ndarray) -> str:
+def _misfit_table(recording: Signals, sensors: Sequence[str], model: np.ndarray) -> Markup:
     """Root mean square, mean, largest residual, and Pearson correlation of each sensor."""
     rows = []
     for i, name in enumerate(sensors):
-        unit, scale = shown_unit(recording.output_units[i], recording.output_names[i])
+        unit, scale = display_unit(recording.output_units[i], recording.output_names[i])
         counted = recording.mask[:, i] & np.isfinite(model[:, i])
         read, estimate = scale * recording.outputs[counted, i], scale * model[counted, i]
-        residual = read - estimate
-        row = [name, unit or "1", str(int(counted.sum())), *_statistics(residual), _correlation(read, estimate)]
-        rows.append(row)
+        residual = read - estimate if len(read) else np.array([np.nan])
+        statistics = (np.sqrt(np.mean(residual**2)), np.mean(residual), np.max(np.abs(residual)))
+        varies = len(read) > 1 and np.ptp(read) > 0 and np.ptp(estimate) > 0
+        correlation = f"{float(np.corrcoef(read, estimate)[0, 1]):.6f}" if varies else "–"
+        rows.append((name, unit or "1", len(read), *map(float, statistics), correlation))
     header = ("sensor", "unit", "readings", "root mean square", "mean", "largest", "correlation")
-    return table(header, rows, left=2)
-
-
-def _statistics(residual: np.ndarray) -> list[str]:
-    if not len(residual):
-        return ["–"] * 3
-    statistics = (np.sqrt(np.mean(residual**2)), np.mean(residual), np.max(np.abs(residual)))
-    return [number(float(v), 3) for v in statistics]
-
-
-def _correlation(read: np.ndarray, estimate: np.ndarray) -> str:
-    """Pearson correlation; a dash if one of both is constant."""
-    if len(read) < 2 or np.ptp(read) == 0 or np.ptp(estimate) == 0:
-        return "–"
-    return f"{float(np.corrcoef(read, estimate)[0, 1]):.6f}"
+    return shown(Table(header, rows, digits=3))
 
 
 BINS = 24

@@ -15,61 +15,36 @@ from fdi_torch.amounts import parameter_words
 from fdi_torch.effects import build_network, effect, full_name
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.effect import Placement
-from fdi_torch.report.html import folded, short, table
+from fdi_torch.quantities import display_unit
+from fdi_torch.report.html import folded, short, shown, table
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import axis, number, percent, shown_unit
+from fdi_torch.report.numbers import axis, percent, shown_unit
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.sections.estimate import column
+from fdi_torch.report.setting_tables import LEGEND, isolation_sentence, setting_tables
 from fdi_torch.report.style import MARK, MODEL, SOFT, logarithmic, panel
 from fdi_torch.study.estimators import ESTIMATORS, Estimator
 
 TRIAL, SUMMARY = "/study/trial", "/study/summary"
-MOST_PANELS, MOST_GROUPS, MOST_ROWS = 9, 40, 30
+MOST_PANELS, MOST_GROUPS = 9, 40
 SHOWN: tuple[Estimator, ...] = ("free", "boxed", "correlation", "search")
 """Estimators in the order of preference: the first one that a log has is shown."""
-MAIN = {"over_bound": "error over the Cramér-Rao bound", "coverage": "coverage of the 95 % interval"}
 _OWN = ("t", "trial", "trials", "group", "seed", "status")
 
 
 def summary_section(material: Material) -> Section | None:
-    """One column per setting, one row per number."""
-    settings = material.of(SUMMARY)[:MOST_GROUPS]
+    """The scores of each setting, as the terminal shows them."""
+    settings = [(str(m.get("group", "")), m.get("trials", ""), m) for m in material.of(SUMMARY)]
     if not settings:
         return None
-    names = list(dict.fromkeys(k for m in settings for k, v in m.items() if k not in _OWN and _shown(v) is not None))
-    header = ["", *(str(m.get("group", "")) for m in settings)]
-    rows = [["trials", *(str(m.get("trials", "")) for m in settings)]]
-    for name in names:
-        label, scale = _label_and_scale(material, name)
-        rows.append([label, *(_shown(m.get(name), scale) or "" for m in settings)])
-    shown = table(header, rows)
-    if len(rows) <= MOST_ROWS:
-        return Section("Settings", [shown])
-    estimator = next((name for name in SHOWN if any(key.startswith(f"{name}.") for key in names)), None)
-    main = [
-        [_main_words(row[0]), *row[1:]] for row in rows if row[0].startswith(f"{estimator}.") and _main_words(row[0])
-    ]
-    blocks = [table(header, [rows[0], *main]), folded(f"All {len(rows)} numbers of each setting", shown, printed=False)]
-    return Section("Settings", [_estimator_words(estimator), *blocks] if main and estimator else blocks[1:])
+    keys = [key.removesuffix(".rmse") for _, _, m in settings for key in m if key.endswith(".rmse")]
+    names = {key.partition(".")[2] for key in keys}
+    tables = setting_tables(settings, {name: _si_unit_of(material, name) for name in names})
+    return Section("Settings", [*map(shown, tables), *([LEGEND] if len(tables) == len(settings) else [])])
 
 
 def _estimator_words(name: Estimator) -> str:
     return f"Estimator: {name}, {ESTIMATORS[name]}."
-
-
-def _label_and_scale(material: Material, name: str) -> tuple[str, float]:
-    """The name of a number, with its unit for display if it is an error of a parameter, and that unit's scale."""
-    parameter, _, quantity = name.partition(".")[2].rpartition(".")
-    if quantity not in ("bias", "bias_error", "rmse"):
-        return name, 1.0
-    unit, scale = _unit_of(material, parameter)
-    return axis(name, unit), scale
-
-
-def _main_words(name: str) -> str:
-    """'leak at A: error over the Cramér-Rao bound' of 'free.A.leak.size.over_bound'; empty for a minor number."""
-    parameter, _, quantity = name.partition(".")[2].rpartition(".")
-    return f"{parameter_words(parameter)}: {MAIN[quantity]}" if quantity in MAIN else ""
 
 
 def error_section(material: Material) -> Section | None:
@@ -80,7 +55,7 @@ def error_section(material: Material) -> Section | None:
         return None
     groups, pictures = _grouped(trials), []
     for i, name in enumerate(_parameters(material, estimator, len(trials[0]["truth"]))[:MOST_PANELS]):
-        unit, scale = _unit_of(material, name)
+        unit, scale = display_unit(_si_unit_of(material, name), name)
         errors, bounds = [], []
         for own in groups.values():
             errors.append(scale * np.array([abs(float(m[estimator][i]) - float(m["truth"][i])) for m in own]))
@@ -96,16 +71,15 @@ def error_section(material: Material) -> Section | None:
     return Section("Errors", [f"{_estimator_words(estimator)} {words}", pictures])
 
 
-def _unit_of(material: Material, name: str) -> tuple[str, float]:
-    """The unit for display of a parameter, by the plant of the log, and its scale from SI; "SI" if it is not known."""
+def _si_unit_of(material: Material, name: str) -> str:
+    """The SI unit of a parameter, by the plant of the log; "SI" if it is not known."""
     try:
         place = ParameterName.parse(name)
         placements = [Placement(effect(place.effect), place.place)] if place.effect else []
-        if material.plant is None:
-            return "SI", 1.0
-        return shown_unit(build_network(material.plant, placements).constants[name].unit, name)
+        network = None if material.plant is None else build_network(material.plant, placements)
+        return "SI" if network is None else network.constants[name].unit
     except ValueError:
-        return "SI", 1.0
+        return "SI"
 
 
 def _parameters(material: Material, estimator: str, count: int) -> list[str]:
@@ -184,17 +158,6 @@ def _grouped(trials: Sequence[Payload]) -> dict[str, list[Payload]]:
     return dict(list(groups.items())[:MOST_GROUPS])
 
 
-def _shown(value: Any, scale: float = 1.0) -> str | None:
-    """Numbers, texts and short lists of them as text; None for values that do not fit a table."""
-    if isinstance(value, bool | str):
-        return str(value)
-    if isinstance(value, int | float):
-        return number(scale * float(value))
-    if isinstance(value, list) and len(value) <= 8:
-        return ", ".join(number(float(v), 3) if isinstance(v, int | float) else str(v) for v in value)
-    return None
-
-
 MOST_MODES = 64
 MOST_NAMED, LONGEST_MODE = 12, 24
 
@@ -205,11 +168,8 @@ def isolation_section(material: Material) -> Section | None:
     if counts is None or counts.shape != (len(labels), len(labels)) or not 0 < len(labels) <= MOST_MODES:
         return None
     result = material.about("result")
-    counts_ = [result.get(f"isolation.{name}", "?") for name in ("right", "trials", "missed", "false")]
-    words = (
-        "{} of {} modes stated correctly; {} faults missed, {} false faults. ".format(*counts_)
-        + "Row: true mode; column: stated mode; the table has their full names."
-    )
+    sentence = isolation_sentence({name.removeprefix("isolation."): text for name, text in result.items()})
+    words = f"{sentence} Row: true mode; column: stated mode; the table has their full names."
     rows = [_row(k, labels, counts) for k in range(len(labels)) if counts[k].sum()]
     listed = table(["", "mode", "trials", "right", "most often taken for"], rows)
     picture = Picture("isolation", matrix_panel(counts, labels))

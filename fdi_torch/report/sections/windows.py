@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from matplotlib.figure import Figure
 
-from fdi_torch.amounts import parameter_words
-from fdi_torch.report.html import short, table
+from fdi_torch.amounts import parameter_words, with_error
+from fdi_torch.quantities import quantity_text
+from fdi_torch.report.html import short, shown
 from fdi_torch.report.material import Material
-from fdi_torch.report.numbers import amount, as_float, number, shown_unit, with_error
+from fdi_torch.report.numbers import as_float, number
 from fdi_torch.report.section import Picture, Section
 from fdi_torch.report.style import FAINT, MARK, panel
+from fdi_torch.tables import Table, in_display_unit
 
 Records = list[dict[str, Any]]
 MOST_SUSPECTS = 40
+LARGEST_RELATIVE_ERROR = 10.0  # a size with a larger standard error is not shown as a number
 
 
 def windows_section(material: Material) -> Section | None:
@@ -26,26 +30,30 @@ def windows_section(material: Material) -> Section | None:
         return None
     count = f"{len(windows)} windows, each" if len(windows) > 1 else "One window,"
     words = f"{count} fitted separately; neighbouring windows with the same fault are one period."
-    header = ["fault", "from, s", "to, s", "size", "flow"]
-    listed = table(header, [_row(s) for s in stretches]) if stretches else "No fault was present in any window."
+    listed = shown(replace(period_table(stretches), title="")) if stretches else "No fault was present in any window."
     caption = "When each fault was present (dark), and where its window does not determine it (pale)."
     return Section(
         "Window by window", [words, [Picture("windows", _bars(windows), caption, wide=True)], listed], lead=True
     )
 
 
-def _row(stretch: dict[str, Any]) -> list[str]:
-    """Sizes in a practical unit; a size beyond its range has no error."""
-    unit, scale = shown_unit(str(stretch.get("unit", "1")), str(stretch["name"]))
-    size, std = (as_float(stretch.get(name)) * scale for name in ("size", "std"))
-    shown = with_error(size, std) if math.isfinite(std) else f"> {number(size)}"
-    flow = as_float(stretch.get("flow"))
-    return [
-        parameter_words(str(stretch["name"])),
-        *(number(stretch[name], 6) for name in ("start", "stop")),
-        f"{shown} {unit}".rstrip(),
-        amount(flow, "m^3/s", 3) if math.isfinite(flow) else "",
-    ]
+def period_table(stretches: Sequence[Mapping[str, Any]]) -> Table:
+    """One row per period in which a fault was present, from the fields of `Stretch`."""
+    rows = []
+    for stretch in stretches:
+        flow = as_float(stretch.get("flow"))
+        shown_flow = quantity_text(flow, "m^3/s", 3) if math.isfinite(flow) else ""
+        times = (number(stretch[name], 6) for name in ("start", "stop"))
+        rows.append([parameter_words(str(stretch["name"])), *times, size_text(stretch), shown_flow])
+    return Table(("fault", "from, s", "to, s", "size", "flow"), rows, "present")
+
+
+def size_text(fault: Mapping[str, Any]) -> str:
+    """Size and standard error in the unit for display; '> ' and the size if its error is too large to show it."""
+    name, si_unit = str(fault["name"]), str(fault.get("unit", "1"))
+    unit, size, std = in_display_unit(name, si_unit, as_float(fault.get("size")), as_float(fault.get("std")))
+    known = std < LARGEST_RELATIVE_ERROR * max(abs(size), 1.0)
+    return f"{with_error(size, std) if known else f'> {number(size)}'} {unit.removeprefix('1')}".rstrip()
 
 
 def _bars(windows: Sequence[dict[str, Any]]) -> Figure:

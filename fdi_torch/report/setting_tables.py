@@ -1,0 +1,71 @@
+"""The scores of a study's settings as tables, from the numbers that its log has, for terminal and page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fdi_torch.amounts import with_error
+from fdi_torch.report.numbers import as_float, number
+from fdi_torch.study.estimators import ESTIMATORS
+from fdi_torch.tables import Table, in_display_unit
+
+MOST_SETTINGS = 10  # of more, the tables are one with a row for each
+RATIOS = {"over_bound": "RMSE / bound", "over_linearised": "RMSE / linearised", "coverage": "coverage"}
+LEGEND = (
+    "; ".join(f"{name}: {meaning}" for name, meaning in ESTIMATORS.items())
+    + "\nbias: ± 1.96 of its standard errors; bound: Cramér-Rao bound; coverage: share of trials whose stated 95 % "
+    "interval contains the truth; 95 %: confidence interval of the number before it"
+)
+Numbers = Mapping[str, Any]
+"""The numbers of a setting by their dotted names, `Summary.numbers`."""
+
+
+def setting_tables(settings: Sequence[tuple[str, Any, Numbers]], units: Mapping[str, str]) -> list[Table]:
+    """The scores of settings, given as name, number of trials and numbers; of many, one table with their failures.
+
+    units: SI units by parameter.
+    """
+    if len(settings) <= MOST_SETTINGS:
+        return [_setting_table(*setting, units) for setting in settings]
+    rows = []
+    for setting, trials, numbers in settings:
+        name = next((name for name in ESTIMATORS if f"{name}.failures" in numbers), "")
+        failures, worst = (as_float(numbers.get(f"{name}.{key}")) for key in ("failures", "worst"))
+        rows.append((setting, trials, number(failures), number(worst, 2)))
+    return [Table(("setting", "trials", "failures", "worst error (share of range)"), rows)]
+
+
+def isolation_sentence(counts: Mapping[str, Any]) -> str:
+    """How many modes were stated correctly, from the counts of an `Isolation`."""
+    right, trials, missed, false = (counts.get(name, "?") for name in ("right", "trials", "missed", "false"))
+    return f"{right} of {trials} modes stated correctly; {missed} faults missed, {false} false faults."
+
+
+def _setting_table(setting: str, trials: Any, numbers: Numbers, units: Mapping[str, str]) -> Table:
+    """One row per estimator and parameter. The summary says how the trials ended."""
+    rows = []
+    for score in (key.removesuffix(".rmse") for key in numbers if key.endswith(".rmse")):
+        estimator, _, parameter = score.partition(".")
+        errors = (as_float(numbers.get(f"{score}.{key}")) for key in ("bias", "bias_error", "rmse"))
+        unit, bias, error, rmse = in_display_unit(parameter, units[parameter], *errors)
+        ratios: list[str] = []
+        for name in (f"{score}.{ratio}" for ratio in RATIOS):
+            value, low, high = (as_float(numbers.get(key)) for key in (name, f"{name}.low", f"{name}.high"))
+            ratios += [f"{value:.3f}", f"{low:.3f} … {high:.3f}"] if value == value else ["", ""]
+        sizes = (with_error(bias, 1.96 * error), number(rmse, 3))
+        rows.append((estimator, parameter.removesuffix(".size"), unit, *sizes, *ratios))
+    header = ["estimator", "parameter", "unit", "bias", "RMSE"]
+    header += [cell for name in RATIOS.values() for cell in (name, "95 %")]
+    title = f"{setting}: {trials} trials, {number(as_float(numbers.get('converged')))} converged"
+    return Table(header, rows, title, summary=_ending(numbers))
+
+
+def _ending(numbers: Numbers) -> str:
+    failed = [f"{name} {numbers[f'{name}.failures']}" for name in ESTIMATORS if f"{name}.failures" in numbers]
+    parts = [f"trials that ended far from the truth: {', '.join(failed)}"] if failed else []
+    if "rho" in numbers:
+        parts.append(f"correlation of readings and model, summed over the sensors: {as_float(numbers['rho']):.6f}")
+    if numbers.get("undetermined"):
+        parts.append(f"{numbers['undetermined']} trials whose readings cannot determine every parameter")
+    return "; ".join(parts)
