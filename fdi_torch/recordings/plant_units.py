@@ -1,5 +1,4 @@
-"""Units that are wrong for a whole kind of number: all areas, flows, levels, pressures or times, or the area of a tank,
-whose decimal point may be misplaced too.
+"""Units that are wrong for a whole kind of number: all areas, flows, levels, pressures or times, or the area of a tank.
 
 A correction divides these numbers by the ratio of the unit in which they were written to another usual unit. By Bayes'
 theorem, the likelihoods of the unchanged plant file and of each correction, which follow from the volume balance of the
@@ -8,9 +7,10 @@ named, unless the unchanged file is among them. A recording without metered flow
 hardly opens looks like tanks that are too small.
 
 An unusual plant is not mistaken for a wrong unit: a leak or a plugged pipe changes a coefficient of the balance by some
-factor, but rarely by one that is close to the ratio of two units. The unit of one sensor alone is a doubt only
-(`doubtful_units`): whether its recording is refused is left to `gap.preprocess.recording_faults`, where effects of the
-plant compete.
+factor, but rarely by one that is close to the ratio of two units. The unit of one sensor alone, and a misplaced decimal
+point in the area of its tank, are doubts only (`doubtful_units`), because a sensor that follows the level badly looks
+the same: whether its recording is refused is left to `gap.preprocess.recording_faults`, where effects of the plant
+compete.
 """
 
 from __future__ import annotations
@@ -73,7 +73,8 @@ def wrong_units(plant: PlantDescription, recording: Recording) -> str:
 
 
 def doubtful_units(plant: PlantDescription, recording: Recording) -> list[tuple[str, str]]:
-    """Sensors whose unit alone is probably wrong, if their readings depend on the flows: columns and a sentence.
+    """Sensors whose unit alone, or whose tank's area, is probably wrong, if their readings depend on the flows: columns
+    and a sentence.
 
     Where all levels rest, readings that do not depend on the flows explain the balance as well as a wrong unit does:
     those of a stuck sensor, for example. A unit that explains the balance less well than these is left out.
@@ -82,12 +83,14 @@ def doubtful_units(plant: PlantDescription, recording: Recording) -> list[tuple[
     as_is = balance_along(plant, recording) if plant.metered_flows() and recorded else Balance(())
     sensors = [(s,) for s in plant.sensors if s.column in recording.output_names]
     corrections = list(_reading_corrections(plant, recording, sensors)) if as_is.is_metered else []
+    corrections += _decimal_slips(plant, recording, as_is) if as_is.is_metered else []
     credible = _credible(as_is, corrections, 0.0)
     worse = math.log(1.0 / CONFIDENCE - 1.0)
     if not credible or any(_lead(each, as_is, UNRELATED) < worse for each in credible) or wrong_units(plant, recording):
         return []
     columns = ", ".join(dict.fromkeys(column for each in credible for column in each.columns))
-    return [(columns, f"by the volume balance of the tanks, {_alternatives(credible)}, unless it is stuck")]
+    unless = f"unless {columns} does not follow the level"
+    return [(columns, f"by the volume balance of the tanks, {_alternatives(credible)}, {unless}")]
 
 
 def _credible(as_is: Balance, corrections: list[Correction], unrelated: float) -> list[Correction]:
@@ -137,11 +140,6 @@ def _corrections(plant: PlantDescription, recording: Recording, as_is: Balance) 
         for names, tanks, pipes in areas:
             smaller = as_is.scaled(metered=ratio**tanks, by_laws=ratio ** (tanks - pipes))
             yield Correction(names, area, right, ratio, smaller)
-    for tank, one in zip(plant.tanks, all_tanks.diag(), strict=True):
-        for ratio in DECIMAL_SLIPS:
-            written, right = (quantity_text(each, "m^2") for each in (tank.area, tank.area / ratio))
-            smaller = as_is.scaled(metered=ratio**one, by_laws=ratio**one)
-            yield Correction(f"tanks.{tank.name}.area is", written, right, ratio, smaller)
     channels = [component.channel for component in plant.metered_flows()]
     written = _written("m^3/s", channels[0], recording)
     for right, ratio in _other_units("m^3/s", written):
@@ -152,6 +150,17 @@ def _corrections(plant: PlantDescription, recording: Recording, as_is: Balance) 
     written = recording.written.get("t", "")  # none: the clock has dates, or is that of a simulation
     for right, ratio in _other_units("s", written) if written else ():
         yield Correction("the times are", written, right, ratio, as_is.scaled(all_tanks / ratio, all_tanks / ratio))
+
+
+def _decimal_slips(plant: PlantDescription, recording: Recording, as_is: Balance) -> Iterator[Correction]:
+    """Corrections of the area of one tank whose level is read."""
+    each_tank = torch.eye(len(plant.tanks), dtype=torch.float64)
+    for tank, one in zip(plant.tanks, each_tank, strict=True):
+        columns = tuple(s.column for s in plant.sensors if s.tank == tank.name and s.column in recording.output_names)
+        for ratio in DECIMAL_SLIPS if columns else ():
+            written, right = (quantity_text(area, "m^2") for area in (tank.area, tank.area / ratio))
+            smaller = as_is.scaled(metered=ratio**one, by_laws=ratio**one)
+            yield Correction(f"tanks.{tank.name}.area is", written, right, ratio, smaller, columns)
 
 
 def _reading_corrections(
