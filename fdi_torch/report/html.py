@@ -18,7 +18,7 @@ NARROW = 3
 SORTED = " ↓↑"  # the signs behind the column by which a table is sorted, which its cells do not repeat
 _TAGS = re.compile("<[^>]*>")
 _POWER = re.compile(r"(?<=[^\W\d_])\^(-?\d+)")
-_NEGATIVE = re.compile(r"(?<![\w.])-(?=\d)")
+_NEGATIVE = re.compile(r"(?<![\w.])-(?=[\d∞])")
 _CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff\u202a-\u202e\u2066-\u2069]")
 _WITHIN_DATE = re.compile(r"(?<=\d)-(?=\d)")
 _WITHIN_NUMBER = re.compile(r" (?=[±%])|(?<=±) |(?<=\d) (?=[^\s\d]{1,8}(?:[),;.]|$))")

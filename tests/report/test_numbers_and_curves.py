@@ -34,7 +34,8 @@ def test_units_and_odd_numbers() -> None:
         typeset("m^-2 s^10") == "m⁻² s¹⁰"
         and typeset("2026-11-24, hA-hB, 1e-05, x^y") == "2026-11-24, hA-hB, 1e-05, x^y"
     )
-    assert [number(v) for v in (float("nan"), float("inf"), -1.5)] == ["–", "∞", "-1.5"]
+    values = float("nan"), float("inf"), float("-inf"), -1.5
+    assert [typeset(number(v)) for v in values] == ["–", "∞", "−∞", "−1.5"]
     assert percent(0.1234) == "12.3 %"
     assert [probability_words(p) for p in (0.9979, 0.00202, 2.06e-59)] == ["99.8 %", "0.2 %", "under 0.1 %"]
 
