@@ -95,9 +95,10 @@ def localize(
         largest = float(best.explained.square().mean(dim=0).max().sqrt())
         if selected and not is_rounding_error(fitter, place, largest):
             needed, evaluated[place] = max(needed, best.gain + math.log(RARE)), best.localized(fitter)
-    for at in _without_the_period(evaluated.values(), fitter.data.longest_duration):
+    if others := _without_the_period(evaluated.values(), fitter.data.longest_duration):
         period = max(evaluated.values(), key=gain_of).periods[0]
         periodic = DiscrepancyRegression(fitter, fit, [1.0 / period], regression.level_filter)
+    for at in others:
         again = ascent.climbed(ascent.under_less_and_less_noise(periodic, at.location, likely), needed)
         evaluated[at.location] = max(at, again.localized(fitter), key=gain_of)
     processes = [*drifting_sensors(regression, likely, places, base, needed)]
