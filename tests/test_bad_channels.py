@@ -27,6 +27,7 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
     noise_of,
 )
 from fdi_torch.gap.preprocess.corrected_fit import first_order_log_likelihood
+from fdi_torch.gap.problem import PLAIN, problem_of
 from fdi_torch.gap.trajectory_problem import BEHIND
 from fdi_torch.jobs.logged_monitor import usable_part
 from fdi_torch.recording import Recording
@@ -169,20 +170,16 @@ def test_clock_offsets_are_refused(seconds: int) -> None:
         usable(nominal_plant(), late(sound(), seconds))
 
 
-def test_a_sensor_that_reads_ahead_of_the_others_is_refused() -> None:
-    run, early = sound(), 60
-    ahead = with_channel(run, 1, torch.cat([run.outputs[early:, 1], run.outputs[-early:, 1]])).stretch(0, 1900)
-    with pytest.raises(ValueError, match=r"h2: stamped \S+ s too early, by the times of the other channels"):
-        usable(nominal_plant(), ahead)
+def second_sensor_late(run: Recording, seconds: int) -> Recording:
+    """The readings of the second sensor so many samples late, or early where that is below 0."""
+    moved = with_channel(run, 1, torch.roll(run.outputs[:, 1], seconds))
+    return moved.stretch(max(seconds, 0), len(run) + min(seconds, 0))
 
 
 @pytest.mark.parametrize("late_by", [-60, 60])
 def test_the_correction_that_is_named_mends_the_clock(late_by: int, tmp_path: Path) -> None:
     """The channel in a file of its own, with the shift of the message."""
-    plant, run = nominal_plant(), sound()
-    moved = with_channel(run, 1, torch.roll(run.outputs[:, 1], late_by)).stretch(
-        max(late_by, 0), 2000 + min(late_by, 0)
-    )
+    plant, moved = nominal_plant(), second_sensor_late(sound(), late_by)
     file = write_csv(moved, tmp_path / "run.csv")
     whole = read_recording(config_of(file), plant, tmp_path)
     fault = examined(plant, whole).fault
@@ -192,12 +189,13 @@ def test_the_correction_that_is_named_mends_the_clock(late_by: int, tmp_path: Pa
     assert [examined(plant, part).fault for part in mended.known_segments()] == [None]
 
 
-def test_a_late_sensor_is_accepted_if_the_caller_considers_sensor_delays() -> None:
-    run, delay = sound(), 60
-    late_one = with_channel(run, 1, torch.cat([run.outputs[:delay, 1], run.outputs[:-delay, 1]])).stretch(delay, 2000)
-    assert usable(nominal_plant(), late_one, effects=True).fault is not None
-    with pytest.raises(ValueError, match=r"h2: stamped \S+ s too late, by the times of the other channels"):
-        usable(nominal_plant(), late_one)
+@pytest.mark.parametrize(("late_by", "when"), [(-60, "early"), (60, "late")])
+def test_only_the_gap_diagnosis_accepts_a_sensor_that_leads_or_lags_the_others(late_by: int, when: str) -> None:
+    moved = second_sensor_late(sound(), late_by)
+    with pytest.raises(ValueError, match=rf"h2: stamped \S+ s too {when}, by the times of the other channels"):
+        usable(nominal_plant(), moved)
+    remarks = problem_of(nominal_plant(), [moved], [], PLAIN).remarks
+    assert [f"too {when}" in remark for remark in remarks] == [True]
 
 
 def test_random_readings_are_refused() -> None:

@@ -22,7 +22,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.plant_limits import denied_rims, with_rims_unknown
+from fdi_torch.recordings.plant_limits import with_rims_unknown
 from fdi_torch.simulate.step_length import commensurate_step
 
 LEAST = 60
@@ -96,9 +96,8 @@ def problem_of(
     longest = max(float(r.time[-1] - r.time[0]) for r in recordings)
     if settings.step is not None and settings.step > longest:
         raise ValueError(f"step: expected one within the {longest:g} s recorded, got {settings.step:g} s; shorten it")
-    recordings, stuck = _examined(plant, recordings, settings.trusted)
-    holdouts, _ = _examined(plant, holdouts, settings.trusted)
-    rims = [rim.text for r in (*recordings, *holdouts) if not r.trusted for rim in denied_rims(plant, r)]
+    recordings, stuck, remarks = _examined(plant, recordings, settings.trusted)
+    holdouts, _, remarks_on_holdouts = _examined(plant, holdouts, settings.trusted)
     plant = with_rims_unknown(plant, [*recordings, *holdouts])
     freezing = {p.location: p for p in library if isinstance(p.effect, Stuck)}
     stuck_for_good = {s.sensor.name: s for s in stuck if s.for_good and s.sensor.name in freezing}
@@ -117,7 +116,14 @@ def problem_of(
     )
     masked = outliers, holdout_outliers
     return DiagnosisProblem(
-        library, tuple(recordings), known_effects, data, tuple(holdout_data), settings, masked, rims
+        library,
+        tuple(recordings),
+        known_effects,
+        data,
+        tuple(holdout_data),
+        settings,
+        masked,
+        [*remarks, *remarks_on_holdouts],
     )
 
 
@@ -140,8 +146,8 @@ def _without_outliers(
 
 def _examined(
     plant: PlantDescription, recordings: Sequence[Recording], trusted: bool
-) -> tuple[list[Recording], list[StuckSegment]]:
-    """The recordings without readings of stuck sensors, and when each of these is stuck.
+) -> tuple[list[Recording], list[StuckSegment], list[str]]:
+    """The recordings without readings of stuck sensors, when each of these is stuck, and what else looks wrong.
 
     Raises ValueError for a faulty recording.
     """
@@ -149,7 +155,8 @@ def _examined(
         usable(plant, replace(_without_rounding_errors(r), trusted=r.trusted or trusted), effects=True)
         for r in recordings
     ]
-    return [f.recording for f in checked], [s for f in checked for s in f.stuck]
+    doubts = [c.fault.text for c in checked if c.fault]
+    return [c.recording for c in checked], [s for c in checked for s in c.stuck], doubts
 
 
 def _without_rounding_errors(recording: Recording) -> Recording:

@@ -96,8 +96,8 @@ def examined(plant: PlantDescription, recording: Recording, thorough: bool = Fal
 def usable(plant: PlantDescription, recording: Recording, effects: bool = False) -> CheckedRecording:
     """Check a recording. Raises ValueError if it has a recording fault.
 
-    effects: whether the caller considers effects of sensors; a delayed sensor is then accepted, and so are readings
-    above a rim, which the caller must take as unknown (`with_rims_unknown`).
+    effects: whether the caller considers effects of sensors; one that lags or leads is then accepted, and so are
+    readings above a rim, which the caller must take as unknown (`with_rims_unknown`).
     """
     checked = examined(plant, recording)
     if checked.fault and not (effects and checked.fault.physical):

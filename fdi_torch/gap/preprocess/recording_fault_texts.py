@@ -12,8 +12,8 @@ from fdi_torch.plant.description import Sensor
 class RecordingFault:
     """A fault of the recording: its channels, and a sentence that says what to do.
 
-    silent: the channels are sensors whose readings do not depend on their levels. physical: an effect of the sensor
-    itself, such as a delay, would look the same, so that the gap diagnosis must accept the recording.
+    silent: the channels are sensors whose readings do not depend on their levels. physical: the sensor
+    itself, such as one that lags or leads, would look the same, so that the gap diagnosis must accept the recording.
     """
 
     channels: tuple[str, ...]
@@ -46,7 +46,7 @@ def clock_offset(columns: tuple[str, ...], delay: float, everything: bool) -> Re
         f"if that is a fault of the clock, name the file once more, with another shift: also: "
         f"[{{file: ..., columns: {{{fix}}}}}]"
     )
-    return RecordingFault(("all",) if everything else columns, text, physical=delay > 0 and not everything)
+    return RecordingFault(("all",) if everything else columns, text, physical=not everything)
 
 
 def not_held(channels: Sequence[str], interval: float) -> RecordingFault:
