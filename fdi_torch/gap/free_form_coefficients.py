@@ -44,9 +44,10 @@ def coefficients_of(
     reach: OperatingRange,
     returned: Sequence[Placement] = (),
 ) -> Coefficients:
-    """Coefficients of free forms, fitted to the residual that a fit has without its causes `returned`.
+    """Coefficients of free forms, fitted to the residual of a fit.
 
-    The amplitude of the coefficients' normal prior maximises the evidence.
+    returned: causes of the fit whose influence the free forms shall describe instead; it is added to the residual. The
+    amplitude of the coefficients' normal prior maximises the evidence.
     """
     options = options_of(free, fitter, reach)
     names = tuple(next(n for n, v in o.start.items() if v != 0.0) for o in options)

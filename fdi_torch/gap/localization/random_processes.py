@@ -38,10 +38,10 @@ SMALLEST_DRIFT = 0.1  # as a share of the sensor's noise
 def random_flows(
     regression: DiscrepancyRegression, noise: StateNoise, places: Sequence[str], base: float, needed: float
 ) -> list[LocalizedDiscrepancy]:
-    """The tank with the largest disturbance, if more likely an unknown flow than one of the disturbances of the plant.
+    """An unknown random flow into the tank with the largest one, if that explains more than `needed`; else nothing.
 
-    The prior of its logarithm is uniform over the range of the estimate instead of normal about the others'. needed: as
-    in `drifting_sensors`.
+    Of the random flows that every plant has, the logarithms of the standard deviations are normal about a common mean.
+    That of an unknown flow is uniform over the range of the estimate. needed: as in `drifting_sensors`.
     """
     fitter, fit, linearised = regression.fitter, regression.fit, regression.linearised
     largest = int(noise.intensity.argmax())
