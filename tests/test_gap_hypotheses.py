@@ -19,7 +19,7 @@ from fdi_torch.gap.diagnose import recalibrate
 from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.hypothesis_weights import HypothesisWeights
 from fdi_torch.gap.localization.localized_discrepancy import Estimate, LocalizedDiscrepancy
-from fdi_torch.gap.marginal_likelihood import log_evidence
+from fdi_torch.gap.marginal_likelihood import log_evidence, occam
 from fdi_torch.gap.problem import PLAIN, problem_of
 from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.plant.effect import Placement
@@ -67,6 +67,30 @@ def test_the_density_ratio_at_zero_is_the_ratio_of_evidences(sound: tuple[Fitter
         assert expected > h.weight + 3.0
 
 
+def test_sizes_of_which_only_the_sum_is_known_cannot_both_be_zero() -> None:
+    """A gain and a bias of one sensor: either alone may be nothing, both together are not."""
+    offset = Placement(effect("sensor_bias"), "h1")
+    recording = recorded(THREE_TANK, random_steps(THREE_TANK, 600.0), {"h1.sensor_gain.factor": 1.005}, seed=0)
+    fitter, null, _ = recalibrate(problem_of(THREE_TANK, [recording], [], PLAIN).data)
+    start = {"h1.sensor_gain.factor": 1.005, "h1.sensor_bias.bias": 1e-3}
+    both = fitter.fit(Candidate((GAIN, offset), (start,)), null)
+    pool = cast(ExplanationPool, SimpleNamespace(fitter=fitter, choices=CHOICES))
+    fewer = {
+        r.causes: r.weight for r in HypothesisWeights(pool, (), 1).without_small_effects(hypothesis_of(fitter, both))
+    }
+    for placements in [(GAIN,), (offset,), ()]:
+        values = {k: v for k, v in start.items() if any(k.startswith(p.prefix) for p in placements)}
+        fit = fitter.fit(Candidate(placements, (values,)), null)
+        assert fewer[causes_in_order(fit)] == pytest.approx(log_evidence(fitter, fit, CHOICES), abs=0.5)
+
+
+def test_parameters_of_which_the_readings_show_nothing_cost_nothing(sound: tuple[Fitter, Fit]) -> None:
+    fitter, _ = sound
+    space = fitter.engine(Candidate((GAIN,)), ["h1.sensor_gain.factor"]).space
+    nothing = fitter.data.readings.new_zeros(*fitter.data.readings.shape, len(space))
+    assert occam(fitter, space, space.nominal(), nothing) == pytest.approx(0.0, abs=1e-9)
+
+
 @pytest.mark.parametrize("mean", [0.4, -2.0, 5.0])
 def test_the_density_of_an_estimate_is_that_of_a_normal_distribution_between_its_bounds(mean: float) -> None:
     estimate = Estimate(torch.tensor([mean]).double(), torch.tensor([[0.7**2]]).double())
@@ -82,7 +106,7 @@ def test_a_size_that_cancels_with_its_ramp_is_compared_with_zero_at_that_ramp() 
     estimate = Estimate(torch.tensor([1.0, 1.0]).double(), covariance)
     assert estimate.log_density(0, 0.0, (-50.0, 50.0)) > -2.0
     expected = -0.5 / 1e-4 - math.log(0.01 * math.sqrt(2.0 * math.pi))
-    assert estimate.log_density(0, 0.0, (-50.0, 50.0), held=[1]) == pytest.approx(expected, rel=1e-3)
+    assert estimate.log_density(0, 0.0, (-50.0, 50.0), held={1: 1.0}) == pytest.approx(expected, rel=1e-3)
 
 
 def test_an_estimate_without_information_is_uniform_between_its_bounds() -> None:

@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 
 from fdi_torch.estimate.evidence import ODDS, log_law_error, log_odds_of_law
-from fdi_torch.gap.answer import CauseName
+from fdi_torch.gap.candidate import Key
 from fdi_torch.gap.cause_hypothesis import CauseHypothesis, causes_in_order, influence, relative_size
 from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.library import tanks_of
@@ -117,33 +117,36 @@ class HypothesisWeights:
                 explained += [law, *self.with_inexact_laws(law)]
         return explained
 
-    def without_small_effects(
-        self, h: CauseHypothesis, left_out: frozenset[CauseName] = frozenset()
-    ) -> list[CauseHypothesis]:
-        """The hypothesis without some of its effects, by the posterior over the prior density of their sizes at zero.
+    def without_small_effects(self, h: CauseHypothesis) -> list[CauseHypothesis]:
+        """The hypothesis without one or several of its effects, by the posterior over the prior density of their sizes
+        at zero.
 
-        This ratio is the Bayes factor for the hypothesis without an effect (Dickey, 1971), at the most likely onset and
-        the like: of an effect of size zero, they are arbitrary. Beside a discrepancy, a fit without the effect may end
-        in a local maximum instead. left_out: effects that `h` lacks.
+        This ratio is the Bayes factor for the hypothesis without these effects (Dickey, 1971), at the most likely onset
+        and the like: of an effect of size zero, they are arbitrary. Beside a discrepancy, a fit without the effects may
+        end in a local maximum instead.
         """
-        fewer: list[CauseHypothesis] = []
         if (at := h.discrepancy) is None:
-            return fewer
+            return []
+        space, fitter = at.fit.space, self.pool.fitter
+        low, high, _ = fitter.box(space)
+        # Each with the effects that remain of the explanation, and with the parameters of those that do not.
+        variants: list[tuple[CauseHypothesis, Key, dict[int, float]]] = [(h, h.explanation.key, {})]
         for p in at.fit.candidate.placements:
-            cause, name = (p.effect.name, p.location), p.full_name(p.effect.parameters(p.location, self.plant)[0].name)
-            if cause in h.causes and p.location != at.location and name in at.fit.space:
-                i, fitter = at.fit.space.index(name), self.pool.fitter
-                low, high, _ = fitter.box(at.fit.space)
-                nothing = at.fit.space.parameters[i].nominal
-                shape = [at.fit.space.index(n) for n in at.fit.values_of([p]) if n in at.fit.space and n != name]
-                density = at.estimate.log_density(i, nothing, (float(low[i]), float(high[i])), shape)
-                ratio = density + log_width(fitter, at.fit.space, i) + 0.5 * math.log(2.0 * math.pi)
-                key, without = h.explanation.key - left_out, left_out | {cause}
-                odds = log_prior(key - {cause}, self.pool.choices) - log_prior(key, self.pool.choices)
-                others = tuple(c for c in h.causes if c != cause)
-                reduced = replace(h, causes=others, weight=h.weight + ratio + odds)
-                fewer += [reduced, *self.without_small_effects(reduced, without)]
-        return fewer
+            size = p.full_name(p.effect.parameters(p.location, self.plant)[0].name)
+            if p.cause not in h.causes or p.location == at.location or size not in space:
+                continue
+            i, nothing = space.index(size), space.parameters[space.index(size)].nominal
+            shape = [space.index(n) for n in at.fit.values_of([p]) if n in space and n != size]
+            for reduced, key, held in tuple(variants):
+                fixed = held | {k: float(at.estimate.values[k]) for k in shape}
+                density = at.estimate.log_density(i, nothing, (float(low[i]), float(high[i])), fixed)
+                odds = log_prior(key - {p.cause}, self.pool.choices) - log_prior(key, self.pool.choices)
+                weight = reduced.weight + density + log_width(fitter, space, i) + odds
+                causes = tuple(c for c in reduced.causes if c != p.cause)
+                variants.append(
+                    (replace(reduced, causes=causes, weight=weight), key - {p.cause}, {**fixed, i: nothing})
+                )
+        return [variant for variant, _, _ in variants[1:]]
 
 
 def _shares(log_odds: Sequence[float]) -> list[float]:

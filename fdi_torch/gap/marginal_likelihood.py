@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.evidence import log_det
 from fdi_torch.estimate.evidence import log_prior as prior_of_set
+from fdi_torch.estimate.evidence import log_volume
 from fdi_torch.estimate.kalman import KalmanFilter, KalmanWhitening, Propagation, SensorNoise, StateNoise
 from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
 from fdi_torch.gap.answer import CauseName
@@ -161,11 +161,9 @@ def with_likeliest_parameters(fitter: Fitter, fit: Fit, starts: Sequence[Mapping
 
 def occam(fitter: Fitter, space: ParameterSpace, theta: Tensor, jacobian: Tensor) -> float:
     """Log of the volume of the posterior over that of the prior (Occam factor). jacobian (S, C, P): whitened."""
-    scale = fitter.box(space)[2]
-    j = (jacobian * scale).flatten(0, 1)
-    weight = torch.nan_to_num(scale / space.std(theta), posinf=0.0)
-    widths = torch.tensor([log_width(fitter, space, i) for i in range(len(space))], dtype=torch.float64)
-    return -0.5 * log_det(j.T @ j + torch.diag(weight**2)) + float((torch.log(scale) - widths).sum())
+    j, widths = jacobian.flatten(0, 1), [math.exp(log_width(fitter, space, i)) for i in range(len(space))]
+    precision = torch.nan_to_num(space.std(theta) ** -2.0, posinf=0.0)
+    return log_volume(j.T @ j + torch.diag(precision), torch.tensor(widths, dtype=torch.float64))
 
 
 def log_prior(causes: Iterable[CauseName], choices: int) -> float:
@@ -175,10 +173,10 @@ def log_prior(causes: Iterable[CauseName], choices: int) -> float:
 
 
 def log_width(fitter: Fitter, space: ParameterSpace, i: int) -> float:
-    """log(w / sqrt(2 pi)), where w is the width of a parameter's prior in the parameter's unit."""
+    """Log of the width of a parameter's prior: one over its density, at the mean of a normal one."""
     p = space.parameters[i]
     if math.isfinite(p.std):
-        return math.log(p.std)
+        return math.log(p.std * math.sqrt(2.0 * math.pi))
     low, high, _ = fitter.box(space)
     width = float(high[i] - low[i])
-    return math.log(width if math.isfinite(width) else 1.0) - 0.5 * math.log(2.0 * math.pi)
+    return math.log(width) if math.isfinite(width) else 0.0

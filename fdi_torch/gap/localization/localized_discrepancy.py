@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -45,18 +45,22 @@ class Estimate:
         scaled = scale.unsqueeze(1) * inverse
         return Estimate(fit.theta + scaled @ (basis.T @ right), scaled @ scaled.T)
 
-    def log_density(self, i: int, value: float, bounds: tuple[float, float], held: Sequence[int] = ()) -> float:
+    def log_density(
+        self, i: int, value: float, bounds: tuple[float, float], held: Mapping[int, float] | None = None
+    ) -> float:
         """Log density of parameter i at a value: normal between its bounds, and zero outside.
 
-        held: other parameters that keep their values. If the readings show nothing of the parameter, the density is
-        uniform between its bounds.
+        held: given values of other parameters. If the readings show nothing of the parameter, the density is uniform
+        between its bounds.
         """
         size = torch.sqrt(torch.diagonal(self.covariance))
-        correlation, others = self.covariance / size / size.unsqueeze(1), list(held)
+        correlation, others = self.covariance / size / size.unsqueeze(1), list(held or ())
         shared = torch.linalg.pinv(correlation[others][:, others], hermitian=True) @ correlation[others, i]
         left = 1.0 - float(correlation[i, others] @ shared)
         std = float(size[i]) * math.sqrt(max(left, COLLINEAR))
-        low, z, high = ((x - float(self.values[i])) / std for x in (bounds[0], value, bounds[1]))
+        moved = (torch.tensor(list((held or {}).values())).to(self.values) - self.values[others]) / size[others]
+        mean = float(self.values[i] + size[i] * (shared @ moved))
+        low, z, high = ((x - mean) / std for x in (bounds[0], value, bounds[1]))
         below, above = (torch.tensor([low, high]) if low + high < 0.0 else torch.tensor([-high, -low])).double()
         above, below = torch.special.log_ndtr(above), torch.special.log_ndtr(below)
         mass = float(above + torch.log(-torch.expm1(below - above)))
