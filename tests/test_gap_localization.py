@@ -24,6 +24,7 @@ from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegress
 from fdi_torch.gap.localization.fine_positions import Positions
 from fdi_torch.gap.localization.localize import localize
 from fdi_torch.gap.localization.predicted_levels import LevelFilter, measured_levels
+from fdi_torch.gap.localization.random_processes import random_flows
 from fdi_torch.gap.localization.regressor_families import Relays
 from fdi_torch.gap.localization.regressors import (
     backlash,
@@ -207,6 +208,29 @@ def test_noise_and_evidence_of_a_discrepancy_refer_to_one_trajectory(
     of_parameters = float(torch.linalg.slogdet(design.T @ design + torch.diag(root**2))[1])
     squares = least_chi_square(under, fit, about) + of_parameters + under.log_det
     assert likely.log_likelihood == pytest.approx(likely.noise.log_prior() - 0.5 * squares, abs=1e-2)
+
+
+def test_a_discrepancy_as_fast_as_the_noise_is_found_although_it_has_enlarged_the_estimate_of_the_noise() -> None:
+    run = recorded({}, 8, samples=600)
+    wave = torch.where(run.time % 8.0 < 4.0, 2e-3, -2e-3).unsqueeze(1) * torch.tensor([1.0, 0.0, 0.0])
+    case = problem_of(nominal_plant(), (replace(run, outputs=run.outputs + wave),), (), Settings(trusted=True))
+    fitter, null, _ = recalibrate(case.data)
+    own, likely = with_estimated_noise(fitter, null)
+    assert localize(own, null, likely.noise, ["h1", "T1"], needed=2.4).discrepancies[0].location == "h1"
+
+
+def test_the_size_of_a_random_flow_does_not_depend_on_the_unit_of_the_sensor() -> None:
+    sizes = []
+    for gain in (1.0, 10.0):
+        plant, run = nominal_plant(), recorded({}, 8, samples=600)
+        plant = replace(plant, sensors=tuple(replace(s, gain=gain * s.gain) for s in plant.sensors))
+        case = problem_of(plant, (replace(run, outputs=gain * run.outputs),), (), Settings(trusted=True))
+        fitter, null, _ = recalibrate(case.data)
+        own, likely = with_estimated_noise(fitter, null)
+        regression = DiscrepancyRegression(own, null, (), LevelFilter(likely.noise))
+        tank = plant.tanks[int(likely.noise.intensity.argmax())].name
+        sizes += [d.size for d in random_flows(regression, likely.noise, [tank], -math.inf, -math.inf)]
+    assert sizes[1] == pytest.approx(sizes[0], rel=0.05)
 
 
 def test_the_thresholds_of_a_relay_are_found_between_those_of_the_grid() -> None:

@@ -42,7 +42,10 @@ class HypothesisWeights:
         return [e for e in self.pool.explanations.values() if _names_unknown(e, h)]
 
     def with_discrepancy(self, explanation: RankedExplanation, at: LocalizedDiscrepancy) -> list[CauseHypothesis]:
-        """An explanation with a discrepancy at one place, which may be the error of the law of an effect there."""
+        """An explanation with a discrepancy at one place, which may be the error of the law of an effect there.
+
+        The odds divide the weight: both hypotheses together have the prior of the explanation.
+        """
         causes = causes_in_order(explanation.fit)
         # A random flow into a tank may stand for the error of any flow there.
         flow = at.noise.apart is not None

@@ -66,7 +66,7 @@ def localize(
     """
     base = log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     scale = torch.minimum(noise.scale, rival.scale) if rival else noise.scale
-    hopeless = _evidence_bound(fitter, fit, replace(noise, scale=scale)) - base < needed
+    hopeless = _perfect_evidence(fitter, fit, replace(noise, scale=scale)) - base < needed
     if hopeless and not places:
         return Localization((), 0.0)
     white = fitter.residual(fit.linearised.readings)[0]
@@ -75,11 +75,13 @@ def localize(
     if not math.isfinite(base + evidence):
         return Localization((), 0.0)
     itself = max(evidence - base, 0.0)
-    if hopeless or not places:
+    if not places:
         return Localization((), itself)
     ascent = Ascent(fitter, regression.level_filter, base)
     noises = likely, nearly_without_disturbances(likely)
     first_order = _first_order_gains(regression, noises, places, base)
+    if hopeless and all(expected < needed for expected, _ in first_order.values()):
+        return Localization((), itself)
     evaluated: dict[str, LocalizedDiscrepancy] = {}
     growth, examined = -math.inf, 0  # growth: largest ratio so far of what a first-order gain lacks to that gain
     for place, (expected, alone) in sorted(first_order.items(), key=lambda item: -item[1][0]):
@@ -189,12 +191,12 @@ def _first_order_gains(
     return first_order
 
 
-def _evidence_bound(fitter: Fitter, fit: Fit, noise: StateNoise) -> float:
-    """Upper bound of the log evidence of a discrepancy in addition to a fit.
+def _perfect_evidence(fitter: Fitter, fit: Fit, noise: StateNoise) -> float:
+    """Log evidence of a single regressor that explains everything except sensor noise, in addition to a fit.
 
-    It is the evidence of a single regressor that explains everything except sensor noise. A regressor that reduces
-    chi-square by G costs (1 + log G) / 2 nats at its most likely precision, plus the logarithm of the number of steps
-    in time for its selection.
+    No discrepancy has more evidence under sensor noise of this size, but one that varies as fast as the noise has
+    enlarged its estimate. A regressor that reduces chi-square by G costs (1 + log G) / 2 nats at its most likely
+    precision, plus the logarithm of the number of steps in time for its selection.
     """
     undisturbed = with_disturbances(fitter, fit, replace(noise, intensity=torch.zeros_like(noise.intensity)))
     count, residual = int(fitter.data.mask.sum()), undisturbed.residual(fit.linearised.readings)

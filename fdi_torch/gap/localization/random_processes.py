@@ -134,11 +134,9 @@ def _random_process(
 
 def _moved(fitter: Fitter, linearised: Linearised) -> float:
     """Norm of the change of the readings by the disturbances, in units of the sensor noise."""
-    whitening, plant = fitter.whitening, fitter.data.plant
-    assert whitening is not None
-    moved = whitening.smoothed(fitter.data.readings - linearised.readings[0])
-    names = [t.name for t in plant.tanks]
-    of_sensors = moved[:, [names.index(s.tank) for s in plant.sensors]]
+    assert fitter.whitening is not None
+    moved = fitter.whitening.smoothed(fitter.data.readings - linearised.readings[0])
+    of_sensors = (fitter.whitening.own.propagation.output @ moved.unsqueeze(-1)).squeeze(-1)
     return float(torch.linalg.vector_norm(torch.where(fitter.data.mask, of_sensors, 0.0) / fitter.noise.std))
 
 
