@@ -15,16 +15,7 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.blind.case_drafts import plans
-from fdi_torch.blind.cases import (
-    answers,
-    append,
-    lines_of,
-    make,
-    manifest,
-    read_plant,
-    read_recording,
-    write_cases,
-)
+from fdi_torch.blind.cases import answers, append, lines_of, make, manifest, read_plant, read_recording, write_cases
 from fdi_torch.blind.kinds import ON_NETWORKS, STANDARD
 from fdi_torch.blind.networks import Networks
 from fdi_torch.blind.places import effect_places
@@ -114,13 +105,7 @@ def seal(
 
 
 def answer_all(
-    diagnoses: Mapping[str, Diagnosis],
-    cases: int,
-    out: Path,
-    each: Each,
-    stop: float,
-    code: str,
-    tell: Tell,
+    diagnoses: Mapping[str, Diagnosis], cases: int, out: Path, each: Each, stop: float, code: str, tell: Tell
 ) -> None:
     """Diagnose the cases without an answer, one JSON line each, until the time `stop`. The key stays sealed."""
     lines = list(manifest(out).values())[:cases]

@@ -55,13 +55,7 @@ def in_turn(items: Sequence[str], seed: int, kind: str, index: int) -> str:
 
 
 def choose(
-    kind: Kind,
-    rig: Rig,
-    seed: int,
-    index: int,
-    library: Collection[str],
-    leave_out: Sequence[str],
-    trial: int = 0,
+    kind: Kind, rig: Rig, seed: int, index: int, library: Collection[str], leave_out: Sequence[str], trial: int = 0
 ) -> Chosen:
     """The causes of case `index` of this kind. trial: number of earlier draws whose causes were not visible."""
     rng, plant = case_generator(seed, kind.name, index, 2, *([trial] if trial else [])), rig.plant

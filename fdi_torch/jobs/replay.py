@@ -33,11 +33,7 @@ _DATA_KEYS = ("simulate", "recordings")
 
 
 def repeat_run(
-    log: LoggedRun,
-    path: Path,
-    overrides: Iterable[str] = (),
-    trials: Sequence[int] = (),
-    tell: Tell = silent,
+    log: LoggedRun, path: Path, overrides: Iterable[str] = (), trials: Sequence[int] = (), tell: Tell = silent
 ) -> Path:
     """Repeat the run of a log of `fdi train`, `fdi study`, `fdi gap` or `fdi monitor`, and log it at `path`.
 

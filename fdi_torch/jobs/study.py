@@ -157,10 +157,7 @@ class RehearsalResult:
 
 
 def rehearse(
-    rehearsal: Rehearsal,
-    resume: bool = False,
-    tell: Tell = silent,
-    listener: Listener | None = None,
+    rehearsal: Rehearsal, resume: bool = False, tell: Tell = silent, listener: Listener | None = None
 ) -> RehearsalResult:
     """Compute every task that the log does not have yet. tell(share, text): progress, called before each task."""
     folder = Path(rehearsal.config.output.folder)

@@ -39,14 +39,7 @@ class Ordered:
     notes: list[str]
 
 
-def in_order(
-    seconds: np.ndarray,
-    values: np.ndarray,
-    sort: bool,
-    place: str,
-    rows: np.ndarray,
-    summer: str,
-) -> Ordered:
+def in_order(seconds: np.ndarray, values: np.ndarray, sort: bool, place: str, rows: np.ndarray, summer: str) -> Ordered:
     """Drop rows that repeat the one before; with `sort`, sort the others and merge rows with equal times.
 
     Of several values of a channel at one time the last one counts. place: format of a row in messages; rows: their
