@@ -184,7 +184,6 @@ def rehearse(
 
 
 def result_tables(rehearsal: Rehearsal, results: Sequence[tuple[str, Mapping[str, Any]]]) -> tuple[Table, ...]:
-    """Result table of each plan."""
     groups: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
     for group, numbers in results:
         groups[group].append(numbers)

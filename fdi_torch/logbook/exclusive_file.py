@@ -43,7 +43,6 @@ class ExclusiveFile:
             raise LogError(f"{self.dead}; nothing more is logged")
 
     def sync(self) -> None:
-        """Flush the file to disk."""
         with named_errors(self.path, LogError):
             os.fsync(self._file)
 

@@ -132,7 +132,6 @@ class Run:
         return self.attachment("config.yaml").decode() if "config.yaml" in self.attachments else ""
 
     def attachment(self, name: str) -> bytes:
-        """The bytes of an attachment."""
         if name not in self.attachments:
             known = ", ".join(self.attachments) or "(none)"
             raise LogError(f"{self.path}: expected one of the attachments {known}, got {name}")

@@ -107,7 +107,6 @@ class Balance:
 
     @property
     def is_metered(self) -> bool:
-        """Whether there is any metered flow."""
         return any(bool((tank.by_flow[..., tank.metered] != 0.0).any()) for tank in self.tanks)
 
     def log_evidence(self, unrelated: float = UNRELATED) -> Tensor:

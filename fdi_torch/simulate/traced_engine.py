@@ -145,7 +145,6 @@ class _Run:
             self._set_state(kind, self.injection.memory[..., first : first + count])
 
     def _step(self) -> None:
-        """One step of the grid."""
         self.compute(self.program.step)
 
     def _levels(self) -> list[tuple[Tensor, Change]]:

@@ -96,7 +96,6 @@ def confusion_section(material: Material) -> Section | None:
 
 
 def misses_section(material: Material) -> Section | None:
-    """Every wrong answer."""
     sheet = misses(benchmark_rows(material))
     return Section(sheet.title, [shown(replace(sheet, title=""))]) if sheet.rows else None
 
