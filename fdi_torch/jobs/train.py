@@ -184,12 +184,6 @@ class SearchLogger:
         self.iterations = 0
 
     def generation(self, search: Search) -> None:
-        state = search.state
-        self.write(search)
-        share = 0.05 + 0.8 * state.evaluations / self.settings.search.evaluations
-        self.tell(min(share, 0.85), f"search: generation {state.generation}, cost {float(state.cost[0, 0]):.3g}")
-
-    def write(self, search: Search) -> None:
         """Log a generation and its best member, and the complete state if it is due."""
         state = search.state
         costs = as_array(state.cost)[0]
@@ -199,6 +193,8 @@ class SearchLogger:
         self.log.write(GENERATION, row, state.generation, units=self.units)
         if state_is_due(state.generation):
             self.log.population(state.generation, search.to_dict())
+        share = 0.05 + 0.8 * state.evaluations / self.settings.search.evaluations
+        self.tell(min(share, 0.85), f"search: generation {state.generation}, cost {float(costs[0]):.3g}")
 
     def iteration(self, progress: Progress) -> None:
         self.iterations += 1
