@@ -101,7 +101,7 @@ def replay_study(
     done: dict[int, Trial] = {}
     with RunLog(path, "study", **study_job.origin_of(study), parent_run_id=parent) as again:
         for block in run_blocks(study.plan, study.plan.blocks_of(numbers)):
-            log_trials(again, study.plan, block)
+            log_trials(again, study.plan.seed, block)
             done |= {trial.number: trial for trial in block}
             tell(len(done) / len(numbers), f"{len(done)} of {len(numbers)} trials")
         if len(done) == study.plan.trials:
