@@ -37,8 +37,8 @@ def sentence(place: Path | str, error: OSError) -> str:
 
 
 @contextmanager
-def named_errors(place: Path | str) -> Iterator[None]:
-    """A context in which the operating system's errors name the file and become DiskErrors."""
+def named_errors(place: Path | str, kind: type[OSError] = DiskError) -> Iterator[None]:
+    """A context in which the operating system's errors name the file and become errors of that kind."""
     try:
         yield
     except BrokenPipeError:
@@ -46,7 +46,7 @@ def named_errors(place: Path | str) -> Iterator[None]:
     except OSError as error:
         if error.errno is None:  # one of this program's errors, which is a sentence already
             raise
-        raise DiskError(sentence(place, error)) from None
+        raise kind(sentence(place, error)) from None
 
 
 @contextmanager

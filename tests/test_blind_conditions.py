@@ -10,10 +10,10 @@ import pytest
 
 from fdi_torch.blind import case_drafts, cases
 from fdi_torch.blind.case_drafts import plans
-from fdi_torch.blind.case_kinds import ON_NETWORKS
 from fdi_torch.blind.cases import make
 from fdi_torch.blind.conditions import commands_of_pumps
 from fdi_torch.blind.inputs import BAND, LevelControl, draw_control
+from fdi_torch.blind.kinds import ON_NETWORKS
 from fdi_torch.blind.networks import HIGHEST, LOWEST, Networks, equilibrium, with_unmeasured
 from fdi_torch.blind.plants import three_tank
 from fdi_torch.blind.random_flows import HOLDS, KINDS, Disturbance, draw_disturbance

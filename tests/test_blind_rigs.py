@@ -13,13 +13,14 @@ import pytest
 import torch
 
 from fdi_torch.blind import case_drafts, cases, conditions
+from fdi_torch.blind.case_causes import UNKNOWN, choose, unknown_to
 from fdi_torch.blind.case_drafts import plans
-from fdi_torch.blind.case_kinds import KINDS, STANDARD, UNKNOWN, choose, unknown_to
 from fdi_torch.blind.case_readings import READOUT_LAWS, SENSOR_LAWS
 from fdi_torch.blind.cases import Case, as_csv, make
 from fdi_torch.blind.conditions import WIDEST, as_built, asked_of_pumps, exercised
 from fdi_torch.blind.deviation import Array, Deviation
 from fdi_torch.blind.inputs import SIGNALS, commanded, with_standstills
+from fdi_torch.blind.kinds import KINDS, STANDARD
 from fdi_torch.blind.laws_pipe import HEAD_LAWS, PIPE_LAWS
 from fdi_torch.blind.laws_pump import PUMP_LAWS
 from fdi_torch.blind.laws_tank import STORAGE_LAWS, TANK_LAWS

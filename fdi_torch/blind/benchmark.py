@@ -15,17 +15,8 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.blind.case_drafts import plans
-from fdi_torch.blind.case_kinds import ON_NETWORKS, STANDARD
-from fdi_torch.blind.cases import (
-    answers,
-    append,
-    lines_of,
-    make,
-    manifest,
-    read_plant,
-    read_recording,
-    write_cases,
-)
+from fdi_torch.blind.cases import answers, append, lines_of, make, manifest, read_plant, read_recording, write_cases
+from fdi_torch.blind.kinds import ON_NETWORKS, STANDARD
 from fdi_torch.blind.networks import Networks
 from fdi_torch.blind.places import effect_places
 from fdi_torch.blind.plants import Rig, three_tank
@@ -114,13 +105,7 @@ def seal(
 
 
 def answer_all(
-    diagnoses: Mapping[str, Diagnosis],
-    cases: int,
-    out: Path,
-    each: Each,
-    stop: float,
-    code: str,
-    tell: Tell,
+    diagnoses: Mapping[str, Diagnosis], cases: int, out: Path, each: Each, stop: float, code: str, tell: Tell
 ) -> None:
     """Diagnose the cases without an answer, one JSON line each, until the time `stop`. The key stays sealed."""
     lines = list(manifest(out).values())[:cases]
@@ -132,14 +117,11 @@ def answer_all(
         append(answers(out, name), json.dumps(result | {"code": code}))
         done, now = total - len(todo) + n, time.perf_counter()
         remaining = min((now - start) / n * (len(todo) - n), max(stop - now, 0.0))
+        left = f"{remaining:.0f} s" if remaining < 100 else f"{remaining / 60:.0f} min"
         text = f"{name} says {result['answer'].get('verdict')} of {result['case']} in {result['sec']:.1f} s"
-        tell(done / total, f"{text}; {done} of {total} answers, {_span(remaining)} left")
+        tell(done / total, f"{text}; {done} of {total} answers, {left} left")
         if now > stop:
             break
-
-
-def _span(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
 def answer(diagnoses: Mapping[str, Diagnosis], out: Path, task: Task) -> Done:

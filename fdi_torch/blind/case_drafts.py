@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdi_torch.blind.case_kinds import FAINT, KINDS, Chosen, Kind, case_generator, choose
+from fdi_torch.blind.case_causes import Chosen, case_generator, choose
 from fdi_torch.blind.case_readings import PARTS, noisy_readings
 from fdi_torch.blind.conditions import (
     COARSE,
@@ -23,6 +23,7 @@ from fdi_torch.blind.conditions import (
 )
 from fdi_torch.blind.deviation import Array
 from fdi_torch.blind.inputs import channel_to_rest
+from fdi_torch.blind.kinds import FAINT, KINDS, Kind
 from fdi_torch.blind.named_effects import NominalRun, draw_effect
 from fdi_torch.blind.networks import Networks, with_unmeasured
 from fdi_torch.blind.plants import Rig

@@ -82,7 +82,6 @@ def _run(drafts: Sequence[CaseDraft]) -> list[list[SimulatedRun]]:
 
 
 def _case(draft: CaseDraft, runs: Sequence[SimulatedRun]) -> Case:
-    """Readings, commands and truth of a case."""
     c, rig, readings, noise_rms, gap_rms = draft.conditions, draft.conditions.rig, [], {}, {}
     for part, (name, _) in enumerate(PARTS):
         noisy, clean = noisy_readings(c, runs[part], part, draft.deviations)

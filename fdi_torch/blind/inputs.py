@@ -168,9 +168,6 @@ class LevelControl:
     gain: float
     quantum: float
 
-    def start(self) -> Controller:
-        return Controller(self)
-
 
 class Controller:
     """State of a level control: its output depends on its previous output."""

@@ -6,8 +6,8 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from fdi_torch.blind.case_kinds import KINDS
 from fdi_torch.blind.conditions import HELD_OUT
+from fdi_torch.blind.kinds import KINDS
 from fdi_torch.blind.places import Cause, canonical, effect_places
 from fdi_torch.blind.sizes import size_errors
 from fdi_torch.blind.statistics import mean_interval, median_interval, share_of

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.blind.deviation import Array, Deviation, Index, Moment
-from fdi_torch.blind.inputs import LevelControl
+from fdi_torch.blind.inputs import Controller, LevelControl
 from fdi_torch.blind.laws_pipe import HEAD_LAWS, PIPE_LAWS
 from fdi_torch.blind.laws_pump import PUMP_LAWS
 from fdi_torch.blind.laws_tank import STORAGE_LAWS, TANK_LAWS
@@ -231,7 +231,7 @@ def simulate(rigs: HiddenRigs, drives: Sequence[Drive], step: float = STEP) -> l
     asked = np.concatenate([drive.asked[row] for drive, row in zip(drives, rows, strict=True)], axis=1)
     disturbance = _disturbances(rigs, drives, rows)
     controls = [
-        (drive.control.start(), int(rigs.first_tank[i]), int(rigs.first_pump[i]), drive.error)
+        (Controller(drive.control), int(rigs.first_tank[i]), int(rigs.first_pump[i]), drive.error)
         for i, drive in enumerate(drives)
         if drive.control
     ]

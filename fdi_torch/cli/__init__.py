@@ -232,12 +232,10 @@ def _whole_number(text: str) -> int:
 
 
 def options_of(name: str) -> ModuleType:
-    """The module with the options of a command."""
     return importlib.import_module(f"fdi_torch.cli.options.{name}")
 
 
 def command_parser(name: str) -> argparse.ArgumentParser:
-    """The parser of a command's arguments."""
     options = options_of(name)
     parser = _Parser(
         prog=f"fdi {name}",

@@ -46,18 +46,7 @@ def _show(entry: Entry, of_plant: bool, screen: Screen) -> None:
 
 
 def _as_json(entry: Entry) -> dict[str, Any]:
-    parameters = [
-        {"name": p.name, "unit": p.unit, "nominal": p.nominal, "low": p.low, "high": p.high, "meaning": p.meaning}
-        for p in entry.parameters
-    ]
-    return {
-        "effect": entry.name,
-        "meaning": entry.meaning,
-        "law": entry.law,
-        "stage": entry.stage,
-        "kinds": list(entry.kinds),
-        "at": list(entry.at),
-        "begins": entry.begins,
-        "parameters": parameters,
-        "mistaken_for": list(entry.mistaken_for),
-    }
+    shown = ("meaning", "law", "stage", "kinds", "at", "begins", "mistaken_for")
+    of_parameters = ("name", "unit", "nominal", "low", "high", "meaning")
+    parameters = [{name: getattr(p, name) for name in of_parameters} for p in entry.parameters]
+    return {"effect": entry.name, **{name: getattr(entry, name) for name in shown}, "parameters": parameters}

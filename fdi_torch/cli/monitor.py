@@ -31,10 +31,7 @@ Publish = Callable[[dict[str, Any]], None] | None
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     monitor_run = load_monitor(arguments.config, overrides(arguments))
-    with (
-        screen.progress("monitor") as advance,
-        outlets(arguments, monitor_run.name, screen) as (listener, publish),
-    ):
+    with screen.progress("monitor") as advance, outlets(arguments, monitor_run.name, screen) as (listener, publish):
         callbacks = MonitorCallbacks(
             advance, lambda e: _show_event(e, screen, publish), lambda p: _show_setup(p, screen), listener
         )

@@ -1,6 +1,6 @@
 """`fdi rehearse`: what it does and prints. Its options: `options/rehearse.py`.
 
-Path: cli.rehearse.run → config.rehearsal_file.load_rehearsal → jobs.study.rehearse → jobs.study.result_tables
+Path: cli.rehearse.run → config.rehearsal_file.load_rehearsal → jobs.study.rehearse
 """
 
 from __future__ import annotations

@@ -35,8 +35,7 @@ class TagConfig(Strict):
     offset: float = Field(0.0, description="added after that, in `unit`")
     constant: Amount | None = Field(None, description="the value of an input that is not delivered")
     held: HeldFor | None = Field(
-        None,
-        description="time for which a value is kept until the next; by default inputs always, readings never",
+        None, description="time for which a value is kept until the next; by default inputs always, readings never"
     )
 
 

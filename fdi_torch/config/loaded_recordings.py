@@ -53,9 +53,7 @@ class LoadedRecording:
 
 
 def load_recordings(
-    configs: Sequence[RecordingConfig],
-    plant: PlantDescription,
-    base: Path | None = None,
+    configs: Sequence[RecordingConfig], plant: PlantDescription, base: Path | None = None
 ) -> list[LoadedRecording]:
     """All recordings, cut into segments with known inputs."""
     segments = []

@@ -72,10 +72,7 @@ def _key(field: dataclasses.Field[Any], hint: Any) -> tuple[Any, Any]:
             none = pydantic.BeforeValidator(lambda value: None if value == meta["none"] else value)
             annotation = Annotated[annotation | None, none]
     return annotation, Field(
-        ... if default is MISSING else default,
-        description=meta["meaning"],
-        ge=meta.get("least"),
-        le=meta.get("most"),
+        ... if default is MISSING else default, description=meta["meaning"], ge=meta.get("least"), le=meta.get("most")
     )
 
 

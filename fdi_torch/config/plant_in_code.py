@@ -113,11 +113,7 @@ class Plant(PlantDescription):
 
     __hash__ = None  # type: ignore[assignment]
 
-    def ode(
-        self,
-        inputs: Inputs,
-        theta: Mapping[str, float | torch.Tensor] | None = None,
-    ) -> PlantOde:
+    def ode(self, inputs: Inputs, theta: Mapping[str, float | torch.Tensor] | None = None) -> PlantOde:
         """dh/dt = f(t, h) of this plant, for `torchdiffeq.odeint`; `.start` is the state at which `simulate` starts.
 
         inputs: a `Recording`, constant inputs (channels,) in SI, or a function of t in s to these. theta: parameters

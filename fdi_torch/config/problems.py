@@ -57,8 +57,6 @@ class Source:
 
 
 class UnknownKeyError(ValueError):
-    """An unknown key."""
-
     def __init__(self, sentence: str, key: str) -> None:
         super().__init__(sentence)
         self.key = key

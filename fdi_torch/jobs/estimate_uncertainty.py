@@ -44,12 +44,7 @@ def profiles_of(
 
 @on_its_device
 def with_draws(
-    fitting: Fitting,
-    result: HybridResult,
-    draws: int,
-    seed: int,
-    most_steps: int = 16_000,
-    tell: Tell = silent,
+    fitting: Fitting, result: HybridResult, draws: int, seed: int, most_steps: int = 16_000, tell: Tell = silent
 ) -> HybridResult:
     """The result whose estimate holds draws from the posterior, with the noise levels of the standard errors."""
     theta, likelihood = result.estimate.value, result.likelihood

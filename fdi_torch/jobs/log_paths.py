@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 
 import torch
@@ -15,11 +15,8 @@ from fdi_torch.logbook.reader import Run as Log
 
 # Topics that a resumed run copies from the log of the killed run.
 COPIED_TOPICS = (
-    "/plant/input",
-    "/plant/output",
-    "/plant/truth",
-    "/estimator/de/generation",
-    "/estimator/de/population",
+    *("/plant/input", "/plant/output", "/plant/truth"),
+    *("/estimator/de/generation", "/estimator/de/population"),
 )
 
 RESUMES = "the same command with --resume goes on from there"
@@ -30,11 +27,9 @@ ENDED = ("completed", "not_converged")
 
 def free_path(folder: Path, name: str, ending: str = "mcap") -> Path:
     """NAME.mcap in the folder, or NAME_2.mcap, NAME_3.mcap ... if it exists."""
-    for k in count(1):
-        path = folder / (f"{name}.{ending}" if k == 1 else f"{name}_{k}.{ending}")
-        if not path.exists() and not partial_path(path).exists():
-            return path
-    raise AssertionError("unreachable")
+    names = chain([name], (f"{name}_{k}" for k in count(2)))
+    paths = (folder / f"{each}.{ending}" for each in names)
+    return next(path for path in paths if not path.exists() and not partial_path(path).exists())
 
 
 def partial_path(path: Path) -> Path:

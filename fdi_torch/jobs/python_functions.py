@@ -157,8 +157,7 @@ def gap(
 
     plant, recordings: without recordings, plant is a run: its file or its keys, as of `train`.
     holdouts: recordings on which the corrected model is validated. out: folder of the log. settings: library, leave_out
-    (names of effects), step (s), most, named_only, as the options of `fdi gap`. tell(share, text): receives the
-    progress, from 0 to 1, and a line about it; by default nothing is shown, and tell=print prints it. Raises ValueError
+    (names of effects), step (s), most, named_only, as the options of `fdi gap`. tell: as of `train`. Raises ValueError
     for other settings.
     """
     valid_settings = [field.name for field in fields(Settings)]
@@ -187,8 +186,8 @@ def monitor(
 
     keys: those of a monitor file, such as fault_free=["0 s", "300 s"]. plant: without a recording, a monitor file or
     its keys, such as {"plant": plant, "recording": recording, "fault_free": ["0 s", "300 s"]}.
-    tell(share, text): receives the progress, from 0 to 1 (None along a live source), and a line about it; by default
-    nothing is shown, and tell=print prints it. Raises ConfigError, which names the wrong key and the expected value.
+    tell: as of `train`; the progress is None along a live source. Raises ConfigError, which names the wrong key and the
+    expected value.
     """
     run: Any = plant
     if recording is not None:
@@ -215,7 +214,7 @@ def predict(
 
     plant, recording: without a recording, plant is a run with one: its file or its keys, as of `train`.
     start_samples: number of samples for estimating the initial levels; settle: the same as a time, s. step: of the
-    integration, s. vary: patterns of constants that are estimated from the start too. tell(share, text): as of `gap`.
+    integration, s. vary: patterns of constants that are estimated from the start too. tell: as of `train`.
     Raises ValueError if an input is unknown for a time.
     """
     if isinstance(recording, list | tuple):
@@ -247,7 +246,7 @@ def refit(
     plant, recordings: without recordings, plant is a run: its file or its keys, as of `train`.
     holdouts: recordings that both plants predict freely, `RefitResult.trials`; start_samples, settle: as of `predict`.
     step: of the simulation, s. choices: leave_out, hold, vary (names or patterns), as the options of `fdi refit`.
-    tell(share, text): as of `gap`. Raises ValueError for a hold-out that is one of the recordings.
+    tell: as of `train`. Raises ValueError for a hold-out that is one of the recordings.
     """
     plant, segments = _plant_and_recordings(plant, recordings, "refit")
     held_out = recordings_of(holdouts, plant)
@@ -270,8 +269,7 @@ def study(
     """Repeat an experiment many times and compare the estimates with their bounds, as `fdi study` does.
 
     study: a study file, or the same as a mapping. resume: continue a killed run. cluster: address of a Dask scheduler,
-    or 'local'. tell(share, text): receives the progress, from 0 to 1, and a line about it; by default nothing is shown,
-    and tell=print prints it.
+    or 'local'. tell: as of `train`.
     """
     given = _resolved(study, Study, load_study, build_study, "study", advice="")
     return study_job.run_study(given, resume, cluster, rounded(tell))

@@ -25,6 +25,7 @@ from fdi_torch.jobs.train import STATE, estimate_logged, log_recordings, state_i
 from fdi_torch.logbook import LogError, Message, RunLog, series
 from fdi_torch.logbook import Run as LoggedRun
 from fdi_torch.logbook.replay import Select
+from fdi_torch.logbook.signals import recording_groups
 from fdi_torch.progress import Tell, silent
 from fdi_torch.study.monte_carlo import Trial, run_blocks
 
@@ -33,11 +34,7 @@ _DATA_KEYS = ("simulate", "recordings")
 
 
 def repeat_run(
-    log: LoggedRun,
-    path: Path,
-    overrides: Iterable[str] = (),
-    trials: Sequence[int] = (),
-    tell: Tell = silent,
+    log: LoggedRun, path: Path, overrides: Iterable[str] = (), trials: Sequence[int] = (), tell: Tell = silent
 ) -> Path:
     """Repeat the run of a log of `fdi train`, `fdi study`, `fdi gap` or `fdi monitor`, and log it at `path`.
 
@@ -105,7 +102,7 @@ def replay_study(
     done: dict[int, Trial] = {}
     with RunLog(path, "study", **study_job.origin_of(study), parent_run_id=parent) as again:
         for block in run_blocks(study.plan, study.plan.blocks_of(numbers)):
-            log_trials(again, study.plan, block)
+            log_trials(again, study.plan.seed, block)
             done |= {trial.number: trial for trial in block}
             tell(len(done) / len(numbers), f"{len(done)} of {len(numbers)} trials")
         if len(done) == study.plan.trials:
@@ -161,12 +158,7 @@ def _expect_no_data(overrides: Iterable[str], keys: Sequence[str]) -> None:
 
 def logged_recordings(log: LoggedRun, run: Run) -> list[LoadedRecording]:
     """The recordings in a log, with the configured knowledge of their initial levels."""
-    topics = dict.fromkeys(m.topic for m in log.messages() if m.topic.startswith("/plant/"))
-    groups = [
-        topic.removeprefix("/plant").strip("/").removesuffix("output").strip("/")
-        for topic in topics
-        if topic.endswith("/output")
-    ]
+    groups = recording_groups(message.topic for message in log.messages())
     levels = _start_levels(run, len(groups), log.path)
     return [
         LoadedRecording(logged_recording(log, group, k), level)

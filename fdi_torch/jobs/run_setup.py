@@ -133,7 +133,6 @@ def expect_enough_samples(recordings: Sequence[Recording], space: ParameterSpace
 
 
 def hybrid_settings(config: EstimationConfig) -> HybridSettings:
-    """The run file's settings as settings of the estimator."""
     steps = [None if step == "auto" else float(step) for step in (config.step.search, config.step.refine)]
     return HybridSettings(
         objectives=(config.objective.search, config.objective.refine),

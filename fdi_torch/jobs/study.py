@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from fdi_torch.progress import Tell, silent
 from fdi_torch.report.setting_tables import setting_tables
 from fdi_torch.study.cluster import run_on_cluster
 from fdi_torch.study.monte_carlo import Trial, run_blocks
-from fdi_torch.study.study_plan import Plan
 from fdi_torch.study.summary import Isolation, Summary, count_modes, summarise
 from fdi_torch.tables import Shown, Table, in_display_unit, in_its_units
 
@@ -83,7 +82,7 @@ def run_study(
         computed = run_blocks(study.plan, blocks) if cluster is None else run_on_cluster(study.plan, blocks, cluster)
         for done in computed:
             new = {trial.number: trial for trial in done if trial.number not in trials}
-            log_trials(log, study.plan, new.values())
+            log_trials(log, study.plan.seed, new.values())
             trials |= new
             tell(*progress(len(trials), copied, study.plan.trials, time.monotonic() - started))
         seconds = time.monotonic() - started
@@ -110,11 +109,9 @@ def copied_trials(log: RunLog, before: LoggedRun | None) -> dict[int, Trial]:
     return trials
 
 
-def log_trials(log: RunLog, plan: Plan, trials: Iterable[Trial]) -> None:
-    for trial in trials:
-        log.trial(
-            trial.number, trial.numbers, group=trial.setting, seed=f"{plan.seed}/{trial.number}", status=trial.status
-        )
+def log_trials(log: RunLog, seed: int, trials: Iterable[Trial]) -> None:
+    for t in trials:
+        log.trial(t.number, t.numbers, group=t.setting, seed=f"{seed}/{t.number}", status=t.status)
     log.flush()
 
 
@@ -157,10 +154,7 @@ class RehearsalResult:
 
 
 def rehearse(
-    rehearsal: Rehearsal,
-    resume: bool = False,
-    tell: Tell = silent,
-    listener: Listener | None = None,
+    rehearsal: Rehearsal, resume: bool = False, tell: Tell = silent, listener: Listener | None = None
 ) -> RehearsalResult:
     """Compute every task that the log does not have yet. tell(share, text): progress, called before each task."""
     folder = Path(rehearsal.config.output.folder)
@@ -168,27 +162,19 @@ def rehearse(
     tasks = [task for plan in rehearsal.plans for task in plan.tasks()]
     records = rehearsal.log_records()
     with RunLog(path, "rehearsal", **records, listener=listener, after_interruption=RESUMES) as log:
-        results: dict[int, tuple[str, Mapping[str, Any]]] = {
-            n: (done.setting, done.numbers) for n, done in copied_trials(log, before).items()
-        }
-        earlier, started = len(results), time.monotonic()
+        trials = copied_trials(log, before)
+        earlier, started = len(trials), time.monotonic()
         for number, task in enumerate(tasks):
-            if number not in results:
-                tell(len(results) / len(tasks), task.group)
-                results[number] = (task.group, dict(task.compute()))
-                seed = f"{rehearsal.config.seed}/{number}"
-                log.trial(number, results[number][1], group=task.group, seed=seed, status="done")
-                log.flush()
-        tables = result_tables(rehearsal, [results[number] for number in sorted(results)])
+            if number not in trials:
+                tell(len(trials) / len(tasks), task.group)
+                numbers: dict[str, Any] = dict(task.compute())
+                trials[number] = Trial(number, task.group, "done", numbers)
+                log_trials(log, rehearsal.config.seed, [trials[number]])
+        groups: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
+        for _, trial in sorted(trials.items()):
+            groups[trial.setting].append(trial.numbers)
+        tables = tuple(plan.result_table(groups) for plan in rehearsal.plans)
         log.result(
             {"tables": [{"title": t.title, "header": t.header, "rows": t.rows, "said": t.summary} for t in tables]}
         )
-    return RehearsalResult(tables, len(tasks), len(results) - earlier, time.monotonic() - started, path)
-
-
-def result_tables(rehearsal: Rehearsal, results: Sequence[tuple[str, Mapping[str, Any]]]) -> tuple[Table, ...]:
-    """Result table of each plan."""
-    groups: dict[str, list[Mapping[str, Any]]] = defaultdict(list)
-    for group, numbers in results:
-        groups[group].append(numbers)
-    return tuple(plan.result_table(groups) for plan in rehearsal.plans)
+    return RehearsalResult(tables, len(tasks), len(trials) - earlier, time.monotonic() - started, path)

@@ -26,13 +26,7 @@ from fdi_torch.jobs.estimate_uncertainty import profiled_names, profiles_of, wit
 from fdi_torch.jobs.log_paths import RESUMES, log_to_write, unfinished_search
 from fdi_torch.jobs.logged_recordings import log_prediction, log_recording
 from fdi_torch.jobs.recording_check import thorough_findings
-from fdi_torch.jobs.run_setup import (
-    fitting_of,
-    hybrid_settings,
-    recordings_of,
-    requested_space,
-    simulated_truth,
-)
+from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, requested_space, simulated_truth
 from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.progress import Tell, rounded, silent
@@ -106,13 +100,7 @@ class TrainResult(Shown):
         return profiles_of(self.fitting, self.result, names or self.result.estimate.names, confidence)
 
     @in_its_units
-    def sample(
-        self,
-        draws: int = 1000,
-        seed: int = 0,
-        most_steps: int = 16_000,
-        tell: Tell = silent,
-    ) -> Draws:
+    def sample(self, draws: int = 1000, seed: int = 0, most_steps: int = 16_000, tell: Tell = silent) -> Draws:
         """Draws from the posterior (extra `draws`); see `draw_posterior`. tell: as of `train`; it may take minutes."""
         drawn = with_draws(self.fitting, self.result, draws, seed, most_steps, rounded(tell)).estimate.draws
         assert drawn is not None
@@ -156,12 +144,7 @@ def train(run: Run, tell: Tell = silent, resume: bool = False, listener: Listene
 
 
 def estimate_logged(
-    run: Run,
-    fitting: Fitting,
-    log: RunLog,
-    tell: Tell,
-    resume: Search | None = None,
-    doubts: Sequence[str] = (),
+    run: Run, fitting: Fitting, log: RunLog, tell: Tell, resume: Search | None = None, doubts: Sequence[str] = ()
 ) -> tuple[HybridResult, tuple[Profile, ...], tuple[str, ...]]:
     """Estimate the parameters, with the profiles and draws asked for, and log each step and the result.
 
@@ -201,12 +184,6 @@ class SearchLogger:
         self.iterations = 0
 
     def generation(self, search: Search) -> None:
-        state = search.state
-        self.write(search)
-        share = 0.05 + 0.8 * state.evaluations / self.settings.search.evaluations
-        self.tell(min(share, 0.85), f"search: generation {state.generation}, cost {float(state.cost[0, 0]):.3g}")
-
-    def write(self, search: Search) -> None:
         """Log a generation and its best member, and the complete state if it is due."""
         state = search.state
         costs = as_array(state.cost)[0]
@@ -216,6 +193,8 @@ class SearchLogger:
         self.log.write(GENERATION, row, state.generation, units=self.units)
         if state_is_due(state.generation):
             self.log.population(state.generation, search.to_dict())
+        share = 0.05 + 0.8 * state.evaluations / self.settings.search.evaluations
+        self.tell(min(share, 0.85), f"search: generation {state.generation}, cost {float(costs[0]):.3g}")
 
     def iteration(self, progress: Progress) -> None:
         self.iterations += 1

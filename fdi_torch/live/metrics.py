@@ -45,7 +45,6 @@ class Metrics:
         self._size = gauge("fault_size", "estimated parameter, SI", "fault")
 
     def __call__(self, channel: Channel, log_time: int, data: bytes) -> None:
-        """Take one message of the log."""
         if channel.topic not in TOPICS:
             return
         payload = orjson.loads(data)

@@ -97,10 +97,7 @@ class OpcUaSource:
         """Deliver notifications until `close`. The library renews a lost connection, and the session if it can."""
         try:
             client = self._asyncua.Client(
-                self._url,
-                watchdog_intervall=ALIVE,
-                auto_reconnect=True,
-                reconnect_max_delay=LONGEST_RETRY,
+                self._url, watchdog_intervall=ALIVE, auto_reconnect=True, reconnect_max_delay=LONGEST_RETRY
             )
             client.connection_lost_callback = self._lost
             if (known := credentials()) is not None:

@@ -102,13 +102,11 @@ class Inbox:
         self._dropped = 0
 
     def put(self, items: Iterable[Item]) -> None:
+        added = list(items)
         with self._arrived:
             before = len(self._items)
-            added = 0
-            for item in items:
-                self._items.append(item)
-                added += 1
-            self._dropped += before + added - len(self._items)
+            self._items.extend(added)
+            self._dropped += before + len(added) - len(self._items)
             self._arrived.notify()
 
     def take(self, timeout: float) -> list[Item]:

@@ -44,11 +44,7 @@ def canonical(message: Message) -> bytes:
 SECTIONS = ("run", "config", "seeds", "data", "env", "git", "status", "result")
 _WALL = {"run": ("started", "run_id", "parent_run_id"), "status": ("ended", "wall_seconds")}
 # The field that identifies an event of a topic; all other topics are aligned by plant time.
-AXES = {
-    "/estimator/de/generation": "generation",
-    "/estimator/refine/iteration": "iteration",
-    "/study/trial": "trial",
-}
+AXES = {"/estimator/de/generation": "generation", "/estimator/refine/iteration": "iteration", "/study/trial": "trial"}
 
 
 @dataclass(frozen=True)

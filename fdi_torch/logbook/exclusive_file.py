@@ -6,7 +6,8 @@ import fcntl
 import os
 from pathlib import Path
 
-from fdi_torch.logbook.errors import LogError, log_error
+from fdi_torch.disk import named_errors, sentence
+from fdi_torch.logbook.errors import LogError
 
 
 class ExclusiveFile:
@@ -19,13 +20,12 @@ class ExclusiveFile:
         self.path = path
         self.size = 0
         self.dead: LogError | None = None
-        try:
-            self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        with named_errors(path, LogError):
+            try:
+                self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+            except FileExistsError:
+                raise LogError(_taken(path)) from None
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except FileExistsError:
-            raise LogError(_taken(path)) from None
-        except OSError as error:
-            raise log_error(path, error) from None
 
     def write(self, data: bytes) -> None:
         self.expect_alive()
@@ -35,7 +35,7 @@ class ExclusiveFile:
                 count = os.write(self._file, remaining)
                 remaining, self.size = remaining[count:], self.size + count
         except OSError as error:
-            self.dead = log_error(self.path, error)
+            self.dead = LogError(sentence(self.path, error))
             raise self.dead from None
 
     def expect_alive(self) -> None:
@@ -43,11 +43,8 @@ class ExclusiveFile:
             raise LogError(f"{self.dead}; nothing more is logged")
 
     def sync(self) -> None:
-        """Flush the file to disk."""
-        try:
+        with named_errors(self.path, LogError):
             os.fsync(self._file)
-        except OSError as error:
-            raise log_error(self.path, error) from None
 
     def close(self) -> None:
         os.close(self._file)
@@ -72,5 +69,5 @@ def _taken(path: Path) -> str:
         if being_written(path):
             return f"{path}: another run is writing this file; choose another name"
     except OSError as error:
-        return str(log_error(path, error))
+        return sentence(path, error)
     return f"{path}: left by a run that did not end; save it with `fdi recover {path}`, then delete it"

@@ -20,8 +20,9 @@ import orjson
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Statistics
 
+from fdi_torch.disk import named_errors
 from fdi_torch.logbook.compare import AXES
-from fdi_torch.logbook.errors import LogError, log_error
+from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.reader import Attachment, Message, Run, read_run
 from fdi_torch.logbook.scan import Damage, Frame, body_of, stream_of
 from fdi_torch.names import counted
@@ -50,14 +51,12 @@ def export_attachment(run: Run, name: str, folder: str | Path) -> Path:
     """Write an attachment into `folder`, never outside it and never over a file. Returns its path."""
     content = run.attachment(name)
     target = Path(folder) / safe_name(name)
-    try:
+    with named_errors(target, LogError):
         target.parent.mkdir(parents=True, exist_ok=True)
+        if target.exists():
+            raise LogError(f"{target}: exists already; choose another folder, or delete it")
         with target.open("xb") as file:
             file.write(content)
-    except OSError as error:
-        if isinstance(error, FileExistsError) and target.exists():
-            raise LogError(f"{target}: exists already; choose another folder, or delete it") from None
-        raise log_error(target, error) from None
     return target
 
 

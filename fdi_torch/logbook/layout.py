@@ -87,7 +87,6 @@ def _properties(schema: bytes) -> dict[str, Any]:
 
 
 def _path(topic: str, name: str) -> str:
-    """The message path of a field."""
     if not _PLAIN.fullmatch(name):
         name = '"' + re.sub(r'(["\\])', r"\\\1", name) + '"'
     return f"{topic}.{name}"

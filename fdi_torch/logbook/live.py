@@ -31,7 +31,6 @@ class Live:
         self.address = ""
 
     def __call__(self, channel: Channel, log_time: int, data: bytes) -> None:
-        """Forward one message of the log."""
         number = self._numbers.get(channel) or self._advertise(channel)
         channel_on_server, sent = self._by_number[number]
         with self._lock:

@@ -20,8 +20,9 @@ from mcap.records import Attachment as AttachmentRecord
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Header, Metadata, Schema
 
+from fdi_torch.disk import named_errors
 from fdi_torch.logbook import scan
-from fdi_torch.logbook.errors import LogError, log_error
+from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.payload import decode
 from fdi_torch.logbook.schemas import conforming
 from fdi_torch.logbook.sink import EPOCH_NS
@@ -131,7 +132,6 @@ class Run:
         return self.attachment("config.yaml").decode() if "config.yaml" in self.attachments else ""
 
     def attachment(self, name: str) -> bytes:
-        """The bytes of an attachment."""
         if name not in self.attachments:
             known = ", ".join(self.attachments) or "(none)"
             raise LogError(f"{self.path}: expected one of the attachments {known}, got {name}")
@@ -271,11 +271,8 @@ class Directory:
 
 def map_file(path: Path) -> Any:
     """The file mapped into memory. Raises LogError if it is empty or cannot be opened."""
-    try:
-        with open(path, "rb") as file:
-            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    except ValueError:
-        raise LogError(f"{path}: the file is empty; the run was killed before it wrote anything") from None
-    except OSError as error:
-        raise log_error(path, error) from None
-    return data
+    with named_errors(path, LogError), open(path, "rb") as file:
+        try:
+            return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        except ValueError:
+            raise LogError(f"{path}: the file is empty; the run was killed before it wrote anything") from None

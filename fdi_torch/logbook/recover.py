@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 from mcap.opcode import Opcode
 
-from fdi_torch.logbook.errors import LogError, log_error
+from fdi_torch.disk import named_errors
+from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.payload import unpack
 from fdi_torch.logbook.reader import Run, read_run
 from fdi_torch.logbook.scan import Damage, Frame
@@ -106,15 +107,13 @@ def set_aside(path: str | Path) -> Path | None:
     partial = Path(f"{path}.partial")
     if not partial.exists():
         return None
-    try:
-        with open(partial, "rb") as file:
+    with named_errors(partial, LogError), open(partial, "rb") as file:
+        try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            target = next(p for n in range(1, 10**6) if not (p := Path(f"{partial}.{n}")).exists())
-            os.rename(partial, target)
-    except BlockingIOError:
-        raise LogError(f"{partial}: another run is writing this file; wait for it, or stop it") from None
-    except OSError as error:
-        raise log_error(partial, error) from None
+        except BlockingIOError:
+            raise LogError(f"{partial}: another run is writing this file; wait for it, or stop it") from None
+        target = next(p for n in range(1, 10**6) if not (p := Path(f"{partial}.{n}")).exists())
+        os.rename(partial, target)
     return target
 
 

@@ -55,11 +55,7 @@ class Replay:
 
 
 def replay(
-    path: str | Path,
-    rerun: Rerun,
-    *,
-    select: Select | None = None,
-    env: Mapping[str, str] | None = None,
+    path: str | Path, rerun: Rerun, *, select: Select | None = None, env: Mapping[str, str] | None = None
 ) -> Replay:
     """Repeat a run and compare it with its log.
 
@@ -75,9 +71,7 @@ def replay(
 
 
 def compare_events(
-    logged: Iterable[Message],
-    replayed: Iterable[Message],
-    versions: dict[str, tuple[str, str]],
+    logged: Iterable[Message], replayed: Iterable[Message], versions: dict[str, tuple[str, str]]
 ) -> Replay:
     """Compare two ordered streams of events, up to the first difference beyond the tolerance."""
     events, largest, first_inexact = 0, 0.0, None

@@ -43,6 +43,12 @@ class Signals:
     hold: str = "zero_order"
 
 
+def recording_groups(topics: Iterable[str]) -> list[str]:
+    """Names of the recordings in a log with these topics; "" for the first, or only, one."""
+    found = (re.fullmatch("/plant/(?:(.+)/)?output", topic) for topic in topics)
+    return list(dict.fromkeys(match[1] or "" for match in found if match))
+
+
 def series(run: Run, topic: str, fields: Sequence[str] | None = None) -> dict[str, np.ndarray]:
     """Numbers of a topic over its messages, (K,) each, NaN where missing; always with `t`, s.
 

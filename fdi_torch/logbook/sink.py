@@ -205,7 +205,6 @@ class Sink:
 
 
 def _bytes(record: Any) -> bytes:
-    """The bytes of an MCAP record."""
     builder = RecordBuilder()
     record.write(builder)
     return builder.end()

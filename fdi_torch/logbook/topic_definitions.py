@@ -46,9 +46,7 @@ _EVENT: dict[str, tuple[Kind, str, str]] = {"problem": ("integer", "", "which of
 TOPICS: dict[str, Topic] = {
     "/plant/input": Topic("fdi_torch.plant_input", "commands to the plant"),
     "/plant/output": Topic(
-        "fdi_torch.plant_output",
-        "readings of the sensors",
-        {"masked": ("texts", "", "readings that are not used")},
+        "fdi_torch.plant_output", "readings of the sensors", {"masked": ("texts", "", "readings that are not used")}
     ),
     "/plant/truth": Topic("fdi_torch.plant_truth", "true states and faults of a simulated plant"),
     "/source/clock": Topic(

@@ -38,12 +38,7 @@ class Topics:
         raise NotImplementedError
 
     def write(
-        self,
-        topic: str,
-        fields: Named,
-        t: float | None = None,
-        *,
-        units: Mapping[str, str] | None = None,
+        self, topic: str, fields: Named, t: float | None = None, *, units: Mapping[str, str] | None = None
     ) -> None:
         """Write one message. units: of named numbers.
 

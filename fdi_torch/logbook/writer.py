@@ -21,8 +21,9 @@ from typing import Any
 import numpy as np
 import orjson
 
+from fdi_torch.disk import named_errors
 from fdi_torch.interruption import UNDISTURBED, Terminated
-from fdi_torch.logbook.errors import LogError, log_error
+from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.payload import as_array, plain
 from fdi_torch.logbook.provenance import environment, git_state, version_of
 from fdi_torch.logbook.reader import Message
@@ -118,10 +119,8 @@ class RunLog(Topics):
     def _end(self) -> None:
         """Complete the log under its final name."""
         self._write_end(self._open_sink())
-        try:
+        with named_errors(self.path, LogError):
             os.replace(self.partial_path, self.path)
-        except OSError as error:
-            raise log_error(self.path, error) from None
 
     def set_status(self, status: str, reason: str = "") -> None:
         """Set how the run ended, such as "not_converged"; the default is "completed"."""
@@ -204,13 +203,10 @@ class RunLog(Topics):
 def _expect_free(path: Path) -> None:
     if path.suffix != ".mcap":
         raise ValueError(f"{path}: expected a log name that ends in .mcap; rename it")
-    try:
+    with named_errors(path, LogError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        taken = path.exists()
-    except OSError as error:
-        raise log_error(path, error) from None
-    if taken:
-        raise LogError(f"{path}: exists already; choose another name, or delete it")
+        if path.exists():
+            raise LogError(f"{path}: exists already; choose another name, or delete it")
 
 
 def _ending(error: BaseException) -> tuple[str, str]:

@@ -124,10 +124,11 @@ def _read(file: FileSource, names: Sequence[str]) -> Read:
     sheets = []
     for tag, numbers, cells, channels, values in parts:
         place, of = f"{path}: row {{}}{tag}, column {clock.header}", tag[2:-1]
-        seconds = _clock(cells, clock, source, place, numbers)
-        order = in_order(seconds, values, source.sort, place, numbers, _summer_time_hint(clock, source))
-        sheets.append(Sheet(f"{path}{tag}", order.seconds, tuple(b.name for b in channels), order.values))
-        notes += [f"{of}: {note}" if of else note for note in order.notes]
+        times = _clock(cells, clock, source, place, numbers)
+        hint = _summer_time_hint(clock, source)
+        seconds, ordered, changes = in_order(times, values, source.sort, place, numbers, hint)
+        sheets.append(Sheet(f"{path}{tag}", seconds, tuple(b.name for b in channels), ordered))
+        notes += [f"{of}: {note}" if of else note for note in changes]
     first = float(sheets[0].seconds[0]) if sheets else 0.0
     return Read(
         sheets,

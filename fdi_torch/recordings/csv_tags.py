@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -28,13 +27,6 @@ Tagged = tuple[Bound, np.ndarray, np.ndarray, np.ndarray]
 """A channel, and for each of its rows the row number, the time in the clock's unit, and the value."""
 
 
-@dataclass
-class _Rows:
-    number: list[int] = field(default_factory=list)
-    time: list[float] = field(default_factory=list)
-    value: list[float] = field(default_factory=list)
-
-
 def tag_columns(header: Sequence[str]) -> TagRows | None:
     """The columns of tag, value and quality in a header with the usual names; None for another table."""
     by_name = {"".join(re.findall(r"[^\W\d_]+", column.lower())): column for column in reversed(header)}
@@ -55,7 +47,7 @@ def read_tags(file: FileSource, names: Sequence[str]) -> tuple[Bound, list[Tagge
         raise ValueError(f"{path}: expected a file with a row for each value, got none")
     sources = {name: file.columns.get(name, ChannelSource()) for name in names}
     channel_by_tag = {source.column or name: name for name, source in sources.items()}
-    rows = {name: _Rows() for name in names}
+    rows: dict[str, list[tuple[int, float, float]]] = {name: [] for name in names}
     other_tags: set[str] = set()
     for channel, source in sources.items():
         if source.plus:
@@ -84,15 +76,15 @@ def read_tags(file: FileSource, names: Sequence[str]) -> tuple[Bound, list[Tagge
                 reading = apply_rule(cells[value], flag, rules[name], heading.delimiter)
             except ValueError as error:
                 raise ValueError(f"{path}: row {number} ({cells[tag].strip()}): {error}") from None
-            rows[name].number.append(number)
-            rows[name].time.append(time)
-            rows[name].value.append(reading)
+            rows[name].append((number, time, reading))
     return clock, [_tagged(path, name, sources[name], rows[name], other_tags) for name in names]
 
 
-def _tagged(path: Path, name: str, source: ChannelSource, rows: _Rows, other_tags: set[str]) -> Tagged:
+def _tagged(
+    path: Path, name: str, source: ChannelSource, rows: Sequence[tuple[int, float, float]], other_tags: set[str]
+) -> Tagged:
     tag = source.column or name
-    if not rows.time:
+    if not rows:
         known = ", ".join(sorted(other_tags)[:12]) or "none"
         raise ValueError(
             f"{path}: expected rows of the tag {tag} for {name}, got {known}{nearest(tag, sorted(other_tags))}; "
@@ -107,4 +99,5 @@ def _tagged(path: Path, name: str, source: ChannelSource, rows: _Rows, other_tag
     except ValueError as error:
         raise ValueError(f"{path}: {name}: {error}") from None
     bound = Bound(name, tag, 0, unit_factor(source.unit, si_unit), si_unit, unit=source.unit)
-    return bound, np.array(rows.number), np.array(rows.time), np.array(rows.value)
+    numbers, times, values = map(np.array, zip(*rows, strict=True))
+    return bound, numbers, times, values

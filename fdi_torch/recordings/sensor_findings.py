@@ -25,7 +25,6 @@ COARSE_SHARE = 0.5
 
 
 def reading_findings(recording: Recording) -> Iterator[ChannelFinding]:
-    """Findings of all sensors of the recording."""
     for i, (name, unit) in enumerate(zip(recording.output_names, recording.output_units, strict=True)):
         mask = recording.mask[:, i]
         values = recording.outputs[mask, i]

@@ -30,25 +30,12 @@ class Sheet:
     values: np.ndarray
 
 
-@dataclass(frozen=True)
-class Ordered:
-    """Rows in order of time, one per instant, and notes on changes."""
-
-    seconds: np.ndarray
-    values: np.ndarray
-    notes: list[str]
-
-
 def in_order(
-    seconds: np.ndarray,
-    values: np.ndarray,
-    sort: bool,
-    place: str,
-    rows: np.ndarray,
-    summer: str,
-) -> Ordered:
-    """Drop rows that repeat the one before; with `sort`, sort the others and merge rows with equal times.
+    seconds: np.ndarray, values: np.ndarray, sort: bool, place: str, rows: np.ndarray, summer: str
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """The rows in order of time, one per instant, and notes on changes.
 
+    Rows that repeat the one before are dropped; with `sort`, the others are sorted and rows with equal times merged.
     Of several values of a channel at one time the last one counts. place: format of a row in messages; rows: their
     numbers. summer: advice for a clock that was set back by an hour. Raises ValueError if time does not increase.
     """
@@ -60,7 +47,7 @@ def in_order(
     rows, seconds, values = rows[kept], seconds[kept], values[kept]
     decreasing = np.flatnonzero(np.diff(seconds) <= 0)
     if not len(decreasing):
-        return Ordered(seconds, values, notes)
+        return seconds, values, notes
     if not sort:
         drop = int(decreasing[0])
         before, after = seconds[drop : drop + 2] - (seconds[0] if seconds[0] > LONG_AGO else 0.0)
@@ -75,7 +62,7 @@ def in_order(
     out_of_order = int((np.diff(seconds) < 0).sum())
     times, merged = _merged(seconds, values)
     notes.append(f"rows sorted by time: {out_of_order} came late, {len(seconds) - len(times)} had the time of another")
-    return Ordered(times, merged, notes)
+    return times, merged, notes
 
 
 def _equal(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -107,7 +107,6 @@ class Balance:
 
     @property
     def is_metered(self) -> bool:
-        """Whether there is any metered flow."""
         return any(bool((tank.by_flow[..., tank.metered] != 0.0).any()) for tank in self.tanks)
 
     def log_evidence(self, unrelated: float = UNRELATED) -> Tensor:
@@ -185,7 +184,8 @@ def _regression(flows: Tensor, excess: Tensor, rounding: float) -> tuple[Tensor,
     size, count = torch.where(flowing, rms, torch.inf), int(flowing.sum())
     scaled = flows / size
     product = torch.einsum("gni,gnj->ij", scaled, scaled)
-    off = _inverse(product) @ torch.einsum("gni,gn->i", scaled, excess)
+    inverse = torch.linalg.pinv(product, hermitian=True, rtol=HALF_OF_DIGITS)
+    off = inverse @ torch.einsum("gni,gn->i", scaled, excess)
     residual = excess - scaled @ off
     scores = torch.einsum("gni,gn->gi", scaled, residual)
     variance = scores.T @ scores * GROUPS / max(GROUPS - count, 1) + rounding**2 * product
@@ -194,8 +194,3 @@ def _regression(flows: Tensor, excess: Tensor, rounding: float) -> tuple[Tensor,
     root = product @ axes[:, known] / variances[known].sqrt()
     directions, lengths, _ = torch.linalg.svd(torch.where(flowing, size, 0.0)[:, None] * root, full_matrices=False)
     return lengths.square(), directions, off / size, residual.square().mean()
-
-
-def _inverse(matrix: Tensor) -> Tensor:
-    """Pseudoinverse of a symmetric matrix; directions below half of the digits count as zero."""
-    return torch.linalg.pinv(matrix, hermitian=True, rtol=HALF_OF_DIGITS)

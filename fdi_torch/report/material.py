@@ -15,6 +15,7 @@ from fdi_torch.clock import clock_shown, of_stamp
 from fdi_torch.effects import units_for_display
 from fdi_torch.gap.verdict_words import FORMAT_1
 from fdi_torch.logbook import Inspection, LogError, Run, Signals, arrays, inspect_log, own_signals, series
+from fdi_torch.logbook.signals import recording_groups
 from fdi_torch.logbook.topic_definitions import TOPICS
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import displayed_in
@@ -89,8 +90,7 @@ class Material:
     @cached_property
     def groups(self) -> list[str]:
         """Names of the recordings in the log; "" if there is only one."""
-        paths = [topic.split("/") for topic in self.counts if topic.startswith("/plant/") and topic.endswith("/output")]
-        return ["/".join(parts[2:-1]) for parts in paths]
+        return recording_groups(self.counts)
 
     @cached_property
     def recordings(self) -> list[Signals]:

@@ -61,7 +61,6 @@ def warm_up() -> None:
 
 
 def can_compile() -> bool:
-    """Whether a compiler works here."""
     try:
         warm_up()
     except BuildError:
@@ -171,7 +170,6 @@ def _opened(library: Path, functions: Sequence[str]) -> ctypes.CDLL:
 
 
 def _compile(compiler: Command, source: str, level: str, folder: Path, key: str) -> Path:
-    """Compile the source and return the path of the library."""
     try:
         with tempfile.TemporaryDirectory(dir=folder) as place:
             code, built = Path(place) / "kernel.cpp", Path(place) / "kernel.so"

@@ -81,11 +81,12 @@ class Collocation:
             self.experiment.steps, path, rates, by_level, by_theta, *self._start(theta, values)
         )
         look = self._output_map.look(corrected, values, self._columns(theta))
+        moves = [self._moving.index(column) if column in self._moving else -1 for column in range(len(self.by))]
         return Linearised(
             corrected.movedim(2, 1),
             slopes.permute(0, 3, 1, 2),
             look.readings.movedim(1, 2),
-            self._jacobian(look, slopes).permute(0, 3, 1, 2),
+            look.along(slopes, moves).permute(0, 3, 1, 2),
             transition.permute(0, 3, 1, 2),
             gain.permute(0, 3, 1, 2),
             defect,
@@ -227,13 +228,6 @@ class Collocation:
                     for q, column in enumerate(columns):
                         slope[:, self._moving[column]] += by_command[:, 0] * course[:, q, 0]
         return torch.cat([start, *states], dim=1), torch.cat([by_theta, torch.stack(slopes, dim=1)], dim=1)
-
-    def _jacobian(self, look: LinearisedOutputs, slopes: Tensor) -> Tensor:
-        """Slopes of the levels (L, tanks, P, K+1) -> slopes of the readings (L, C, P, S)."""
-        moves = [-1] * len(self.by)
-        for q, column in enumerate(self._moving):
-            moves[column] = q
-        return look.along(slopes, moves)
 
     def _rate_slopes(self, middle: Tensor, theta: Tensor, slopes: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         """Rates (L, n, K) at mid-step levels (L, n, K), their slopes by level (L, n, n, K) and by theta (L, n, P, K).

@@ -25,10 +25,7 @@ class SectionWriter:
             texts += [self._section("act", [p.act]), self._section("rates", [p.law])]
         else:
             texts.append(self._section("step", [p.act + p.stages[0], *p.stages[1:-1], p.stages[-1] + p.advance]))
-        texts += [
-            self._section("settle_readings", [p.settle_readings]),
-            self._section("read", [p.read]),
-        ]
+        texts += [self._section("settle_readings", [p.settle_readings]), self._section("read", [p.read])]
         if self.inner_samples and p.unrolled:
             texts.append(self._section("end", [p.end]))
         texts.insert(0, self._prepare())

@@ -20,11 +20,7 @@ KINDS = ("auto", "compiled", "traced", "reference")
 
 
 def make_engine(
-    network: TankNetwork,
-    space: ParameterSpace,
-    experiment: Experiment,
-    kind: str = "auto",
-    device: str = "cpu",
+    network: TankNetwork, space: ParameterSpace, experiment: Experiment, kind: str = "auto", device: str = "cpu"
 ) -> Engine:
     """The requested engine, or under 'auto' the fastest one; `engine.why` states the reason.
 

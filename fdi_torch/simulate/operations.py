@@ -115,9 +115,7 @@ OPERATIONS: dict[str, Operation] = {
         torch.clamp_max, "AT_MOST({0}, {1})", lambda g, out, a: (_choose(g, g.apply("le", *a), 1.0, 0.0), None)
     ),
     "where": Operation(
-        _where,
-        "WHERE({0}, {1}, {2})",
-        lambda g, out, a: (None, _choose(g, a[0], 1.0, 0.0), _choose(g, a[0], 0.0, 1.0)),
+        _where, "WHERE({0}, {1}, {2})", lambda g, out, a: (None, _choose(g, a[0], 1.0, 0.0), _choose(g, a[0], 0.0, 1.0))
     ),
     "lt": _comparison(torch.lt, "LESS"),
     "le": _comparison(torch.le, "AT_MOST_AS"),

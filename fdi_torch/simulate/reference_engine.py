@@ -136,17 +136,16 @@ class ReferenceEngine(Engine):
         """Output of each pump and valve over each step, (K, L, actuators)."""
         starts, steps = self.experiment.nodes[:-1], self.experiment.steps
         delays = self.network.command_delays(values)
-        channels = {}
+        means = []
         for i, (_, channel) in enumerate(self.network.actuators()):
             mean = self.experiment.inputs[:, channel : channel + 1].expand(-1, lanes)
             if i in delays:
                 begin = starts.unsqueeze(1).expand(-1, lanes)
                 mean = self.experiment.signal.average(begin, steps.unsqueeze(1), channel, delays[i])
-            channels[i] = mean
-        if not channels:
+            means.append(mean)
+        if not means:
             return starts.new_zeros(len(starts), lanes, 0)
-        stacked = torch.stack([channels[i] for i in range(len(channels))], dim=-1)
-        return self._actuator_outputs(stacked, values)
+        return self._actuator_outputs(torch.stack(means, dim=-1), values)
 
     def _actuator_outputs(self, channels: Tensor, values: PlaceValues) -> Tensor:
         starts, steps = self.experiment.nodes[:-1], self.experiment.steps

@@ -23,8 +23,7 @@ from sample_runs import (
     write_train,
 )
 
-from fdi_torch.blind.case_kinds import KINDS
-from fdi_torch.blind.kind_meanings import KIND_MEANINGS
+from fdi_torch.blind.kinds import KINDS
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.logbook import RunLog, read_run
 from fdi_torch.plant.description import PlantDescription
@@ -204,7 +203,7 @@ def test_a_challenge_page_shows_scores_confusion_and_misses(tmp_path: Path) -> N
     assert {"challenge_confusion_1", "challenge_unknown", "challenge_left_out"} <= names(made)
     text = page([made])
     assert "cannot be shown" not in text and NASTY not in text and "three_tank, effect left out" in text
-    assert KIND_MEANINGS.keys() == KINDS.keys() and KIND_MEANINGS["pair"] in text and KIND_MEANINGS["poor"] not in text
+    assert KINDS["pair"].meaning in text and KINDS["poor"].meaning not in text
 
 
 def test_a_rehearsal_page_shows_the_tables_of_the_command(tmp_path: Path) -> None:

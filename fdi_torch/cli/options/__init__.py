@@ -149,7 +149,6 @@ def shared(*options: str, **changes: Any) -> Arguments:
 
 
 def add_arguments(parser: argparse.ArgumentParser, command: str) -> None:
-    """Add the arguments of a command to a parser."""
     for names_of, settings in import_module(f"{__name__}.{command}").ARGUMENTS.items():
         parser.add_argument(*names_of.split(), **settings)
 

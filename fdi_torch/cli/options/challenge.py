@@ -7,14 +7,14 @@ two answers without skill. Everything is written to --out; repeating the command
 
 import math
 
-from fdi_torch.blind.kind_meanings import KIND_MEANINGS
+from fdi_torch.blind.kinds import KINDS
 from fdi_torch.cli.options import names, shared
 
 RIGS = ("cascaded_tanks", "quadruple_tank", "three_tank")
 
 STEP, SUMMARY = "validate", "blind benchmark of the gap diagnosis on hidden rigs"
 LONG = True
-_KINDS = "".join(f"  {kind:<10}{meaning}\n" for kind, meaning in KIND_MEANINGS.items())
+_KINDS = "".join(f"  {kind.name:<10}{kind.meaning}\n" for kind in KINDS.values())
 EXAMPLES = f"""
 kinds of cases (on random networks also null, dnull and dsingle):
 {_KINDS}

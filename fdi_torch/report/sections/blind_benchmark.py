@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from fdi_torch.blind.kind_meanings import KIND_MEANINGS
+from fdi_torch.blind.kinds import KINDS
 from fdi_torch.blind.places import EFFECTS, OUTLET, PAIR, PIPE, PUMP, SENSOR, TANK
 from fdi_torch.blind.score import Row
 from fdi_torch.blind.scored_rows import OWN, Scores, group_of, misses, sheets, tables
@@ -43,9 +43,8 @@ def scores_section(material: Material) -> Section | None:
         "in. Lines and brackets are 95 % intervals. Calibration: orange is the mean stated probability of the best "
         "explanation, blue the share in which it was true. Times: a point is a case, blue the median."
     )
-    kinds = [
-        [kind.replace("_", " "), KIND_MEANINGS.get(kind, "")] for kind in dict.fromkeys(row["kind"] for row in rows)
-    ]
+    present = {row["kind"] for row in rows}
+    kinds = [[kind.name.replace("_", " "), kind.meaning] for kind in KINDS.values() if kind.name in present]
     blocks: list[Markup | str | list[Picture]] = [words, table(["kind of case", "what it is"], kinds, left=2)]
     for k, (group, by) in enumerate(tables(rows).items()):
         own = [row for row in rows if row["by"] == OWN and group_of(row) == group]
@@ -97,7 +96,6 @@ def confusion_section(material: Material) -> Section | None:
 
 
 def misses_section(material: Material) -> Section | None:
-    """Every wrong answer."""
     sheet = misses(benchmark_rows(material))
     return Section(sheet.title, [shown(replace(sheet, title=""))]) if sheet.rows else None
 

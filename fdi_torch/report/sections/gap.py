@@ -8,13 +8,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from fdi_torch.amounts import probability_words
-from fdi_torch.gap.verdict_words import (
-    FORMAT_1,
-    apart_from_rounding,
-    causes_of,
-    explanation_words,
-    rounding_words,
-)
+from fdi_torch.gap.verdict_words import FORMAT_1, apart_from_rounding, causes_of, explanation_words, rounding_words
 from fdi_torch.report.gap_tables import cause_table, flow_table, has_causes
 from fdi_torch.report.html import bullets, shown, table
 from fdi_torch.report.material import Material

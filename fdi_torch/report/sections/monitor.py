@@ -93,7 +93,6 @@ def mark_words(marks: Sequence[tuple[float, str]], what: str) -> str:
 
 
 def event_section(material: Material) -> Section | None:
-    """All events of the monitor."""
     events = material.of(ALARM)
     if not events:
         return None

@@ -91,7 +91,6 @@ _LEVELS = {3: "warning", 4: "error", 5: "fatal"}
 
 
 def configuration_section(material: Material) -> Section | None:
-    """The original configuration file."""
     raw = material.run.attachment("config.yaml") if "config.yaml" in material.run.attachments else b""
     text = raw.decode(errors="replace")
     if not text:

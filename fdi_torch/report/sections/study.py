@@ -43,10 +43,6 @@ def summary_section(material: Material) -> Section | None:
     return Section("Settings", [*map(shown, tables), *([LEGEND] if len(tables) == len(settings) else [])])
 
 
-def _estimator_words(name: Estimator) -> str:
-    return f"Estimator: {name}, {ESTIMATORS[name]}."
-
-
 def error_section(material: Material) -> Section | None:
     """Absolute error of every trial in each parameter, with the Cramér-Rao bound."""
     trials = [m for m in material.of(TRIAL) if isinstance(m.get("truth"), list)]
@@ -68,7 +64,7 @@ def error_section(material: Material) -> Section | None:
         figure.axes[0].plot(range(len(groups)), bounds, "_", color=MARK, ms=22, mew=2.0)
         pictures.append(Picture(f"errors_{i + 1}", figure))
     words = "Each point is a trial, blue their root mean square, orange its Cramér-Rao bound."
-    return Section("Errors", [f"{_estimator_words(estimator)} {words}", pictures])
+    return Section("Errors", [f"Estimator: {estimator}, {ESTIMATORS[estimator]}. {words}", pictures])
 
 
 def _si_unit_of(material: Material, name: str) -> str:

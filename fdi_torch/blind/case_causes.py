@@ -1,5 +1,5 @@
-"""Kinds of cases (strata), the choice of causes for a case of each kind (names and locations, without numbers), and how
-each law outside the library is drawn.
+"""The choice of causes for a case of each kind (names and locations, without numbers), and how each law outside the
+library is drawn.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdi_torch.blind.deviation import Deviation
+from fdi_torch.blind.kinds import Kind
 from fdi_torch.blind.named_effects import NominalRun
 from fdi_torch.blind.places import (
     EFFECTS,
@@ -28,62 +29,6 @@ from fdi_torch.blind.places import (
 )
 from fdi_torch.blind.plants import Rig
 from fdi_torch.plant.description import PlantDescription
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A kind of cases.
-
-    strength: of full effects (1 is usual). causes: number of full effects; perhaps: further ones in every other case;
-    faint: further ones of an eighth of the usual strength. unseen: whether a law outside the library is added. inputs:
-    see `draw_conditions`. coloured: probability of correlated noise. disturbed: random disturbance flows. unmeasured:
-    share of levels without a sensor. looped: whether a level is controlled. shows: whether causes are drawn again until
-    each is visible in the readings.
-    """
-
-    name: str
-    strength: float = 1.0
-    causes: int = 1
-    perhaps: int = 0
-    faint: int = 0
-    unseen: bool = False
-    inputs: str = "rich"
-    coloured: float = 0.0
-    disturbed: bool = False
-    unmeasured: float = 0.0
-    looped: bool = False
-    shows: bool = False
-
-
-FAINT = 0.125
-KINDS = {
-    kind.name: kind
-    for kind in (
-        Kind("single"),
-        Kind("weak", strength=0.2),
-        Kind("coloured", coloured=1.0),
-        Kind("null", causes=0, coloured=0.3),
-        Kind("pair", causes=2),
-        Kind("unknown", causes=0, unseen=True),
-        Kind("messy", faint=3),
-        Kind("poor", inputs="poor"),
-        Kind("twins", strength=0.6),
-        Kind("left_out"),
-        Kind("dnull", causes=0, inputs="steps", disturbed=True),
-        Kind("dsingle", inputs="steps", disturbed=True, shows=True),
-        Kind("dloop", causes=0, inputs="steps", disturbed=True, looped=True),
-        Kind("site", perhaps=1, inputs="steps", shows=True),
-        Kind("hidden", inputs="steps", unmeasured=1 / 3, shows=True),
-        Kind("law", causes=0, unseen=True, inputs="steps", shows=True),
-        Kind("mixed", unseen=True, inputs="steps", shows=True),
-        Kind("loop", inputs="steps", looped=True, shows=True),
-    )
-}
-ON_NETWORKS = ("site", "hidden", "law", "mixed", "null", "loop", "dnull", "dsingle")
-"""Default kinds for random networks."""
-_EXTRA = {"left_out", "dloop", "site", "hidden", "law", "mixed", "loop"}
-STANDARD = tuple(name for name in KINDS if name not in _EXTRA)
-"""Default kinds for all other rigs."""
 
 
 @dataclass(frozen=True)
@@ -110,13 +55,7 @@ def in_turn(items: Sequence[str], seed: int, kind: str, index: int) -> str:
 
 
 def choose(
-    kind: Kind,
-    rig: Rig,
-    seed: int,
-    index: int,
-    library: Collection[str],
-    leave_out: Sequence[str],
-    trial: int = 0,
+    kind: Kind, rig: Rig, seed: int, index: int, library: Collection[str], leave_out: Sequence[str], trial: int = 0
 ) -> Chosen:
     """The causes of case `index` of this kind. trial: number of earlier draws whose causes were not visible."""
     rng, plant = case_generator(seed, kind.name, index, 2, *([trial] if trial else [])), rig.plant
