@@ -33,6 +33,7 @@ from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.experiment import lay_out
 from tests.rigs import blank_recording, constant_inputs, three_tank
 
+WHOLE = (slice(None),)
 SMALL = ("pump_gain", "pump_lag", "laminar_flow", "leak@T1", "sensor_bias")
 
 
@@ -82,10 +83,23 @@ def recorded(
 def test_level_and_correlation_of_noise_are_estimated_despite_a_slow_misfit(ar: float) -> None:
     x = noise(4000, ar, 0.002, 3)
     slow = 0.01 * torch.sin(torch.arange(4000, dtype=torch.float64) / 200.0).unsqueeze(1)
-    found = estimate_noise(x + slow, torch.ones_like(x, dtype=torch.bool))
+    found = estimate_noise(x + slow, torch.ones_like(x, dtype=torch.bool), WHOLE)
     assert found.std.tolist() == pytest.approx([0.002] * 3, rel=0.15 if ar else 0.04)
     assert found.ar.tolist() == pytest.approx([ar] * 3, abs=0.04)
     assert found.mean_of == 0
+
+
+def test_a_model_error_that_jumps_between_recordings_is_not_taken_for_correlated_noise() -> None:
+    rows = [slice(401 * k, 401 * k + 400) for k in range(4)]
+    residual, mask = torch.zeros(4 * 401 - 1, 3, dtype=torch.float64), torch.zeros(4 * 401 - 1, 3, dtype=torch.bool)
+    for k, r in enumerate(rows):
+        ramp = 0.1 * (-1) ** k * torch.linspace(1.0, 0.0, 400, dtype=torch.float64)
+        residual[r], mask[r] = noise(400, 0.0, 0.002, k) + ramp.unsqueeze(1), True
+    found = estimate_noise(residual, mask, rows)
+    assert found.std.tolist() == pytest.approx([0.002] * 3, rel=0.06)
+    assert found.ar.tolist() == pytest.approx([0.0] * 3, abs=1e-6)
+    across = estimate_noise(residual, mask, WHOLE)
+    assert float(across.ar.min()) > 0.1
 
 
 def test_a_recording_without_noise_tells_no_more_than_the_simulation() -> None:
@@ -111,7 +125,7 @@ def test_a_moving_average_is_detected_and_inverted(samples: int, slow: float) ->
     mean = torch.stack([fresh[j : j + 6000] for j in range(samples)]).mean(dim=0)
     misfit = slow * torch.sin(torch.arange(6000, dtype=torch.float64) / 200.0).unsqueeze(1)
     mask = torch.ones_like(mean, dtype=torch.bool)
-    found = estimate_noise(mean + misfit, mask)
+    found = estimate_noise(mean + misfit, mask, WHOLE)
     assert found.mean_of == samples
     assert found.std.tolist() == pytest.approx([0.002 / math.sqrt(samples)] * 3, rel=0.06)
     assert found.lag_one.tolist() == pytest.approx([1.0 - 1.0 / samples] * 3, abs=0.01)
@@ -135,8 +149,8 @@ def test_quantized_readings_are_no_moving_average() -> None:
     fresh = noise(6007, 0.0, 0.002, 9)
     mean = torch.stack([fresh[j : j + 6000] for j in range(8)]).mean(dim=0)
     mask = torch.ones_like(mean, dtype=torch.bool)
-    assert estimate_noise(mean, mask).mean_of == 8
-    assert estimate_noise(mean, mask, (0.0, 0.0, 0.1)).mean_of == 0
+    assert estimate_noise(mean, mask, WHOLE).mean_of == 8
+    assert estimate_noise(mean, mask, WHOLE, (0.0, 0.0, 0.1)).mean_of == 0
 
 
 def test_a_quantized_channel_has_a_step_and_a_printed_one_has_none() -> None:

@@ -130,14 +130,12 @@ def low_frequency_excess(white: Tensor) -> float:
     return float((power[slow].sum(dim=0) - (float(slow.sum()) - 0.5) * level).sum())
 
 
-def estimate_noise(
-    residual: Tensor, mask: Tensor, steps: Sequence[float] = (), rows: Sequence[slice] = (slice(None),)
-) -> Noise:
+def estimate_noise(residual: Tensor, mask: Tensor, rows: Sequence[slice], steps: Sequence[float] = ()) -> Noise:
     """Estimate the noise of each channel from residual (S, C) and mask (S, C).
 
-    All channels share one correlation, since one system reads them. steps (C,): quantization steps; channels with a
-    step do not count for the common correlation, because rounding errors have their own. rows: segments without a jump
-    between their samples.
+    All channels share one correlation, since one system reads them. rows: those of each recording, because the model
+    error jumps between recordings. steps (C,): quantization steps; channels with a step do not count for the common
+    correlation, because rounding errors have their own.
     """
     quantized = [step > 0.0 for step in steps]
     spectra = [_spectrum_of_all([residual[r][mask[r][:, c], c] for r in rows]) for c in range(residual.shape[1])]

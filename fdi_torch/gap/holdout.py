@@ -91,7 +91,7 @@ def run_reference_models(
     runs = {name: free_run(data, noise, model) for name, model in models.items()}
     residuals = (data.readings - runs[m] for m in ("augmented", "recalibrated") if m in runs)
     nearest = min(residuals, key=lambda r: float(torch.where(data.mask, r * r, 0.0).sum()))
-    fast = estimate_noise(nearest, data.mask, quantization_steps)
+    fast = estimate_noise(nearest, data.mask, data.rows, quantization_steps)
     return HeldOut(data, runs, with_rounding(fast, quantization_steps, data.readings - nearest))
 
 
