@@ -331,6 +331,27 @@ def test_declared_units_are_true(plant: str, place: str) -> None:
         assert torch.allclose(rescaled_readings(plant, metre, second)[place], alone(plant, place).started, rtol=1e-5)
 
 
+EQUIVALENT = [
+    (name, p.prefix)
+    for name, plant in PLANTS.items()
+    for p in placements_of(plant)
+    if p.effect.equivalents(p.location, plant, {})
+]
+
+
+@pytest.mark.parametrize(("plant", "place"), EQUIVALENT)
+def test_equivalent_effects_name_each_other_and_read_the_same(plant: str, place: str) -> None:
+    placement = rig(plant).placement(place)
+    for start in placement.effect.starts(placement.location, PLANTS[plant], bare_reach(plant)):
+        own = rig_of(PLANTS[plant], (replace(placement, values=start),))
+        for (name, at), values in placement.effect.equivalents(placement.location, PLANTS[plant], start).items():
+            back = effect(name).equivalents(at, PLANTS[plant], values)[placement.cause]
+            assert {n: back.get(n) for n in start} == pytest.approx(start)
+            other = rig_of(PLANTS[plant], (Placement(effect(name), at, values),))
+            readings = [r.engine.readings(r.space.nominal()) for r in (own, other)]
+            assert torch.allclose(*readings, rtol=0.0, atol=1e-9)
+
+
 SPILLING = replace(three_tank(), tanks=(replace(three_tank().tanks[0], overflow_to="T2"), *three_tank().tanks[1:]))
 BALANCED = [
     pytest.param(plant, p, id=f"{plant.name}-{p.prefix}")

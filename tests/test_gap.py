@@ -240,6 +240,13 @@ def test_slow_noise_that_no_effect_explains_is_no_unknown_cause() -> None:
     assert answer.verdict == "no_gap"
 
 
+def test_equivalent_causes_are_one_hypothesis() -> None:
+    """Plugging and openness of a pipe were an ambiguous answer."""
+    recording = recorded({"P13.plugging.size": 0.2}, 51, samples=400)
+    answer = diagnose(nominal_plant(), recording, settings=Settings(("plugging@P13", "openness@P13")))
+    assert answer.verdict == "named" and len(answer.ambiguity_set) == 1
+
+
 def test_the_answer_follows_the_protocol() -> None:
     recording = recorded({"Q2.pump_gain.factor": 1.12}, 51, samples=400)
     answer = diagnose(nominal_plant(), recording, settings=Settings(("pump_gain",)))
@@ -257,21 +264,26 @@ def test_the_library_offers_65_effects_at_places_of_the_three_tanks() -> None:
 
 def test_a_leak_at_the_floor_and_a_plugged_outlet_without_a_valve_are_one_cause() -> None:
     plant, plugged, leak = nominal_plant(), ("plugging", "OUT2"), ("leak", "T2")
-    both = {plugged, leak}
+    share = ("net_outlet", "OUT2")
+    both = {plugged, leak, share}
     assert equivalence_class(leak, plant, {}) == both == equivalence_class(plugged, plant, {})
     assert equivalence_class(plugged, plant, {"OUT2.plugging.size": -0.4}) == both
     assert equivalence_class(leak, plant, {"T2.leak.height": 0.3}) == {leak}
-    assert equivalence_class(plugged, plant, {"OUT2.plugging.size": 0.4}) == {plugged}
+    assert equivalence_class(plugged, plant, {"OUT2.plugging.size": 0.4}) == {plugged, share}
+    assert equivalence_class(share, plant, {"OUT2.net_outlet.size": 0.6}) == {plugged, share}
+    assert equivalence_class(leak, plant, {"T2.leak.onset": 100.0}) == {plugged, leak}  # a share is constant
+    assert equivalence_class(plugged, plant, {"OUT2.plugging.size": 0.4, "OUT2.plugging.onset": 9.0}) == {plugged}
     pipe = ("plugging", "P13")
     assert equivalence_class(pipe, plant, {"P13.plugging.size": -0.4}) == {pipe}
-    for other in (("openness", "P13"), ("net_outlet", "OUT2")):
-        assert equivalence_class(other, plant, {}) == {other, ("plugging", other[1])}
+    opened = ("openness", "P13")
+    assert equivalence_class(opened, plant, {}) == {opened, pipe} == equivalence_class(pipe, plant, {})
     (outlet,) = (p for p in plant.pipes if p.name == "OUT2")
     with_valve = replace(plant, pipes=tuple(replace(p, valve="v") if p is outlet else p for p in plant.pipes))
-    assert equivalence_class(plugged, with_valve, {}) == {plugged} and equivalence_class(leak, with_valve, {}) == {leak}
+    assert equivalence_class(plugged, with_valve, {}) == {plugged, share}
+    assert equivalence_class(leak, with_valve, {}) == {leak}
     two_outlets = replace(plant, pipes=(*plant.pipes, replace(outlet, name="OUT4")))
-    all_three = both | {("plugging", "OUT4")}
-    assert all(equivalence_class(c, two_outlets, {}) == all_three for c in all_three)
+    all_five = both | {("plugging", "OUT4"), ("net_outlet", "OUT4")}
+    assert all(equivalence_class(c, two_outlets, {}) == all_five for c in all_five)
 
 
 def test_a_pair_of_tanks_is_accepted_in_either_order() -> None:
