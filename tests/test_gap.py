@@ -171,8 +171,18 @@ def test_rounding_adds_a_uniform_error_to_the_noise_of_the_other_channels() -> N
     """A step q has the standard deviation q / sqrt(12)."""
     both = Noise(torch.full((2,), 1e-3, dtype=torch.float64), torch.zeros(2, dtype=torch.float64))
     moving = 0.05 * torch.arange(100, dtype=torch.float64).unsqueeze(1).expand(100, 2)
-    told = with_rounding(both, (0.0, 0.012), moving)
+    told = with_rounding(both, (0.0, 0.012), moving, torch.ones(2, dtype=torch.float64))
     assert told.std.tolist() == pytest.approx([1e-3, math.hypot(1e-3, 0.012 / math.sqrt(12.0))])
+
+
+@pytest.mark.parametrize("gain", [2.0, -2.0])
+def test_the_noise_below_a_rounding_is_that_of_the_other_sensors_in_metres(gain: float) -> None:
+    """20 V/m with 20 mV of noise, beside another sensor that is rounded."""
+    both = Noise.white(torch.tensor([0.02, 5e-4], dtype=torch.float64))
+    moving = 0.05 * torch.arange(100, dtype=torch.float64).unsqueeze(1).expand(100, 2)
+    gains = torch.tensor([20.0, gain], dtype=torch.float64)
+    told = with_rounding(both, (0.0, 1e-3), moving, gains)
+    assert told.std.tolist() == pytest.approx([0.02, math.hypot(2e-3, 1e-3 / math.sqrt(12.0))])
 
 
 def test_a_pair_gains_nothing_if_one_size_had_to_be_negative() -> None:

@@ -249,23 +249,26 @@ def _most_likely(likelihood: Tensor, count: int) -> int:
     return best if float(likelihood[_WHITE] - likelihood[best]) > math.log(count) else _WHITE
 
 
-def with_rounding(noise: Noise, steps: Sequence[float], readings: Tensor) -> Noise:
+def with_rounding(noise: Noise, steps: Sequence[float], readings: Tensor, gains: Tensor) -> Noise:
     """Add the rounding error of channels (C,) with steps > 0. readings (S, C): close to the readings before rounding.
 
-    Its variance is step^2 / 12 (Widrow and Kollar, 2008), added to the noise of the other channels. It is constant
-    until the level has moved by a good part of a step, which gives its correlation.
+    Its variance is step^2 / 12 (Widrow and Kollar, 2008), added to the noise of the other channels, which is assumed to
+    be the same in metres. It is constant until the level has moved by a good part of a step, which gives its
+    correlation. gains (C,): of the sensors, in the reading's unit per metre.
     """
     if not any(steps):
         return noise
     std, ar = noise.std.clone(), noise.ar.clone()
-    unrounded = [float(s) for s, step in zip(std, steps, strict=True) if not step]
+    in_metres = (std / gains.abs()).tolist()
+    unrounded = sorted(s for s, step in zip(in_metres, steps, strict=True) if not step)
+    noise_level = unrounded[len(unrounded) // 2] if unrounded else 0.0
     for c, step in enumerate(steps):
         if not step:
             continue
-        noise_below = sorted(unrounded)[len(unrounded) // 2] if unrounded else 0.0
         movement = float(readings[:, c].diff().abs().mean())
         correlation = math.exp(-max(movement, 1e-4 * step) / (DECAY_SHARE * step))
-        std[c], ar[c] = math.hypot(noise_below, step / math.sqrt(12.0)), max(float(ar[c]), min(correlation, 0.98))
+        std[c] = math.hypot(noise_level * float(gains[c]), step / math.sqrt(12.0))
+        ar[c] = max(float(ar[c]), min(correlation, 0.98))
     return Noise(std * torch.sqrt(1.0 - ar**2), ar)
 
 
