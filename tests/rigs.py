@@ -39,6 +39,13 @@ def three_tank(start: tuple[float, float, float] = REST, tank_height: float = 1.
     )
 
 
+def draining_tanks() -> PlantDescription:
+    """Two tanks that run dry, one through the other, without any input."""
+    tanks = (Tank("A", 0.01, 0.5, 0.45), Tank("B", 0.01, 0.5, 0.3))
+    pipes = (Pipe("P", "A", "B", 2e-5, 0.6), Pipe("O", "B", "outside", 2e-5, 0.6))
+    return PlantDescription("draining_tanks", tanks, pipes, sensors=(Sensor("a", "A"), Sensor("b", "B")))
+
+
 def factor(unit: str, metre: float, second: float) -> float:
     """How a number in this unit changes when metres and seconds are rescaled; volts stay."""
     scale, result = {"m": metre, "s": second}, 1.0

@@ -18,9 +18,10 @@ from torch import Tensor
 from fdi_torch.effects import EFFECTS, all_placements, build_network, effect
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.plant.description import FLOW_KINDS, OUTSIDE, Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
-from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.effect import Placement, Stage
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.operating_range import OperatingRange, operating_range_of
+from fdi_torch.plant.signals import Clock
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.build import BuildError
 from fdi_torch.simulate.engine_choice import make_engine
@@ -328,6 +329,62 @@ def rescaled_readings(plant: str, m: float, s: float) -> dict[str, Tensor]:
 def test_declared_units_are_true(plant: str, place: str) -> None:
     for metre, second in ((100.0, 1.0), (1.0, 60.0)):
         assert torch.allclose(rescaled_readings(plant, metre, second)[place], alone(plant, place).started, rtol=1e-5)
+
+
+EQUIVALENT = [
+    (name, p.prefix)
+    for name, plant in PLANTS.items()
+    for p in placements_of(plant)
+    if p.effect.equivalents(p.location, plant, {})
+]
+
+
+@pytest.mark.parametrize(("plant", "place"), EQUIVALENT)
+def test_equivalent_effects_name_each_other_and_read_the_same(plant: str, place: str) -> None:
+    placement = rig(plant).placement(place)
+    for start in placement.effect.starts(placement.location, PLANTS[plant], bare_reach(plant)):
+        own = rig_of(PLANTS[plant], (replace(placement, values=start),))
+        for (name, at), values in placement.effect.equivalents(placement.location, PLANTS[plant], start).items():
+            back = effect(name).equivalents(at, PLANTS[plant], values)[placement.cause]
+            assert {n: back.get(n) for n in start} == pytest.approx(start)
+            other = rig_of(PLANTS[plant], (Placement(effect(name), at, values),))
+            readings = [r.engine.readings(r.space.nominal()) for r in (own, other)]
+            assert torch.allclose(*readings, rtol=0.0, atol=1e-9)
+
+
+SPILLING = replace(three_tank(), tanks=(replace(three_tank().tanks[0], overflow_to="T2"), *three_tank().tanks[1:]))
+BALANCED = [
+    pytest.param(plant, p, id=f"{plant.name}-{p.prefix}")
+    for plant in (PLANTS["valves"], SPILLING)
+    for p in all_placements(plant)
+    if p.effect.stage is Stage.BALANCE
+]
+
+
+@pytest.mark.parametrize(("plant", "placement"), BALANCED)
+def test_what_a_tank_loses_arrives_in_others_or_leaves_the_plant(plant: PlantDescription, placement: Placement) -> None:
+    """At each of its starts, and with all other parameters at their upper bound."""
+    network = build_network(plant, (placement,))
+    levels = {t.name: (0.5 * t.height, 0.95 * t.height) for t in plant.tanks}
+    starts = placement.effect.starts(placement.location, plant, OperatingRange(1000.0, {}, {}, levels))
+    space = ParameterSpace(p for p in network.constants if p.name.startswith(f"{placement.prefix}."))
+    nominal, *begun = (space.vector({placement.full_name(n): v for n, v in s.items()}) for s in ({}, *starts))
+    extreme = [torch.where((start == nominal) & space.high().isfinite(), space.high(), start) for start in begun]
+    theta = torch.stack([nominal, *begun, *extreme])
+    levels_now = [theta.new_full((len(theta),), (0.9 - 0.1 * k) * t.height) for k, t in enumerate(plant.tanks)]
+    end = theta.new_tensor(500.0)
+    clock, values = Clock(end - 1.0, end, end / end), network.bind(space, theta)
+    commands = [theta.new_zeros(len(theta)) for _ in network.actuators()]
+    point = network.operating_point(levels_now, commands, clock, values)
+    net = torch.stack(network.less_overflow(point, network.net_inflows(point, network.flows(point))))
+    change = dict(zip((t.name for t in plant.tanks), net - net[:, :1], strict=True))
+    first, *_ = plant.tanks_at(placement.location)
+    lost, arrived = -change.pop(first), sum(change.values())
+    size, rounding = lost.abs(), 1e-12 * net.abs().max()
+    assert bool((size > rounding).any())
+    assert bool((arrived * lost.sign() >= -rounding).all()) and bool((arrived.abs() <= size + rounding).all())
+    if len(plant.tanks_at(placement.location)) == 2:
+        assert torch.allclose(arrived, lost, rtol=0.0, atol=float(rounding))
 
 
 @at_each_kind

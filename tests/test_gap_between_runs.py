@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import statistics
+
 import pytest
 import torch
 
@@ -12,11 +15,33 @@ def own(value: float, std: float = 1e-3) -> RunConstant:
     return RunConstant("qL.gain", "run.csv", 0.0, value, std)
 
 
-def test_the_interval_holds_the_true_spread_in_19_of_20_cases() -> None:
-    draws = 1.05 + 0.01 * torch.randn(400, 6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
-    told = [between_run_spread([own(float(v)) for v in row], 0.1) for row in draws]
-    held = sum(t is not None and t.low < 0.01 < t.high for t in told)
+def drawn(std: float, error: float, cases: int = 400, runs: int = 6) -> torch.Tensor:
+    """Values (cases, runs) that differ between runs, with estimation errors."""
+    generator = torch.Generator().manual_seed(3)
+    return 1.05 + math.hypot(std, error) * torch.randn(cases, runs, generator=generator, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("error", [1e-4, 5e-3, 0.02])
+def test_the_interval_holds_the_true_spread_in_19_of_20_cases(error: float) -> None:
+    told = [between_run_spread([own(float(v), error) for v in row], 0.1) for row in drawn(0.01, error)]
+    held = sum(t is not None and t.low <= 0.01 <= t.high for t in told)
     assert 0.92 < held / 400 < 0.98
+
+
+def test_errors_of_estimation_are_no_variance_between_runs() -> None:
+    told = [between_run_spread([own(float(v), 0.04) for v in row], 0.1) for row in drawn(0.0, 0.04, runs=12)]
+    assert sum(t is not None and t.low == 0.0 for t in told) / 400 > 0.95
+    assert sum(t is not None and t.std == 0.0 for t in told) / 400 == pytest.approx(0.56, abs=0.05)  # Q(0) < n - 1
+
+
+def test_exact_values_have_their_own_mean_and_variance_and_inexact_ones_count_less() -> None:
+    values = (1.0, 1.02, 1.05)
+    told = between_run_spread([own(v, 1e-9) for v in values], 0.1)
+    assert told is not None and told.mean == pytest.approx(statistics.mean(values))
+    assert told.std == pytest.approx(statistics.stdev(values))
+    assert (told.low, told.high) == pytest.approx([told.std * math.sqrt(2.0 / q) for q in (7.37776, 0.0506356)])
+    inexact = between_run_spread([own(1.0), own(1.02), own(1.05, std=0.04)], 0.1)
+    assert inexact is not None and 1.01 < inexact.mean < 1.015
 
 
 def test_recordings_that_do_not_determine_the_constant_do_not_count() -> None:

@@ -20,7 +20,7 @@ from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.engine_choice import make_engine
 from fdi_torch.simulate.experiment import Experiment, divided, lay_out
 from tests.rigs import constant_inputs, three_tank
-from tests.test_gap import nominal_plant, recorded
+from tests.test_gap import WHOLE, nominal_plant, recorded
 
 
 @pytest.mark.parametrize(("ar", "count"), [(0.0, 1024), (0.0, 6000), (0.7, 6000)])
@@ -32,7 +32,7 @@ def test_a_model_error_above_the_corner_frequency_is_not_taken_for_correlated_no
         noise[k] += ar * noise[k - 1]
         slope[k] += 0.9 * slope[k - 1]  # flows that are wrong for some ten samples at a time
         level[k] = 0.98 * level[k - 1] + slope[k]
-    found = estimate_noise((noise + level).unsqueeze(1), torch.ones(count, 1, dtype=torch.bool))
+    found = estimate_noise((noise + level).unsqueeze(1), torch.ones(count, 1, dtype=torch.bool), WHOLE)
     assert float(found.ar[0]) == pytest.approx(ar, abs=0.25)
     assert float(found.std[0]) == pytest.approx(float(noise.std()), rel=0.35)
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from fdi_torch.effects import effect
+from fdi_torch.effects import build_network, effect, placements_for
 from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
@@ -20,7 +20,8 @@ from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.gap.screening import Option, Pairs, options_of, screen
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of
-from tests.rigs import three_tank
+from fdi_torch.simulate.simulated_recording import clean_readings
+from tests.rigs import constant_inputs, draining_tanks, three_tank
 from tests.test_gap import nominal_plant, recorded
 
 
@@ -130,6 +131,18 @@ def test_explanations_with_the_same_prediction_are_not_separated(rivals: Fitter)
     assert found is not None
     assert found["separation"] == pytest.approx(0.0, abs=1e-9)
     assert found["parted_after"] is None and found["parted_after_samples"] is None
+
+
+def test_an_ambiguous_answer_of_a_plant_without_inputs_has_no_next_input_and_no_remark_on_inputs() -> None:
+    """Lag and delay of a sensor of draining tanks."""
+    plant, lag = draining_tanks(), {"a.sensor_lag.time_constant": 4.0}
+    planned = constant_inputs(plant, 300.0, sample=2.0)
+    clean = clean_readings(build_network(plant, placements_for(lag)), planned, lag)
+    noise = torch.randn(clean.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    recording = plant.recording(planned.time, planned.inputs, clean + 3e-3 * noise)
+    answer = diagnose(plant, recording, settings=Settings(("sensor_lag@a", "sensor_delay@a")))
+    assert answer.verdict == "ambiguous" and answer.next_input is None
+    assert not any("inputs" in remark for remark in answer.remarks)
 
 
 def test_an_ambiguous_answer_has_an_input_that_separates_the_rivals() -> None:

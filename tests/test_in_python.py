@@ -573,6 +573,18 @@ def test_the_beginning_of_one_of_several_recordings_has_its_own_start_level() ->
     assert torch.equal(engine.readings(own), both.engines(1.0)[1].readings(own)[:, :50])
 
 
+def test_each_recording_has_its_own_noise_and_the_estimate_that_of_all() -> None:
+    runs = [
+        fdi_torch.simulate(RIG, inputs=STEPS, duration=f"{seconds} s", noise={"std": {"h": noise}}, seed=3)
+        for seconds, noise in ((200, "1 mm"), (600, "4 mm"))
+    ]
+    found = fdi_torch.estimate_parameters(fdi_torch.set_up(RIG, runs, ["A.leak"]))
+    assert [float(noise[0]) for noise in found.noise] == pytest.approx([1e-3, 4e-3], rel=0.15)
+    pooled = (0.25 * found.noise[0] ** 2 + 0.75 * found.noise[1] ** 2).sqrt()
+    assert found.estimate.noise_std is not None
+    assert torch.allclose(found.estimate.noise_std, pooled, rtol=0.01)
+
+
 def test_a_recording_at_hand_is_asked_for_the_plant_s_channels() -> None:
     blank = simulated()
     with pytest.raises(fdi_torch.ConfigError, match=r"expected a sensor 'h', got x"):

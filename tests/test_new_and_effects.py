@@ -32,6 +32,7 @@ from fdi_torch.effects.catalogue import effects
 from fdi_torch.jobs.run_setup import simulate_recording
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.recordings.csv_files import read_header
+from tests.rigs import draining_tanks
 
 
 def fdi(*words: str) -> None:
@@ -106,6 +107,15 @@ def test_every_template_is_a_file_of_its_kind_for_every_shipped_plant(name: str,
     assert study.plan.trials == 600 and study.run.config.simulate is not None
     assert study.run.config.simulate.duration == pytest.approx(600 * time_scale(plant), rel=0.1)
     assert len(load_rehearsal(paths["rehearsal"]).plans) == 2
+
+
+def test_the_templates_of_a_plant_without_inputs_are_files_of_their_kind(tmp_path: Path) -> None:
+    for kind, load in {"study": load_study, "rehearsal": load_rehearsal}.items():
+        path = tmp_path / f"{kind}.yaml"
+        (tmp_path / "drain.yaml").write_text(yaml.safe_dump(plant_mapping(draining_tanks())))
+        path.write_text(template(kind, draining_tanks(), str(tmp_path / "drain.yaml"), kind))
+        load(path)
+    assert "#   inputs: {}\n" in template("run", draining_tanks(), "drain.yaml", "run")
 
 
 LOADERS = {

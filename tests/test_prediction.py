@@ -10,14 +10,16 @@ import yaml
 
 import fdi_torch
 from fdi_torch.config.plant_file import build_plant, load_plant
+from fdi_torch.effects import build_network
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.free_runs.between_runs import between_run_spread
-from fdi_torch.gap.free_runs.prediction import leave_one_file_out, predict
+from fdi_torch.gap.free_runs.prediction import _starts, leave_one_file_out, predict
 from fdi_torch.gap.free_runs.refit import refit
 from fdi_torch.gap.recomputed import Recomputed
-from fdi_torch.plant.description import PlacedEffect, PlantDescription
+from fdi_torch.plant.description import OUTSIDE, Pipe, PlacedEffect, PlantDescription, Sensor, Tank
 from fdi_torch.recording import Recording
+from fdi_torch.simulate.simulated_recording import clean_readings
 
 NOISE = 0.01  # V
 
@@ -182,6 +184,31 @@ def test_a_run_needs_something_to_settle_in_and_something_left() -> None:
             predict(tank(), run, settle=seconds)
     with pytest.raises(ValueError, match=r"with a tolerance to vary .*got 'Z.gain'; the nearest is 'Q.gain'"):
         predict(tank(), run, vary=("Z.gain",))
+
+
+def row_of_tanks(unmeasured: int) -> PlantDescription:
+    """Tanks that drain from one into the next, of which only the last has a sensor."""
+    names = [f"T{i}" for i in range(unmeasured + 1)]
+    tanks = tuple(Tank(name, 1e-3, 0.5) for name in names)
+    ends = zip(names, [*names[1:], OUTSIDE], strict=True)
+    pipes = tuple(Pipe(f"P{i}", a, b, 2e-5, 0.6) for i, (a, b) in enumerate(ends))
+    return PlantDescription("row", tanks, pipes, sensors=(Sensor("h", names[-1]),))
+
+
+@pytest.mark.parametrize(("unmeasured", "count"), [(0, 1), (1, 4), (2, 16), (8, 4 + 12 * 8)])
+def test_the_starts_of_tanks_without_a_sensor_grow_in_proportion_to_their_number(unmeasured: int, count: int) -> None:
+    assert len(_starts(row_of_tanks(unmeasured), {f"T{unmeasured}.start_level": 0.3})) == count
+
+
+def test_the_initial_levels_of_four_tanks_without_a_sensor_are_found() -> None:
+    plant, levels = row_of_tanks(4), (0.1, 0.4, 0.15, 0.3, 0.2)
+    time = torch.arange(0.0, 120.0, 2.0, dtype=torch.float64)
+    blank = plant.recording(time, time.new_zeros(len(time), 0), time.new_zeros(len(time), 1))
+    network = build_network(plant)
+    clean = clean_readings(network, blank, {f"T{i}.start_level": h for i, h in enumerate(levels)})
+    noise = 1e-4 * torch.randn(clean.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    found = predict(plant, replace(blank, outputs=clean + noise), start_samples=60)
+    assert found.start_levels == pytest.approx({f"T{i}": h for i, h in enumerate(levels)}, abs=0.025)
 
 
 @pytest.mark.parametrize("start", [0.05, 0.0503, 0.0506, 0.0509, 0.0512])

@@ -179,8 +179,8 @@ def _suspected(plant: PlantDescription) -> list[str]:
 
 
 def _inputs(plant: PlantDescription, sampling: float) -> str:
-    """For each pump and transfer a step up and a step down about half of its range; valves are open."""
-    lines = []
+    """The key `inputs`: for each pump and transfer a step up and one down about half of its range; valves are open."""
+    lines = ["  inputs:" if plant.channels() else "  inputs: {}"]
     for channel in plant.channels():
         steps = zip((0, 200, 400), _shares(plant, channel, (0.4, 0.5, 0.3)), strict=False)
         listed = [f"[{sampling * k:.10g} s, {level}]" for k, level in steps]

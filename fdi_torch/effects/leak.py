@@ -6,8 +6,17 @@ from collections.abc import Mapping
 
 import torch
 
-from fdi_torch.plant.constants import leak_pipe
-from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
+from fdi_torch.plant.constants import leak_pipe, share_of_hole
+from fdi_torch.plant.effect import (
+    Effect,
+    Equivalents,
+    Local,
+    OperatingRange,
+    Parameter,
+    PlantDescription,
+    Stage,
+    Values,
+)
 from fdi_torch.plant.operating_range import interior_points, timed_starts
 
 
@@ -41,11 +50,14 @@ class Leak(Effect):
         permanent, *timed = timed_starts([{"size": 0.1}], operating_range)
         return [permanent, *at_height, *timed]
 
-    def equivalents(
-        self, place: str, plant: PlantDescription, values: Mapping[str, float]
-    ) -> tuple[tuple[str, str], ...]:
-        is_raised = values.get("height", 0.0) > 0.0
-        return () if is_raised else tuple(("plugging", outlet) for outlet in plant.floor_outlets(place))
+    def equivalents(self, place: str, plant: PlantDescription, values: Mapping[str, float]) -> Equivalents:
+        if values.get("height", 0.0) > 0.0:
+            return {}
+        size, timing = values.get("size", 0.0), {n: v for n, v in values.items() if n != "height"}
+        return {
+            ("plugging", outlet): {**timing, "size": -size / share_of_hole(plant, place, outlet)}
+            for outlet in plant.floor_outlets(place)
+        }
 
     def inflow(self, local: Local, p: Values) -> torch.Tensor:
         head = torch.clamp(local.level - p["height"], min=0.0)

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import torch
 
-from fdi_torch.plant.effect import Effect, Local, Parameter, PlantDescription, Stage, Values
+from fdi_torch.plant.effect import Effect, Equivalents, Local, Parameter, PlantDescription, Stage, Values
 
 
 class NetOutlet(Effect):
@@ -27,10 +27,8 @@ class NetOutlet(Effect):
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         return (Parameter("size", "1", 1.0, -1.0, 2.0, meaning="net outflow relative to the outlet's law"),)
 
-    def equivalents(
-        self, place: str, plant: PlantDescription, values: Mapping[str, float]
-    ) -> tuple[tuple[str, str], ...]:
-        return (("plugging", place),)
+    def equivalents(self, place: str, plant: PlantDescription, values: Mapping[str, float]) -> Equivalents:
+        return {("plugging", place): {"size": 1.0 - values.get("size", 1.0)}}
 
     def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * p["size"]

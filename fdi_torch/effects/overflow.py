@@ -13,7 +13,8 @@ from fdi_torch.plant.orifice import rim_strength, weir_flow
 
 class Overflow(Effect):
     """The weir law with a crest at H - b, less the law at the rim, times the length of the crest relative to the rim.
-    Shares of the overflow can go to other tanks; the rest leaves the plant, or goes where the rim's overflow goes.
+    Shares of the overflow can go to other tanks, by default to where that of the rim goes; the rest leaves the plant.
+    Shares whose sum exceeds 1 are divided by it.
 
     Typical: an overflow pipe 5 to 20 cm below the rim, a crest of 1 to 100 % of it. No effect below the crest.
     """
@@ -50,7 +51,8 @@ class Overflow(Effect):
         depths = [tank.height - level for level in (*interior_points((low, high), 6), high)]
         above = _above(place, plant)
         others = [t.name for t in plant.tanks if t.name not in (place, tank.overflow_to, *above)]
-        shares = [{}, *({f"to_{name}": 0.7} for name in others)]
+        usual = {f"to_{t.name}": 0.2 for t in plant.tanks if t.name == tank.overflow_to}
+        shares = [{}, *({f"to_{name}": 0.7} | usual for name in others)]
         return [{"below_rim": max(d, 0.0), "crest": 0.03} | share for d in depths for share in shares]
 
     def inflow(self, local: Local, p: Values) -> torch.Tensor:
@@ -58,7 +60,9 @@ class Overflow(Effect):
         return self._weir(over_rim, local, p["crest"]) - self._weir(over_rim + p["below_rim"], local, p["crest"])
 
     def recipients(self, p: Values) -> Mapping[str, torch.Tensor]:
-        return {name.removeprefix("to_"): share for name, share in p.items() if name.startswith("to_")}
+        shares = {name.removeprefix("to_"): share for name, share in p.items() if name.startswith("to_")}
+        whole = torch.clamp(sum(shares.values(), torch.zeros_like(p["crest"])), min=1.0)
+        return {name: share / whole for name, share in shares.items()}
 
     def _weir(self, above: torch.Tensor, local: Local, crest: torch.Tensor) -> torch.Tensor:
         area = local.constants["area"]

@@ -6,7 +6,18 @@ from collections.abc import Mapping
 
 import torch
 
-from fdi_torch.plant.effect import Effect, Local, OperatingRange, Parameter, PlantDescription, Stage, Values
+from fdi_torch.plant.constants import share_of_hole
+from fdi_torch.plant.effect import (
+    Effect,
+    Equivalents,
+    Local,
+    OperatingRange,
+    Parameter,
+    PlantDescription,
+    Stage,
+    Values,
+    place_kind,
+)
 from fdi_torch.plant.operating_range import onset_grid
 
 
@@ -35,14 +46,16 @@ class Plugging(Effect):
         times = [{}, *({"onset": instant} for instant in onset_grid(operating_range))]
         return [{"size": size} | onset for onset in times for size in (0.1, -0.1)]
 
-    def equivalents(
-        self, place: str, plant: PlantDescription, values: Mapping[str, float]
-    ) -> tuple[tuple[str, str], ...]:
+    def equivalents(self, place: str, plant: PlantDescription, values: Mapping[str, float]) -> Equivalents:
+        size, same = values.get("size", 0.0), dict[tuple[str, str], Mapping[str, float]]()
+        constant = not (values.get("onset") or values.get("ramp"))
+        share = {"outlet": "net_outlet", "pipe": "openness" if size >= 0.0 else None}.get(place_kind(plant, place))
+        if share and constant:
+            same[share, place] = {"size": 1.0 - size}
         source = next((p.source for p in plant.pipes if p.name == place), "")
-        outlets = plant.floor_outlets(source)
-        if place not in outlets or values.get("size", 0.0) > 0.0:
-            return ()
-        return (("leak", source), *((self.name, other) for other in outlets if other != place))
+        if size <= 0.0 and place in plant.floor_outlets(source):
+            same["leak", source] = {**values, "size": -size * share_of_hole(plant, source, place)}
+        return same
 
     def flow(self, flow: torch.Tensor, local: Local, p: Values) -> torch.Tensor:
         return flow * (1.0 - p["size"] * local.clock.risen(p["onset"], p["ramp"]))

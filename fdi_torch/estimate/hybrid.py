@@ -49,7 +49,8 @@ class HybridResult:
 
     likelihood: negative log-likelihood behind the standard errors, with the noise levels of the estimate.
     correlation (C,): between readings and predictions of the first recording, per channel.
-    predicted: readings (S, C) of each recording, simulated at the estimate, SI units.
+    predicted: readings (S, C) of each recording, simulated at the estimate, SI units. noise: noise level (C,) of each
+    recording, in the readings' units.
     steps: integration steps of search and refinement, s. engine: name of the simulation engine.
     """
 
@@ -59,6 +60,7 @@ class HybridResult:
     likelihood: Problem
     correlation: Tensor
     predicted: tuple[Tensor, ...]
+    noise: tuple[Tensor, ...]
     steps: tuple[float, float]
     engine: str
 
@@ -164,22 +166,24 @@ def conclude(
     problem = fitting.problem(steps[1], "likelihood", settings.adaptive)
     raw = fitting.problem(steps[1], "likelihood", settings.adaptive, averaged=False)
     predicted, misfits, inflated_noise = [], [], []
-    noise = raw.noise(theta, lanes)
+    noise = [level[0] for level in raw.noise(theta, lanes)]
     for term, noise_level in zip(raw.terms, noise, strict=True):
         predicted.append(term.engine.readings(term.theta(theta))[0])
-        misfits.append(channel_misfit(noise_level[0], term.data.known, term.data.weight))
+        misfits.append(channel_misfit(noise_level, term.data.known, term.data.weight))
     for term, noise_level in zip(problem.terms, problem.noise(theta, lanes), strict=True):
         residuals = term.data.known - term.engine.readings(term.theta(theta))[0]
         inflation = correlation_inflation(residuals, (term.data.weight > 0).to(residuals))
         inflated_noise.append(noise_level[0] * torch.sqrt(inflation))
     likelihood = problem.at_noise(inflated_noise)
     curvature = likelihood.linearise(theta, lanes).curvature[0]
+    samples = torch.stack([term.data.degrees for term in raw.terms])
+    pooled = (samples * torch.stack(noise) ** 2).sum(dim=0) / samples.sum(dim=0).clamp(min=1.0)
     estimate = make_estimate(
         fitting.space,
         theta[0],
         curvature,
         status=status_of(refinement),
-        noise_std=noise[0][0],
+        noise_std=torch.sqrt(pooled),
         reached={"search": search_result.reasons()[0], "refinement": refinement.statuses()[0], "steps_s": list(steps)},
     )
     first = raw.terms[0]
@@ -204,6 +208,7 @@ def conclude(
         likelihood=likelihood,
         correlation=raw.correlations(theta.unsqueeze(1), lanes)[0, 0],
         predicted=tuple(predicted),
+        noise=tuple(noise),
         steps=steps,
         engine=problem.terms[0].engine.why or problem.terms[0].engine.name,
     )

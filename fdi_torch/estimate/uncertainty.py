@@ -34,8 +34,8 @@ class Estimate(Shown):
     undetermined parameters. covariance (P, P): computed without regard to bounds; infinite or NaN in the rows and
     columns of undetermined parameters. at_bounds: 'low' or 'high' by name. undetermined: one sentence per group.
     combinations: what is determined of the undetermined parameters.
-    noise_std (C,): noise level of each channel, known or estimated, in its unit. reached: how the estimate was
-    computed, as plain values. draws: from the posterior, if some were asked for.
+    noise_std (C,): noise level of each channel over all recordings, known or estimated, in its unit. reached: how the
+    estimate was computed, as plain values. draws: from the posterior, if some were asked for.
     """
 
     names: tuple[str, ...]

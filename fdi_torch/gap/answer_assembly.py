@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from fdi_torch.effects import effect
 from fdi_torch.estimate.diagnosis import fault_flow
 from fdi_torch.gap.answer import UNKNOWN, Amount, Answer, Cause, CauseName, ProbableExplanation, names
 from fdi_torch.gap.candidate import Fit
@@ -149,7 +150,7 @@ def _causes(result: DiagnosisResult) -> tuple[Cause, ...]:
     placements = [p for p in fit.candidate.placements if p.cause in result.posterior.best.causes]
     for p in placements:
         amounts = amounts_of(fitter, fit, p, stds)
-        others = equivalence_class(p.cause, plant, fit.values) - {p.cause}
+        others = {c for c in equivalence_class(p.cause, plant, fit.values) if effect(c[0]).searched} - {p.cause}
         causes.append(Cause(*p.cause, amounts, tuple(sorted(others)), _flow(fitter, fit, p, amounts)))
     if result.posterior.best.unknown_at:
         causes.append(Cause(UNKNOWN, result.posterior.best.unknown_at))

@@ -130,14 +130,12 @@ def low_frequency_excess(white: Tensor) -> float:
     return float((power[slow].sum(dim=0) - (float(slow.sum()) - 0.5) * level).sum())
 
 
-def estimate_noise(
-    residual: Tensor, mask: Tensor, steps: Sequence[float] = (), rows: Sequence[slice] = (slice(None),)
-) -> Noise:
+def estimate_noise(residual: Tensor, mask: Tensor, rows: Sequence[slice], steps: Sequence[float] = ()) -> Noise:
     """Estimate the noise of each channel from residual (S, C) and mask (S, C).
 
-    All channels share one correlation, since one system reads them. steps (C,): quantization steps; channels with a
-    step do not count for the common correlation, because rounding errors have their own. rows: segments without a jump
-    between their samples.
+    All channels share one correlation, since one system reads them. rows: those of each recording, because the model
+    error jumps between recordings. steps (C,): quantization steps; channels with a step do not count for the common
+    correlation, because rounding errors have their own.
     """
     quantized = [step > 0.0 for step in steps]
     spectra = [_spectrum_of_all([residual[r][mask[r][:, c], c] for r in rows]) for c in range(residual.shape[1])]
@@ -251,23 +249,26 @@ def _most_likely(likelihood: Tensor, count: int) -> int:
     return best if float(likelihood[_WHITE] - likelihood[best]) > math.log(count) else _WHITE
 
 
-def with_rounding(noise: Noise, steps: Sequence[float], readings: Tensor) -> Noise:
+def with_rounding(noise: Noise, steps: Sequence[float], readings: Tensor, gains: Tensor) -> Noise:
     """Add the rounding error of channels (C,) with steps > 0. readings (S, C): close to the readings before rounding.
 
-    Its variance is step^2 / 12 (Widrow and Kollar, 2008), added to the noise of the other channels. It is constant
-    until the level has moved by a good part of a step, which gives its correlation.
+    Its variance is step^2 / 12 (Widrow and Kollar, 2008), added to the noise of the other channels, which is assumed to
+    be the same in metres. It is constant until the level has moved by a good part of a step, which gives its
+    correlation. gains (C,): of the sensors, in the reading's unit per metre.
     """
     if not any(steps):
         return noise
     std, ar = noise.std.clone(), noise.ar.clone()
-    unrounded = [float(s) for s, step in zip(std, steps, strict=True) if not step]
+    in_metres = (std / gains.abs()).tolist()
+    unrounded = sorted(s for s, step in zip(in_metres, steps, strict=True) if not step)
+    noise_level = unrounded[len(unrounded) // 2] if unrounded else 0.0
     for c, step in enumerate(steps):
         if not step:
             continue
-        noise_below = sorted(unrounded)[len(unrounded) // 2] if unrounded else 0.0
         movement = float(readings[:, c].diff().abs().mean())
         correlation = math.exp(-max(movement, 1e-4 * step) / (DECAY_SHARE * step))
-        std[c], ar[c] = math.hypot(noise_below, step / math.sqrt(12.0)), max(float(ar[c]), min(correlation, 0.98))
+        std[c] = math.hypot(noise_level * float(gains[c]), step / math.sqrt(12.0))
+        ar[c] = max(float(ar[c]), min(correlation, 0.98))
     return Noise(std * torch.sqrt(1.0 - ar**2), ar)
 
 

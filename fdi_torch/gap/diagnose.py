@@ -131,14 +131,14 @@ def recalibrate(data: DataSet) -> tuple[Fitter, Fit, list[float]]:
     """The noise of each channel, the constants fitted under it, and the quantization step of each channel."""
     null = Fitter(data, Noise.rough(data.readings)).fit(Candidate())
     residual = data.readings - null.linearised.readings[0]
-    noise = estimate_noise(residual, data.mask, rows=data.rows)
+    noise = estimate_noise(residual, data.mask, data.rows)
     quantization_steps = []
     for c, values in enumerate(map(data.recorded, range(len(data.plant.sensors)))):
         of_one_reading = float(noise.std[c]) * math.sqrt(len(values) / int(data.mask[:, c].sum()))
         quantization_steps.append(quantization_step(values, of_one_reading))
     # A recording without noise tells no more than the simulation, whose readings err a little.
     exact = EXACT * torch.where(data.mask, data.readings, 0.0).abs().amax(dim=0)
-    noise = estimate_noise(residual, data.mask, quantization_steps, data.rows).at_least(exact)
+    noise = estimate_noise(residual, data.mask, data.rows, quantization_steps).at_least(exact)
     noise = noise_before_clipping(noise, data, null.linearised.readings[0])
     fitter = Fitter(with_noise_limits(data, null, noise), noise)
     return fitter, fitter.fit(Candidate(), null), quantization_steps

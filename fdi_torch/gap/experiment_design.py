@@ -29,7 +29,10 @@ TINY = 1e-10
 
 
 def discriminating_input(fitter: Fitter, first: Fit, second: Fit) -> Mapping[str, Any] | None:
-    """The design with the largest separation that keeps all tanks below their rim; None if none is safe."""
+    """The design with the largest separation that keeps all tanks below their rim; None if none is safe, or if the
+    plant has no inputs."""
+    if not fitter.data.plant.channels():
+        return None
     generator, scale = torch.Generator().manual_seed(SEED), time_scale(fitter.data.plant)
     best: Mapping[str, Any] | None = None
     for k in range(DESIGNS):

@@ -139,7 +139,7 @@ class ExplanationPool:
         own_noise: screening under its own noise. sensor_noise: screening under sensor noise alone.
         """
         own_noise = with_fine_onsets(parent.fitter, parent.fit, own_noise, FITTED)
-        relevant = [c for c in self._extensions(parent.fit, own_noise, own=True) if self._relevant(parent, c.key)]
+        relevant = self._relevant(parent, self._extensions(parent.fit, own_noise, own=True))
         fits = self._fitted(parent.fitter, parent.fit, relevant)[:EVALUATED]
         if sensor_noise:
             pairs = best_pairs(pairs_of(self.fitter, parent.fit, sensor_noise), PAIRS)
@@ -200,15 +200,16 @@ class ExplanationPool:
                     self._failed.add(candidate.key)
         return sorted(fits, key=lambda f: f.cost)
 
-    def _relevant(self, parent: RankedExplanation, key: Key) -> bool:
-        """Whether an extension of `parent` is expected to come within RARE of the best explanation.
+    def _relevant(self, parent: RankedExplanation, extensions: Sequence[Candidate]) -> list[Candidate]:
+        """The extensions of `parent` that are expected to come within RARE of the best explanation.
 
-        It may gain more than its first-order gain by the largest factor among all extensions that were fitted so far.
+        Each may gain more than its first-order gain by the largest factor among all extensions that were fitted so far.
         """
         pairs = [pair for k in self._expected_gains for pair in self._gains(k)]
         factor = max([1.0, *(actual / gain for actual, gain in pairs if gain > PRIOR_GAIN)])
-        expected = self._expected_gains[parent.key][key]
-        return factor * expected.gain + expected.prior + parent.log_evidence - self.best.log_evidence > math.log(RARE)
+        needed = math.log(RARE) + self.best.log_evidence - parent.log_evidence
+        expected = [(c, self._expected_gains[parent.key][c.key]) for c in extensions]
+        return [c for c, e in expected if factor * e.gain + e.prior > needed]
 
     def _improves(self, fit: Fit, costs: Mapping[Key, float]) -> bool:
         """Whether a fit is likelier, by chi-square and prior odds, than every explanation with fewer of its effects.

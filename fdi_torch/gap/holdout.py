@@ -89,10 +89,11 @@ def run_reference_models(
 ) -> HeldOut:
     """Free runs of all models by name, "augmented" among them. quantization_steps (C,): 0 for channels without one."""
     runs = {name: free_run(data, noise, model) for name, model in models.items()}
+    gains = data.readings.new_tensor([s.gain for s in data.plant.sensors])
     residuals = (data.readings - runs[m] for m in ("augmented", "recalibrated") if m in runs)
-    nearest = min(residuals, key=lambda r: float(torch.where(data.mask, r * r, 0.0).sum()))
-    fast = estimate_noise(nearest, data.mask, quantization_steps)
-    return HeldOut(data, runs, with_rounding(fast, quantization_steps, data.readings - nearest))
+    nearest = min(residuals, key=lambda r: float(torch.where(data.mask, (r / gains) ** 2, 0.0).sum()))
+    fast = estimate_noise(nearest, data.mask, data.rows, quantization_steps)
+    return HeldOut(data, runs, with_rounding(fast, quantization_steps, data.readings - nearest, gains))
 
 
 def closure(holdouts: Sequence[HeldOut]) -> Closure:

@@ -76,8 +76,16 @@ def tanks_of(place: str, plant: PlantDescription) -> tuple[str, ...]:
 
 
 def equivalence_class(cause: CauseName, plant: PlantDescription, values: Mapping[str, float]) -> frozenset[CauseName]:
-    """The cause and all others with the same equations. values: of a fit, by full name."""
+    """The cause and all others with the same equations, also through others. values: of a fit, by full name; a
+    parameter of the cause without a value may have any.
+    """
     name, place = cause
     prefix = f"{place}.{name}."
-    own = {full.removeprefix(prefix): value for full, value in values.items() if full.startswith(prefix)}
-    return frozenset((cause, *effect(name).equivalents(place, plant, own)))
+    pending = {cause: {full.removeprefix(prefix): v for full, v in values.items() if full.startswith(prefix)}}
+    same: set[CauseName] = set()
+    while pending:
+        (name, place), own = pending.popitem()
+        same.add((name, place))
+        others = effect(name).equivalents(place, plant, own)
+        pending |= {c: dict(v) for c, v in others.items() if c not in same}
+    return frozenset(same)

@@ -40,7 +40,7 @@ def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
     remarks: list[str] = []
     remarks += dict.fromkeys(s for part in data.parts for s in data_warnings(part.recording, data.plant))
     inputs = [column for part in data.parts for column in part.recording.inputs.T]
-    if all(float(torch.diff(column).abs().max()) == 0.0 for column in inputs):
+    if inputs and all(float(torch.diff(column).abs().max()) == 0.0 for column in inputs):
         remarks.append(
             "the inputs never change, so that most effects cannot be distinguished from each other or from a constant "
             "within its tolerance; test inputs with steps by `fdi plan`, then record again"

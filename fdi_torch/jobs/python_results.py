@@ -224,7 +224,7 @@ class RefitResult(Shown):
             rows += [(name, Path(o.source).name, o.start, scale * o.value, scale * o.std, unit) for o in each]
             if variation := between_run_spread(each, constants[name].std):
                 std, low, high = (f"{scale * x:.2g}" for x in (variation.std, variation.low, variation.high))
-                mean, of = f"{scale * variation.mean:.4g}", f"mean and standard deviation of {variation.count}"
+                mean, of = f"{scale * variation.mean:.4g}", f"mean and between-run std of {variation.count}"
                 rows.append((name, of, None, mean, f"{std} (95 %: {low} to {high})", unit))
         header = ("parameter", "recording", "from, s", "value", "std error", "unit")
         return Table(header, rows, "values of each recording")

@@ -169,9 +169,9 @@ def estimate_logged(
         tell(0.95, "examining the recordings")
         doubts = (*thorough_findings(run.plant, [r.to(torch.device("cpu")) for r in fitting.recordings]), *doubts)
     log_result(log, result, fitting.space, profiles, doubts)
-    for k, (recording, predicted) in enumerate(zip(fitting.recordings, result.predicted, strict=True)):
-        group = group_of(k, len(fitting.recordings))
-        log_prediction(log, recording, predicted, group, result.estimate.noise_std)
+    each = zip(fitting.recordings, result.predicted, result.noise, strict=True)
+    for k, (recording, predicted, noise) in enumerate(each):
+        log_prediction(log, recording, predicted, group_of(k, len(fitting.recordings)), noise)
     return result, profiles, tuple(doubts)
 
 

@@ -71,6 +71,12 @@ def leak_pipe(plant: PlantDescription, tank: str) -> Pipe:
     return plant.pipes[0] if plant.pipes else Pipe(f"{tank}.hole", tank, OUTSIDE, 1e-3 * plant.tank(tank).area, 0.6)
 
 
+def share_of_hole(plant: PlantDescription, tank: str, outlet: str) -> float:
+    """Nominal capacity of an outlet relative to that of a leak of size 1 of its tank."""
+    pipe = next(p for p in plant.pipes if p.name == outlet)
+    return nominal_capacity(plant, pipe) / nominal_capacity(plant, leak_pipe(plant, tank))
+
+
 def nominal_capacity(plant: PlantDescription, pipe: Pipe) -> float:
     """Nominal C_d a sqrt(2 g) of a pipe: its flow at 1 m of head, m^2.5/s."""
     return pipe.nominal_capacity(plant.gravity)

@@ -23,10 +23,19 @@ from fdi_torch.plant.signals import Clock
 __all__ = [
     *("Effect", "Memory", "Placement", "Stage"),
     *("expect_fit", "fits", "place_kind", "place_kinds_of", "placed_parameters"),
-    *("Clock", "Local", "OperatingRange", "Parameter", "PlantDescription", "Values"),  # for the files of effects
+    *(
+        "Clock",
+        "Equivalents",
+        "Local",
+        "OperatingRange",
+        "Parameter",
+        "PlantDescription",
+        "Values",
+    ),  # for the files of effects
 ]
 
 Memory = tuple["torch.Tensor", ...]
+Equivalents = Mapping[tuple[str, str], Mapping[str, float]]
 
 
 class Stage(Enum):
@@ -87,13 +96,13 @@ class Effect:
         bounds = [bound for bound in (size.low, size.high) if bound != size.nominal]
         return [{size.name: size.nominal + 0.1 * (bound - size.nominal)} | typical for bound in bounds]
 
-    def equivalents(
-        self, place: str, plant: PlantDescription, values: Mapping[str, float]
-    ) -> tuple[tuple[str, str], ...]:
-        """Other effects, each with its place, that have the same equations. values: its parameters (SI, short names);
-        a parameter without a value may have any.
+    def equivalents(self, place: str, plant: PlantDescription, values: Mapping[str, float]) -> Equivalents:
+        """Other effects with the same equations: name and place, and the parameters with which they are the same.
+
+        values: its own parameters (SI, short names); a parameter without a value may have any. An effect that is the
+        same through another need not be named. Each of the others names this one in turn.
         """
-        return ()
+        return {}
 
     def delay(self, p: Values) -> torch.Tensor:
         """COMMAND, READING: dead time that the effect adds to its signal, s (only where `delays`)."""

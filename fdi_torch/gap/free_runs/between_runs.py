@@ -24,7 +24,7 @@ class RunConstant:
 
 @dataclass(frozen=True)
 class BetweenRunSpread:
-    """Mean, standard deviation and its 95 % interval over `count` recordings."""
+    """Mean, between-run standard deviation and its 95 % interval over `count` recordings."""
 
     count: int
     mean: float
@@ -34,16 +34,37 @@ class BetweenRunSpread:
 
 
 def between_run_spread(constants: Sequence[RunConstant], tolerance: float) -> BetweenRunSpread | None:
-    """Standard deviation over the recordings that determine the constant; None for fewer than two.
+    """Between-run standard deviation s over the recordings that determine the constant; None for fewer than two.
 
-    For independent normal values, (n - 1) s^2 / sigma^2 is chi-square with n - 1 degrees of freedom.
+    The values x_i with the standard errors e_i are normal with the variances s^2 + e_i^2, so that
+
+        Q(s^2) = sum w_i (x_i - m)^2,   w_i = 1 / (s^2 + e_i^2),   m = sum w_i x_i / sum w_i,
+
+    is chi-square with n - 1 degrees of freedom. At the estimate Q is n - 1 (Paule and Mandel, 1982), at the ends of the
+    interval a quantile (Viechtbauer, 2007). Any of the three is 0 if Q(0) is smaller.
     """
-    from scipy.special import chdtri  # SciPy takes a while to load, and few plants have constants that vary
+    from scipy.optimize import brentq  # SciPy takes a while to load, and few plants have constants that vary
+    from scipy.special import chdtri
 
-    values = torch.tensor([o.value for o in constants if o.std < DETERMINED * tolerance], dtype=torch.float64)
-    count = len(values)
+    determined = [o for o in constants if o.std < DETERMINED * tolerance]
+    count = len(determined)
     if count < 2:
         return None
-    std = float(values.std())
-    low, high = (std * math.sqrt((count - 1) / chdtri(count - 1, share)) for share in (0.025, 0.975))
-    return BetweenRunSpread(count, float(values.mean()), std, low, high)
+    values = torch.tensor([o.value for o in determined], dtype=torch.float64)
+    errors = torch.tensor([o.std for o in determined], dtype=torch.float64)
+    scale = float(values.var())
+
+    def weighted(variance: float) -> tuple[float, float]:
+        """m and Q at s^2 = variance * scale."""
+        weight = 1.0 / (variance * scale + errors**2)
+        mean = (weight * values).sum() / weight.sum()
+        return float(mean), float((weight * (values - mean) ** 2).sum())
+
+    def variance_at(chi_square: float) -> float:
+        if weighted(0.0)[1] <= chi_square:
+            return 0.0
+        return float(brentq(lambda v: weighted(v)[1] - chi_square, 0.0, (count - 1) / chi_square))
+
+    high, estimate, low = (variance_at(q) for q in (chdtri(count - 1, 0.975), count - 1, chdtri(count - 1, 0.025)))
+    std, low, high = (math.sqrt(v * scale) for v in (estimate, low, high))
+    return BetweenRunSpread(count, weighted(estimate)[0], std, low, high)

@@ -182,10 +182,15 @@ def _engine(fitter: Fitter, placements: Sequence[Placement], names: Sequence[str
 
 
 def _starts(plant: PlantDescription, measured: Mapping[str, float]) -> list[dict[str, float]]:
-    """Initial values: measured levels, and a grid for tanks without a sensor."""
-    unmeasured = [t for t in plant.tanks if f"{t.name}.start_level" not in measured]
-    grids = [[(f"{t.name}.start_level", share * t.height) for share in UNMEASURED_STARTS] for t in unmeasured]
-    return [{**measured, **dict(choice)} for choice in product(*grids)]
+    """Initial values: measured levels, and those of tanks without a sensor, of which all but one are equally full.
+
+    Of u such tanks these are 4 + 12 u starts, or all 4^u combinations of two or fewer.
+    """
+    full = {f"{t.name}.start_level": t.height for t in plant.tanks if f"{t.name}.start_level" not in measured}
+    differing = product(UNMEASURED_STARTS, full, UNMEASURED_STARTS)
+    shares = [dict.fromkeys(full, share) | {name: other} for share, name, other in differing] or [{}]
+    starts = [{**measured, **{name: s * full[name] for name, s in each.items()}} for each in shares]
+    return [start for i, start in enumerate(starts) if start not in starts[:i]]
 
 
 @dataclass(frozen=True)

@@ -116,7 +116,8 @@ def refit(
     for turn in range(turns):
         tell((1 + turn) / (1 + turns), f"fit of constants and effects, turn {turn + 1} of {turns}")
         if white is None:
-            fitter = Fitter(data, estimate_noise(data.readings - fit.linearised.readings[0], data.mask))
+            residual = data.readings - fit.linearised.readings[0]
+            fitter = Fitter(data, estimate_noise(residual, data.mask, data.rows))
         candidate = Candidate(tuple(free), (start,))
         fit = base = _with_a_trajectory(fit_by_continuation(fitter, candidate, base), recordings)
         effect_values = {n: v for n, v in fit.effect_values.items() if n in start}
