@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.monitor.hypothesis import Fault, Hypothesis
-from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow
+from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, sudden_changes
 from fdi_torch.monitor.oscillation import strongest_periods
 
 ONSETS = 24  # candidate onsets in a window; the fit then varies the onset continuously
@@ -165,16 +165,12 @@ def oscillation_guess(
     theta = believed.repeat(len(grid), 1)
     trial = TRIAL_SIZE * float(observer.space_width()[size])
     theta[:, size], theta[:, period], theta[:, phase] = trial, grid[:, 0], grid[:, 2]
-    changes = ChangeHypotheses(theta, grid[:, 1], torch.zeros(len(grid), dtype=torch.bool))
-    products = []
-    for part in observer.in_blocks(window, changes, even=2):
-        shape = (base - observer.white_innovations(window, believed, part)).flatten(1).reshape(len(part) // 2, 2, -1)
-        columns = torch.cat([shape, base.flatten(1).expand(len(shape), 1, -1)], dim=1)
-        products.append(columns @ columns.mT)
-    gram = torch.cat(products)
-    normal = gram[:, :2, :2] + 1e-12 * gram[:, :2, :2].diagonal(dim1=1, dim2=2).amax(1).clamp(min=1e-30)[
-        :, None, None
-    ] * torch.eye(2, dtype=gram.dtype)
+    shape = base - observer.white_innovations(window, believed, sudden_changes(theta, grid[:, 1]))
+    shape = shape.flatten(1).unflatten(0, (-1, 2))
+    columns = torch.cat([shape, base.flatten(1).expand(len(shape), 1, -1)], dim=1)
+    gram = columns @ columns.mT
+    largest = gram[:, :2, :2].diagonal(dim1=1, dim2=2).amax(1).clamp(min=1e-30)
+    normal = gram[:, :2, :2] + 1e-12 * largest[:, None, None] * torch.eye(2, dtype=gram.dtype)
     scale = torch.linalg.solve(normal, gram[:, :2, 2:])[..., 0]
     best = int((scale * gram[:, :2, 2]).sum(1).argmax())
     sine, cosine = scale[best].tolist()

@@ -112,10 +112,10 @@ def misfits_over_excess(
     closest = min(range(len(fits)), key=lambda i: fits[i].misfit)
     if fits[closest].fits:
         return [f.misfit for f in fits]
-    blocks, times = observer.in_blocks(window, changes_of(fits)), window.times.contiguous()
-    square = torch.cat([observer.white_innovations(window, believed, block).square().sum(2) for block in blocks])
+    square = observer.white_innovations(window, believed, changes_of(fits)).square().sum(2)
     count = torch.isfinite(window.samples.readings[1:]).sum(1).to(square.dtype)
     total = torch.nn.functional.pad(torch.stack([square[closest], count]).cumsum(1), (1, 0))
+    times = window.times.contiguous()
     first, last = (torch.searchsorted(times, times + s * reach, right=s > 0.0) for s in (-0.5, 0.5))
     near, readings = total[:, last] - total[:, first]
     return (0.5 * square / (near / readings.clamp(min=1.0)).clamp(min=1.0)).sum(1).tolist()
@@ -138,8 +138,7 @@ def with_flows_of_window(
     likeliest = next(f for f in ranked if f.hypothesis.columns)
     observer = observer.learning_from(window, believed, changes_of([likeliest]))[0]
     base = observer.white_innovations(window, believed, no_change(believed))
-    blocks = observer.in_blocks(window, changes_of(ranked))
-    misfits = torch.cat([0.5 * observer.white_innovations(window, believed, b).square().sum((1, 2)) for b in blocks])
+    misfits = 0.5 * observer.white_innovations(window, believed, changes_of(ranked)).square().sum((1, 2))
     evidence = [f.evidence + f.misfit - now for f, now in zip(ranked, misfits.tolist(), strict=True)]
     changes = [
         f
