@@ -82,21 +82,12 @@ def estimate_state_noise(
             problem.climbed(each, times[1:], wander.correlation_time, _with_wander_correlation_time) for each in starts
         ]
         return max(climbs, key=lambda likely: likely.log_likelihood)
-    return problem.climbed(start, times, start.correlation_time, partial(with_flow_correlation_time, interval=interval))
+    return problem.climbed(
+        start, times, start.correlation_time, partial(_with_flow_correlation_time, interval=interval)
+    )
 
 
-def hill_climb(value: Callable[[int], float], first: int, count: int) -> int:
-    """An index below `count` at which a value is at its maximum: from `first` to the better neighbour, as long as there
-    is one. value: keeps what it has computed.
-    """
-    best = first
-    for step in (1, -1):
-        while 0 <= best + step < count and value(best + step) > value(best):
-            best += step
-    return best
-
-
-def with_flow_correlation_time(noise: StateNoise, time: float, interval: float) -> StateNoise:
+def _with_flow_correlation_time(noise: StateNoise, time: float, interval: float) -> StateNoise:
     """The noise model with another correlation time of the flow disturbances.
 
     The intensity is adjusted such that the variance of the disturbance integrated over a long time, which is
@@ -141,24 +132,26 @@ class _Problem:
         first_time: float,
         with_time: Callable[[StateNoise, float], StateNoise],
     ) -> Likelihood:
-        """The most likely noise on a grid of correlation times, s: hill climbing from the one nearest to `first_time`.
+        """Hill climbing over the grid of correlation times, s, from the one nearest to `first_time`.
 
         At each time the other noise parameters are optimised. with_time: sets the correlation time of a noise model.
         """
 
+        def at(noise: StateNoise, time: float) -> Likelihood:
+            # The likelihood is flat in the logarithms of flows that move no level.
+            flows = torch.maximum(noise.intensity, self.unit)
+            return self.solve(with_time(replace(noise, intensity=flows), time))
+
         middle = min(range(len(times)), key=lambda i: abs(times[i] - first_time))
-        found: dict[int, Likelihood] = {}
-
-        def at(i: int) -> float:
-            if i not in found:
-                noise = max(found.values(), key=lambda likely: likely.log_likelihood).noise if found else start
-                # The likelihood is flat in the logarithms of flows that move no level.
-                flows = torch.maximum(noise.intensity, self.unit)
-                found[i] = self.solve(with_time(replace(noise, intensity=flows), times[i]))
-            return found[i].log_likelihood
-
-        best = found[hill_climb(at, middle, len(times))]
-        return replace(best, start_log_likelihood=found[middle].start_log_likelihood)
+        first = best = at(start, times[middle])
+        for step in (1, -1):
+            i = middle + step
+            while 0 <= i < len(times):
+                candidate = at(best.noise, times[i])
+                if candidate.log_likelihood <= best.log_likelihood:
+                    break
+                best, i = candidate, i + step
+        return replace(best, start_log_likelihood=first.start_log_likelihood)
 
     def solve(self, start: StateNoise) -> Likelihood:
         """Maximise the likelihood over the logarithms of intensities, scales and wander, by L-BFGS-B."""

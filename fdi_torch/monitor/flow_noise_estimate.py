@@ -9,25 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache
 
 import torch
 from torch import Tensor
 
 from fdi_torch.estimate.kalman import Propagation, SensorNoise, StateNoise
-from fdi_torch.estimate.state_noise import (
-    CORRELATION_TIMES,
-    Likelihood,
-    estimate_state_noise,
-    hill_climb,
-    with_flow_correlation_time,
-)
+from fdi_torch.estimate.state_noise import CORRELATION_TIMES, Likelihood, estimate_state_noise
 from fdi_torch.monitor.flow_filter import FlowFilter, forcing
 from fdi_torch.monitor.observer_gain import Gain, Linear
 
 FIRST_TIME = 20.0  # correlation time at which the optimisation starts, in sampling intervals
-# The correlation time is 2^e sampling intervals, searched in steps of 1 of e; flows are white at the lowest e.
-WHITE, SLOWEST = -1.0, 8.5
+# The correlation time is 2^e sampling intervals, searched with this step of e; flows are white at the lowest e.
+WHITE, SLOWEST, STEP = -1.0, 8.5, 1.0
 CORRELATIONS = (0.3, 0.5, 0.7, 0.85, 0.95)  # candidates for that of the sensors' noise
 FIRST_UNIT = 0.1  # initial flow per sample of the optimisation, in standard deviations of a level's measurement noise
 
@@ -65,8 +58,18 @@ def likeliest_correlation(estimate: Callable[[float], tuple[FlowFilter, float]])
 
     estimate: `estimate_flow_filter` with a correlation.
     """
-    found = cache(lambda i: estimate(CORRELATIONS[i]))
-    return found(hill_climb(lambda i: found(i)[1], len(CORRELATIONS) // 2, len(CORRELATIONS)))
+    best = len(CORRELATIONS) // 2
+    found = {best: estimate(CORRELATIONS[best])}
+
+    def at(i: int) -> float:
+        if i not in found:
+            found[i] = estimate(CORRELATIONS[i])
+        return found[i][1]
+
+    for step in (1, -1):
+        while 0 <= best + step < len(CORRELATIONS) and at(best + step) > at(best):
+            best += step
+    return found[best]
 
 
 def _likeliest(
@@ -110,28 +113,29 @@ def _with_likeliest_time(
 ) -> Likelihood:
     """The most likely noise over all correlation times.
 
-    The search climbs on a grid of correlation times that contains that of `start`, from the best of it and of `times`
-    (in sampling intervals), and ends at the maximum of a parabola through the last three points. solved: the most
-    likely noise among those with the correlation time of its argument.
+    The search climbs on a grid of correlation times, from the best of `times` (in sampling intervals) and that of
+    `start`, and ends at the maximum of a parabola through the last three points. solved: the most likely noise among
+    those with the correlation time of its argument.
     """
     first = _exponent(start.correlation_time / interval)
     found = {first: solved(start)}
-    steps = range(math.ceil(WHITE - first), math.floor(SLOWEST - first) + 1)
-    grid = sorted({WHITE, *(first + k for k in steps), SLOWEST})
 
     def at(e: float) -> float:
         if e not in found:
-            nearest, time = min(found, key=lambda other: abs(other - e)), interval * 2.0**e if e > WHITE else 0.0
-            found[e] = solved(with_flow_correlation_time(found[nearest].noise, time, interval))
+            nearest = min(found, key=lambda other: abs(other - e))
+            noise, time = found[nearest].noise, interval * 2.0**e if e > WHITE else 0.0
+            # keeps the variance of a flow integrated over a long time, intensity^2 max(2 tau, interval)
+            intensity = noise.intensity * 2.0 ** (0.5 * (nearest - e))
+            found[e] = solved(replace(noise, correlation_time=time, intensity=intensity))
         return found[e].log_likelihood
 
-    starts = {min(grid, key=lambda e: abs(e - other)) for other in (first, *map(_exponent, times))}
-    highest = max(sorted(starts, key=lambda e: abs(e - first)), key=at)
-    best = hill_climb(lambda i: at(grid[i]), grid.index(highest), len(grid))
-    if 1 < best < len(grid) - 2:
-        below, middle, above = (at(e) for e in grid[best - 1 : best + 2])
-        if (bend := below - 2.0 * middle + above) < 0.0:
-            at(grid[best] + 0.5 * (below - above) / bend)
+    best = max(sorted({first, *map(_exponent, times)}, key=lambda e: abs(e - first)), key=at)
+    for step in (STEP, -STEP):
+        while at(further := min(max(best + step, WHITE), SLOWEST)) > at(best):
+            best = further
+    below, above = best - STEP, best + STEP
+    if below > WHITE and above < SLOWEST and (bend := at(below) - 2.0 * at(best) + at(above)) < 0.0:
+        at(best + 0.5 * STEP * (at(below) - at(above)) / bend)
     likeliest = max(found.values(), key=lambda likely: likely.log_likelihood)
     return replace(likeliest, start_log_likelihood=found[first].start_log_likelihood)
 
