@@ -14,7 +14,6 @@ from scipy import stats
 
 from fdi_torch.monitor.detection import (
     CHARTS,
-    NO_ALARM,
     Chart,
     ChartRate,
     Detector,
@@ -150,8 +149,8 @@ def test_a_shift_is_found_sooner_by_cusum_than_by_a_fixed_threshold() -> None:
     shifted[:, 1000:, 1] += 0.7
     delays = {}
     for chart in CHARTS:
-        first = detector_of(chart, 20000.0).first_alarm(shifted)
-        late = torch.where(first == NO_ALARM, 3000, first)
+        alarms = detector_of(chart, 20000.0).alarms(shifted)
+        late = torch.where(alarms.any(dim=1), alarms.to(torch.int8).argmax(dim=1), 3000)
         delays[chart] = float(late[late > 1000].median() - 1000)
     assert delays["cusum"] < 0.5 * delays["fixed"]
 

@@ -134,7 +134,7 @@ def _explained_time(plant: PlantDescription, recording: Recording, longest: floa
 
     Raises ValueError for a recording that cannot be monitored.
     """
-    from fdi_torch.monitor.explained_beginning import explained_until  # takes a while to load
+    from fdi_torch.monitor.monitor_setup import explained_until  # takes a while to load
 
     first, learnt = float(recording.time[0]), FEWEST * recording.interval
     if learnt >= longest:

@@ -9,6 +9,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from io import FileIO
 from itertools import chain, pairwise, takewhile
 from pathlib import Path
 from typing import Any
@@ -191,6 +192,7 @@ class LearningItems:
     def __init__(self, log: Path) -> None:
         self.path = log.with_name(f"{log.name}.learning")
         self.count, self._ended, self._writing = 0, False, threading.Lock()
+        self._file: FileIO | None = None
 
     def read(self) -> tuple[list[Row | str], float | None]:
         """All items, and time 0; nothing without a file. A line that a killed run has not finished is left out."""
@@ -207,18 +209,31 @@ class LearningItems:
         """The items, each added to the file before it is passed on, until `end`; to be read by the thread that reads
         the source, because learning occupies the other one. origin: time 0 of the source."""
         known = len(self.read()[0])  # a resumed run begins with them
-        for item in items:
-            with self._writing:
-                self.count += 1
-                if self.count > known and not self._ended:
-                    with named_errors(self.path), self.path.open("ab") as file:
-                        file.write(orjson.dumps([origin(), [item]]) + b"\n")
-            yield item
+        try:
+            for item in items:
+                with self._writing:
+                    self.count += 1
+                    if self.count > known and not self._ended:
+                        self._append(orjson.dumps([origin(), [item]]))
+                yield item
+        finally:
+            self._close()
+
+    def _append(self, line: bytes) -> None:
+        """Add a line, which is on its way to the disk at once, so that a killed run has left it."""
+        with named_errors(self.path):
+            self._file = self._file or self.path.open("ab", buffering=0)
+            self._file.write(line + b"\n")
+
+    def _close(self) -> None:
+        if self._file is not None:
+            self._file.close()
 
     def end(self) -> None:
         """Keep nothing more, and remove the file, since the log has its items."""
         with self._writing:
             self._ended = True
+            self._close()
             self.remove()
 
     def remove(self) -> None:

@@ -15,11 +15,9 @@ from fdi_torch.monitor.event_text import EventWriter
 from fdi_torch.monitor.events import Event, Kind
 from fdi_torch.monitor.explanations import Explainer, answer_of
 from fdi_torch.monitor.hypothesis import HypothesisFit, merged
-from fdi_torch.monitor.hypothesis_fit import changes_of
 from fdi_torch.monitor.isolation import SMALLEST_PROBABILITY
 from fdi_torch.monitor.known_faults import (
     STRONG_EVIDENCE,
-    effect_of_value,
     end_recovered,
     examine_hidden,
     possible_ends,
@@ -267,15 +265,7 @@ class AlarmHandler:
         state = adopt_change(self.observer, state, change, reset_to_nominal(self.space, change, back))
         if not best.fits:
             state = beside_deviation(state)
-        window, healthy = state.window(change.best.onset), state.healthy.tolist()
-        state = updated_tracks(
-            state,
-            change,
-            [fault.size for fault in self.faults],
-            lambda c: effect_of_value(self.observer, window, change.before, changes_of([change.best]), c, healthy[c])[
-                0
-            ],
-        )
+        state = updated_tracks(self.observer, state, change, self.faults)
         ends = possible_ends(self.observer, state, change, self.settings.lookback)
         state = with_hidden(self.observer, state, change, ends, self.settings.confirm)
         state, events = end_recovered(self.writer, state, change, reported, ends, told)

@@ -150,7 +150,6 @@ CHARTS: tuple[Chart, ...] = ("fixed", "cusum")
 
 # CUSUM's drift: half the shift, in standard deviations of the white residual, for which the detection delay is least.
 DRIFT = 0.5
-NO_ALARM = -1
 
 
 @dataclass(frozen=True)
@@ -175,23 +174,16 @@ class Detector:
         each = self.update(torch.where(single, white, 0.0), None)[0][:, -1]
         return each / each.sum().clamp(min=1e-300)
 
-    def first_alarm(self, white: Tensor) -> Tensor:
-        """Index of the first sample above the threshold, (*batch); NO_ALARM if there is none."""
-        above = self.update(white, None)[0] > self.threshold
-        first = above.to(torch.int8).argmax(dim=-1)
-        return torch.where(above.any(dim=-1), first, torch.full_like(first, NO_ALARM))
-
     def alarms(self, white: Tensor) -> Tensor:
         """(*batch, S), True where an alarm is raised. After each, the detector restarts with the next sample."""
         remaining = torch.nan_to_num(white, nan=0.0)
         index = torch.arange(remaining.shape[-2], device=remaining.device)
         alarms = torch.zeros(remaining.shape[:-1], dtype=torch.bool, device=remaining.device)
-        while True:
-            first = self.first_alarm(remaining).unsqueeze(-1)
-            if not bool((first != NO_ALARM).any()):
-                return alarms
+        while bool((above := self.update(remaining, None)[0] > self.threshold).any()):
+            first = torch.where(above.any(dim=-1), above.to(torch.int8).argmax(dim=-1), -1).unsqueeze(-1)
             alarms = alarms | (index == first)
             remaining = torch.where((index <= first).unsqueeze(-1), torch.zeros_like(remaining), remaining)
+        return alarms
 
 
 def make_detector(

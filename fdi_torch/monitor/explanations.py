@@ -66,6 +66,7 @@ class Explainer:
                 earlier,
                 flows=True,
                 unlisted=self.unlisted,
+                reach=s.lookback,
             )
             plausible = [f for f in fits if f.hypothesis.columns and f.probability > SMALLEST_PROBABILITY]
             if start <= earliest or all(f.onset - start > 2.0 * f.onset_std for f in plausible):

@@ -113,24 +113,25 @@ class HypothesisFit:
 NO_CHANGE, UNLISTED = Hypothesis(()), Hypothesis((), unlisted=True)
 
 
-def with_posterior(fits: Sequence[HypothesisFit]) -> list[HypothesisFit]:
+def with_posterior(fits: Sequence[HypothesisFit], over_excess: Sequence[float] = ()) -> list[HypothesisFit]:
     """The fits with their posterior probabilities, likeliest first.
 
-    If even the closest fit leaves more than noise, the model is inexact. Then differences of misfit are divided by the
-    excess ratio, and standard deviations are widened by its square root: a quasi-likelihood (McCullagh and Nelder,
-    1989, "Generalized linear models", chapter 9).
+    If even the closest fit leaves more than noise, the model is inexact. Then misfits are divided by the excess, and
+    standard deviations are widened by its square root: a quasi-likelihood (McCullagh and Nelder, 1989, "Generalized
+    linear models", chapter 9). over_excess: the misfits so divided; by default all by the excess ratio of the closest.
     """
     closest = min(fits, key=lambda fit: fit.misfit)
     excess, widening = closest.misfit_ratio, closest.misfit_ratio**0.5
     if excess > 1.0:
+        over_excess = over_excess or [f.misfit / excess for f in fits]
         fits = [
             replace(
                 f,
                 std=f.std * widening,
                 onset_std=f.onset_std * widening,
-                evidence=f.evidence + (f.misfit - closest.misfit) * (1.0 - 1.0 / excess),
+                evidence=f.evidence + f.misfit - misfit,
             )
-            for f in fits
+            for f, misfit in zip(fits, over_excess, strict=True)
         ]
     probabilities = posterior([f.evidence for f in fits])
     weighted = [replace(f, probability=p) for f, p in zip(fits, probabilities, strict=True)]

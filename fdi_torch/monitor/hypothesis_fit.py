@@ -258,8 +258,8 @@ def _expansion(
     behind[rows, column] -= step
     source = torch.cat([torch.arange(count), lane, lane])
     every = with_phases_at(torch.cat([point, ahead, behind]), oscillations, free[source], -middle)
-    blocks = observer.in_blocks(window, ChangeHypotheses(every[:, :-1], every[:, -1], incipient[source]))
-    white = torch.cat([observer.white_innovations(window, believed, block).flatten(1) for block in blocks])
+    changes = ChangeHypotheses(every[:, :-1], every[:, -1], incipient[source])
+    white = observer.white_innovations(window, believed, changes).flatten(1)
     error = white[:count]
     slope = (white[count : count + len(lane)] - white[count + len(lane) :]) / (2.0 * step).unsqueeze(1)
     gradient, curvature = error.new_zeros(used.shape), error.new_zeros(*used.shape, used.shape[-1])

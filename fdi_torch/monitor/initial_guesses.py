@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import combinations
 
 import torch
 from torch import Tensor
 
 from fdi_torch.monitor.hypothesis import Fault, Hypothesis
-from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow
+from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, sudden_changes
 from fdi_torch.monitor.oscillation import strongest_periods
 
 ONSETS = 24  # candidate onsets in a window; the fit then varies the onset continuously
@@ -41,28 +40,6 @@ def recovery_hypotheses(believed: Tensor, healthy: Tensor, faults: Sequence[Faul
     ]
 
 
-def recovery_guesses(
-    observer: ObserverBank,
-    window: ObserverWindow,
-    believed: Tensor,
-    healthy: Tensor,
-    hypotheses: Sequence[Hypothesis],
-) -> Tensor:
-    """Starting values and onset of H recoveries, (H, P+1): the onset with the smallest sum of squared innovations."""
-    onsets = _onsets(window, ONSETS)
-    theta = believed.repeat(len(hypotheses), ONSETS, 1)
-    for i, hypothesis in enumerate(hypotheses):
-        theta[i][:, list(hypothesis.recovered)] = healthy[list(hypothesis.recovered)]
-    sudden = torch.zeros(len(hypotheses) * ONSETS, dtype=torch.bool)
-    changes = ChangeHypotheses(theta.flatten(0, 1), onsets.repeat(len(hypotheses)), sudden)
-    parts = [
-        observer.white_innovations(window, believed, part).square().sum((1, 2))
-        for part in observer.in_blocks(window, changes)
-    ]
-    best = torch.cat(parts).reshape(len(hypotheses), ONSETS).argmin(dim=1)
-    return torch.cat([theta[:, 0], onsets[best].unsqueeze(-1)], dim=-1)
-
-
 def _onsets(window: ObserverWindow, count: int) -> Tensor:
     """Candidate onsets spread evenly over a window, s."""
     time = window.samples.time
@@ -73,6 +50,7 @@ def signature_guesses(
     observer: ObserverBank,
     window: ObserverWindow,
     believed: Tensor,
+    healthy: Tensor,
     hypotheses: Sequence[Hypothesis],
     base: Tensor,
     most: int = 0,
@@ -81,19 +59,21 @@ def signature_guesses(
     changes, `most` at most, that together match it best, each with values and onset (P+1,).
 
     Generalised likelihood ratio over faults and onsets (Willsky & Jones 1976): the signature is the change of the
-    innovations by a small fault, scaled by least squares. It is computed for ONSETS onsets and shifted in time for the
-    samples between them, because a jump of a reading shows in a few samples only; pairs begin at one of the ONSETS.
-    hypotheses: of one column each. base (1, S, sensors): white innovations without a change.
+    innovations by a small fault, scaled by least squares, or by a recovery, which has a scale of one. It is computed
+    for ONSETS onsets and shifted in time for the samples between them, because a jump of a reading shows in a few
+    samples only; pairs begin at one of the ONSETS. hypotheses: recoveries to `healthy` (P,), then new faults of
+    one column each. base (1, S, sensors): white innovations without a change.
     """
     if not hypotheses:
         return believed.new_zeros(0, len(believed) + 1), []
     onsets, count = _onsets(window, ONSETS), len(hypotheses)
+    theta, width = believed.repeat(count, 1), TRIAL_SIZE * observer.space_width()
+    for row, h in enumerate(hypotheses):
+        for c in h.columns:
+            theta[row, c] = healthy[c] if h.recovered else believed[c] + _inward(observer, believed, c, float(width[c]))
     columns = torch.tensor([h.columns[0] for h in hypotheses])
-    rows, width = torch.arange(count), TRIAL_SIZE * observer.space_width()
-    move = believed.new_tensor([_inward(observer, believed, c, float(width[c])) for c in columns.tolist()])
-    theta = believed.repeat(count, 1)
-    theta[rows, columns] += move
-    late = torch.tensor([h.incipient for h in hypotheses])
+    move, changed = (theta - believed)[torch.arange(count), columns], theta != believed
+    late, whole = (torch.tensor(x) for x in zip(*((h.incipient, bool(h.recovered)) for h in hypotheses), strict=True))
     changes = ChangeHypotheses(theta.repeat(ONSETS, 1), onsets.repeat_interleave(count), late.repeat(ONSETS))
     reach = len(window) // (2 * ONSETS) + 1  # samples to half-way between two onsets
     matches, scores, grams = [], [], []
@@ -106,38 +86,37 @@ def signature_guesses(
     match, power = (
         torch.cat(x).unflatten(0, (ONSETS, count)).transpose(0, 1).flatten(1) for x in zip(*matches, strict=True)
     )
-    best = (match**2 / power).argmax(dim=1)
+    size = torch.where(whole.unsqueeze(1), 1.0, match / power)
+    best = (size * (2.0 * match - size * power)).argmax(dim=1, keepdim=True)
     nearest, shift = best // (2 * reach + 1), best % (2 * reach + 1) - reach
     space = observer.search_space(believed)
     low, high = space.low(believed), space.high(believed)
-    value = theta.clone()
-    value[rows, columns] = believed[columns] + move * (match / power)[rows, best]
+    value = torch.lerp(believed, theta, size.gather(1, best))
     interval = (window.samples.time[-1] - window.samples.time[0]) / len(window)
     onset = (onsets[nearest] + shift * interval).clamp(window.samples.time[0], window.samples.time[-2])
-    singles = torch.cat([value.clamp(low, high), onset.unsqueeze(-1)], dim=-1)
+    singles = torch.cat([value.clamp(low, high), onset], dim=-1)
 
     if not most:
         return singles, []
-    size, gain = _joint_sizes(torch.cat(grams), torch.cat(scores))
+    size, gain = _joint_sizes(torch.cat(grams), torch.cat(scores), whole)
     final = believed[columns] + move * size  # (ONSETS, H, H): value of the column's hypothesis beside the row's
-    inside = (final >= low[columns]) & (final <= high[columns])
-    possible = torch.triu(columns.unsqueeze(1) != columns, diagonal=1) & (late.unsqueeze(1) == late)
+    inside = whole | ((final >= low[columns]) & (final <= high[columns]))
+    possible = torch.triu(~changed[:, columns], diagonal=1) & (late.unsqueeze(1) == late) & ~whole
     gain = torch.where(inside & inside.mT & possible, gain, 0.0)
     gain, begin = gain.max(dim=0)
     pairs = []
     for flat in gain.flatten().argsort(descending=True)[:most].tolist():
         i, j = divmod(flat, count)
         if gain[i, j] > 0.0:
-            start = torch.cat([believed, onsets[begin[i, j]][None]])
-            start[columns[i]], start[columns[j]] = final[begin[i, j], j, i], final[begin[i, j], i, j]
-            both = tuple(sorted((*hypotheses[i].columns, *hypotheses[j].columns)))
-            pairs.append((replace(hypotheses[i], columns=both), start))
+            start = torch.cat([believed.lerp(theta[i], size[begin[i, j], j, i]), onsets[begin[i, j]][None]])
+            start[columns[j]] = final[begin[i, j], i, j]
+            pairs.append((hypotheses[i].with_fault(Fault(int(columns[j]))), start))
     return singles, pairs
 
 
-def _joint_sizes(gram: Tensor, score: Tensor) -> tuple[Tensor, Tensor]:
+def _joint_sizes(gram: Tensor, score: Tensor, whole: Tensor) -> tuple[Tensor, Tensor]:
     """Least squares on two signatures at a time. gram (K, H, H), score (K, H): products of the signatures with each
-    other and with the residual.
+    other and with the residual. whole (H,) bool: those with a size of one.
 
     Returns the size of each signature beside each other one, (K, H beside, H), and the reduction of the sum of squares
     by both, (K, H, H); 0 where two are nearly collinear.
@@ -145,9 +124,11 @@ def _joint_sizes(gram: Tensor, score: Tensor) -> tuple[Tensor, Tensor]:
     strength = torch.diagonal(gram, dim1=1, dim2=2)
     determinant = strength.unsqueeze(2) * strength.unsqueeze(1) - gram**2
     separable = determinant > COLLINEAR * strength.unsqueeze(2) * strength.unsqueeze(1)
-    size = strength.unsqueeze(2) * score.unsqueeze(1) - gram * score.unsqueeze(2)
-    size = torch.where(separable, size / determinant, 0.0)
-    return size, size * score.unsqueeze(1) + (size * score.unsqueeze(1)).mT
+    size = (strength.unsqueeze(2) * score.unsqueeze(1) - gram * score.unsqueeze(2)) / determinant
+    size = torch.where(whole.unsqueeze(1), (score.unsqueeze(1) - gram) / strength.unsqueeze(1), size)
+    size = torch.where(separable, torch.where(whole, 1.0, size), 0.0)
+    each = size * (2.0 * score.unsqueeze(1) - size * strength.unsqueeze(1))
+    return size, each + each.mT - 2.0 * size * size.mT * gram
 
 
 def _matches(shape: Tensor, base: Tensor, reach: int) -> tuple[Tensor, Tensor]:
@@ -184,16 +165,12 @@ def oscillation_guess(
     theta = believed.repeat(len(grid), 1)
     trial = TRIAL_SIZE * float(observer.space_width()[size])
     theta[:, size], theta[:, period], theta[:, phase] = trial, grid[:, 0], grid[:, 2]
-    changes = ChangeHypotheses(theta, grid[:, 1], torch.zeros(len(grid), dtype=torch.bool))
-    products = []
-    for part in observer.in_blocks(window, changes, even=2):
-        shape = (base - observer.white_innovations(window, believed, part)).flatten(1).reshape(len(part) // 2, 2, -1)
-        columns = torch.cat([shape, base.flatten(1).expand(len(shape), 1, -1)], dim=1)
-        products.append(columns @ columns.mT)
-    gram = torch.cat(products)
-    normal = gram[:, :2, :2] + 1e-12 * gram[:, :2, :2].diagonal(dim1=1, dim2=2).amax(1).clamp(min=1e-30)[
-        :, None, None
-    ] * torch.eye(2, dtype=gram.dtype)
+    shape = base - observer.white_innovations(window, believed, sudden_changes(theta, grid[:, 1]))
+    shape = shape.flatten(1).unflatten(0, (-1, 2))
+    columns = torch.cat([shape, base.flatten(1).expand(len(shape), 1, -1)], dim=1)
+    gram = columns @ columns.mT
+    largest = gram[:, :2, :2].diagonal(dim1=1, dim2=2).amax(1).clamp(min=1e-30)
+    normal = gram[:, :2, :2] + 1e-12 * largest[:, None, None] * torch.eye(2, dtype=gram.dtype)
     scale = torch.linalg.solve(normal, gram[:, :2, 2:])[..., 0]
     best = int((scale * gram[:, :2, 2]).sum(1).argmax())
     sine, cosine = scale[best].tolist()

@@ -6,6 +6,7 @@ Each fit starts from the onset and size at which the hypothesis' signature match
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -17,7 +18,6 @@ from fdi_torch.monitor.hypothesis import Fault, Hypothesis, HypothesisFit, with_
 from fdi_torch.monitor.hypothesis_fit import Prior, changes_of, fit, misfit, no_change_fit, point_of
 from fdi_torch.monitor.initial_guesses import (
     oscillation_guess,
-    recovery_guesses,
     recovery_hypotheses,
     signature_guesses,
 )
@@ -38,6 +38,7 @@ def isolate(
     earlier: Sequence[HypothesisFit] = (),
     flows: bool = False,
     unlisted: Sequence[Fault] = (),
+    reach: float = math.inf,
 ) -> list[HypothesisFit]:
     """Fits of all single changes, of the best ones combined with a further fault, and of no change, likeliest first.
 
@@ -46,7 +47,8 @@ def isolate(
     are sudden. healthy (P,): the same without faults; if given, recovery of the faults in `believed` is a hypothesis.
     earlier: previous fits of the same change, used as further initial guesses. flows: whether random flows are learnt
     from the window too; the misfits of two calls are then not those of the same noise. unlisted: faults that are not on
-    the list; together they are one explanation.
+    the list; together they are one explanation. reach: time over which an excess of the innovations over noise is
+    averaged, s.
     """
     manners = (False, True) if growth_times else (False,)
     outside = [f.size for f in unlisted]
@@ -57,22 +59,19 @@ def isolate(
     )
     oscillating = [Hypothesis(f.columns, shape=f.shape) for f in faults if f.shape]
     base = observer.white_innovations(window, believed, no_change(believed))
-    most_pairs = len(faults) if deepest > 1 else 0
-    single_starts, pairs = signature_guesses(observer, window, believed, plain, base, most_pairs)
+    healthy = believed if healthy is None else healthy
+    changes, most_pairs = [*recovery_hypotheses(believed, healthy, faults), *plain], len(faults) if deepest > 1 else 0
+    single_starts, pairs = signature_guesses(observer, window, believed, healthy, changes, base, most_pairs)
+    earlier = [f for f in earlier if f.hypothesis.columns]
     starts = torch.cat(
         [
             single_starts,
-            signature_guesses(observer, window, believed, others, base)[0],
+            signature_guesses(observer, window, believed, healthy, others, base)[0],
             *(oscillation_guess(observer, window, believed, h, base) for h in oscillating),
+            *(point_of(f)[None] for f in earlier),
         ]
     )
-    recoveries = [] if healthy is None else recovery_hypotheses(believed, healthy, faults)
-    if healthy is not None and recoveries:
-        starts = torch.cat([starts, recovery_guesses(observer, window, believed, healthy, recoveries)])
-    earlier = [f for f in earlier if f.hypothesis.columns]
-    if earlier:
-        starts = torch.cat([starts, torch.stack([point_of(f) for f in earlier])])
-    hypotheses = [*plain, *others, *oscillating, *recoveries, *(f.hypothesis for f in earlier)]
+    hypotheses = [*changes, *others, *oscillating, *(f.hypothesis for f in earlier)]
     fits = _best_of_each(fit(observer, window, believed, hypotheses, starts, misfit(base), prior))
     # Where nothing fits, the law of the plant or of a known fault is wrong: no evidence for a cause outside the list.
     fits = [f for f in fits if f.fits or f.hypothesis.columns[0] not in outside]
@@ -93,11 +92,33 @@ def isolate(
         points += [point_of(b) for b in best]
         wider_fits = fit(observer, window, believed, wider, torch.stack(points), misfit(base), prior)
         fits = _best_of_each([*fits, *wider_fits])
-    ranked = with_posterior([*fits, no_change_fit(observer, window, believed, base)])
+    fits = [*fits, no_change_fit(observer, window, believed, base)]
+    ranked = with_posterior(fits, misfits_over_excess(observer, window, believed, fits, reach))
     if flows and ranked[0].hypothesis.columns and ranked[0].fits:
         observer, ranked = with_flows_of_window(observer, window, believed, ranked, prior)
     ranked = with_unlisted_as_one(ranked, outside) if outside else ranked
     return [_beyond_range(observer, window, believed, f, prior) if f.at_bound else f for f in ranked]
+
+
+def misfits_over_excess(
+    observer: ObserverBank, window: ObserverWindow, believed: Tensor, fits: Sequence[HypothesisFit], reach: float
+) -> list[float]:
+    """The misfits, with each square divided by the mean square of the closest fit's innovations in the `reach` s about
+    it, where that is above 1.
+
+    An inexact law leaves much in some readings and nothing in others, as near the floor of a tank. If the excess were
+    averaged over a longer time, exact readings would raise the weight of the inexact ones.
+    """
+    closest = min(range(len(fits)), key=lambda i: fits[i].misfit)
+    if fits[closest].fits:
+        return [f.misfit for f in fits]
+    square = observer.white_innovations(window, believed, changes_of(fits)).square().sum(2)
+    count = torch.isfinite(window.samples.readings[1:]).sum(1).to(square.dtype)
+    total = torch.nn.functional.pad(torch.stack([square[closest], count]).cumsum(1), (1, 0))
+    times = window.times.contiguous()
+    first, last = (torch.searchsorted(times, times + s * reach, right=s > 0.0) for s in (-0.5, 0.5))
+    near, readings = total[:, last] - total[:, first]
+    return (0.5 * square / (near / readings.clamp(min=1.0)).clamp(min=1.0)).sum(1).tolist()
 
 
 def with_flows_of_window(
@@ -117,8 +138,7 @@ def with_flows_of_window(
     likeliest = next(f for f in ranked if f.hypothesis.columns)
     observer = observer.learning_from(window, believed, changes_of([likeliest]))[0]
     base = observer.white_innovations(window, believed, no_change(believed))
-    blocks = observer.in_blocks(window, changes_of(ranked))
-    misfits = torch.cat([0.5 * observer.white_innovations(window, believed, b).square().sum((1, 2)) for b in blocks])
+    misfits = 0.5 * observer.white_innovations(window, believed, changes_of(ranked)).square().sum((1, 2))
     evidence = [f.evidence + f.misfit - now for f, now in zip(ranked, misfits.tolist(), strict=True)]
     changes = [
         f

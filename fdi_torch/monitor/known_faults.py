@@ -5,7 +5,7 @@ cannot show it any more.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -19,7 +19,7 @@ from fdi_torch.monitor.hypothesis_fit import changes_of
 from fdi_torch.monitor.isolation import isolate
 from fdi_torch.monitor.monitor_settings import REVISE
 from fdi_torch.monitor.monitor_state import DetectedChange, FaultTrack, HiddenFault, MonitorState
-from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
+from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change, sudden_changes
 from fdi_torch.parameters import ParameterSpace
 
 # A change whose effect is below this share of the known faults' effect may be a change of their size.
@@ -66,8 +66,7 @@ def _relative_effect(
     theta = torch.cat([change.value[None], state.believed.repeat(len(groups), 1)])
     for lane, columns in enumerate(groups, start=1):
         theta[lane, columns] = state.healthy[columns]
-    sudden = torch.zeros(len(theta), dtype=torch.bool)
-    lanes = ChangeHypotheses(theta, torch.full((len(theta),), change.onset, dtype=theta.dtype), sudden)
+    lanes = sudden_changes(theta, change.onset)
     base = observer.white_innovations(window, state.believed, no_change(state.believed))
     moved, *removed = (observer.white_innovations(window, state.believed, lanes) - base).square().sum((1, 2)).tolist()
     return (moved / sum(removed)) ** 0.5 if sum(removed) > 0.0 else float("inf")
@@ -91,14 +90,11 @@ def effect_of_value(
 
 
 def updated_tracks(
-    state: MonitorState, change: DetectedChange, sizes: Sequence[int], effect_rms: Callable[[int], float]
+    observer: ObserverBank, state: MonitorState, change: DetectedChange, faults: Sequence[Fault]
 ) -> MonitorState:
-    """The state with one track for each fault that is present after a change.
-
-    sizes: columns of the faults' sizes. effect_rms: of a column, what the fault adds to the white residuals.
-    """
-    fit, tracks = change.best, []
-    for column in sizes:
+    """The state with one track for each fault that is present after a change."""
+    fit, tracks, window, healthy = change.best, [], state.window(change.best.onset), state.healthy.tolist()
+    for column in (fault.size for fault in faults):
         if float(state.believed[column]) == float(state.healthy[column]):
             continue
         earlier = next((t for t in state.tracks if t.column == column), None)
@@ -106,7 +102,8 @@ def updated_tracks(
             tracks += [earlier] if earlier else []
             continue
         now, onset = (state.now, float(state.believed[column]), float(fit.std[column])), (fit.onset, fit.onset_std)
-        track = FaultTrack(column, change.number, *onset, now, now, effect_rms(column), state.now)
+        effect, _ = effect_of_value(observer, window, change.before, changes_of([fit]), column, healthy[column])
+        track = FaultTrack(column, change.number, *onset, now, now, effect, state.now)
         if earlier is not None and earlier.number == change.number:
             track = replace(track, first=earlier.first, announced=earlier.announced, adjusted=earlier.adjusted)
         start = fit.onset, float(change.before[column]), 0.0
@@ -167,11 +164,10 @@ def _possible_end(
     best, window = change.best, state.window(max(change.best.onset - lookback, change.since))
     times = window.samples.time[:: max(len(window) // END_CANDIDATES, 1)]
     onsets = torch.cat([times, times.new_tensor([best.onset])])
-    sudden = torch.zeros(len(onsets), dtype=torch.bool)
     after = change.before.clone()
     after[ended.column] = best.value[ended.column]
-    blocks = observer.in_blocks(window, ChangeHypotheses(after.repeat(len(onsets), 1), onsets, sudden))
-    white = torch.cat([observer.white_innovations(window, change.before, block) for block in blocks])
+    lanes = sudden_changes(after.repeat(len(onsets), 1), onsets)
+    white = observer.white_innovations(window, change.before, lanes)
     white = white + (observer.white_innovations(window, change.before, changes_of([best])) - white[-1])
     misfits = 0.5 * white.square().sum((1, 2)) / best.misfit_ratio
     between = ((window.times > times[:, None]) != (window.times > best.onset)).to(white.dtype)
@@ -195,7 +191,7 @@ def _while(times: Tensor, possible: Tensor) -> list[float]:
 def _end_is_shown(observer: ObserverBank, state: MonitorState, fault: HiddenFault, start: float) -> bool:
     """Whether the readings since `start` s would show a hidden fault, and contradict it."""
     window = state.window(start)
-    present = ChangeHypotheses(state.believed[None], window.samples.time[:1], torch.tensor([False]))
+    present = sudden_changes(state.believed[None], window.samples.time[:1])
     effect, misfit = effect_of_value(observer, window, state.believed, present, fault.track.column, fault.size)
     return effect >= _law_error(fault.track) and misfit > STRONG_EVIDENCE
 

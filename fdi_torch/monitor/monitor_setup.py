@@ -20,7 +20,7 @@ from fdi_torch.monitor.flow_filter import FlowFilter
 from fdi_torch.monitor.flow_noise_estimate import by_initial_levels, free_residual
 from fdi_torch.monitor.hypothesis import SHAPE, faults_of
 from fdi_torch.monitor.law_errors import ConstantErrors
-from fdi_torch.monitor.monitor import Monitor
+from fdi_torch.monitor.monitor import Monitor, ResidualTrace
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.noise_model import effects_of_constants, learn_beside_errors
 from fdi_torch.monitor.observer import Observer
@@ -31,6 +31,11 @@ from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.description import PlantDescription, uncertain_constants
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.step_length import commensurate_step
+
+CHANCE = 0.01
+"""Probability of an alarm in a recording that the plant explains throughout; as that of the warning about alarms in a
+fault-free part (`fault_free_checks.residual_warnings`)."""
+BATCH = 32  # samples processed before the alarms are looked at: a monitor would go on to explain them, which takes long
 
 
 @dataclass(frozen=True)
@@ -184,3 +189,26 @@ def fault_free_part(recording: Recording, start: float, stop: float) -> Recordin
                 f"column or tag of {name}"
             )
     return part
+
+
+def explained_until(plant: PlantDescription, recording: Recording, learnt: float) -> float:
+    """How long a plant explains a recording: until when a monitor that learns up to `learnt`, s, raises no alarm, s.
+
+    The time before an alarm is that at which the detector's statistic last was as small as usual, its median before:
+    later the deviation that causes the alarm has begun. Raises ValueError if the monitor cannot learn.
+    """
+    first, last = float(recording.time[0]), float(recording.time[-1])
+    prepared = prepare_monitor(
+        plant, fault_free_part(recording, first, learnt), time_between_false_alarms=(last - first) / CHANCE
+    )
+    samples, traces = samples_of_recording(recording, plant), list[ResidualTrace]()
+    state = prepared.monitor.start(samples.segment(0, 1), prepared.believed, learning_until=learnt)
+    for k in range(1, len(samples), BATCH):
+        state, events = prepared.monitor.advance(state, samples.segment(k, min(k + BATCH, len(samples))), traces.append)
+        alarm = next((event.time for event in events if event.kind == "alarm"), None)
+        if alarm is not None:
+            time, statistic = (torch.cat(each) for each in zip(*((t.time, t.statistic) for t in traces), strict=True))
+            before = (time > learnt) & (time < alarm)
+            usual = time[before & (statistic <= statistic[before].nanmedian())]
+            return float(usual[-1]) if len(usual) else learnt
+    return last

@@ -47,9 +47,14 @@ class ChangeHypotheses:
         return torch.where(self.incipient, (end - self.onset).clamp(min=0.0), 0.0)
 
 
+def sudden_changes(theta: Tensor, onset: Tensor | float) -> ChangeHypotheses:
+    """Sudden changes to theta (L, P) at an onset of each (L,), or of all, s."""
+    return ChangeHypotheses(theta, theta.new_zeros(len(theta)) + onset, torch.zeros(len(theta), dtype=torch.bool))
+
+
 def no_change(believed: Tensor) -> ChangeHypotheses:
     """The hypothesis that the parameters (P,) do not change, as one lane."""
-    return ChangeHypotheses(believed[None], believed.new_tensor([NEVER]), torch.tensor([False]))
+    return sudden_changes(believed[None], NEVER)
 
 
 @dataclass(frozen=True)
@@ -118,7 +123,8 @@ class ObserverBank:
 
     def white_innovations(self, window: ObserverWindow, believed: Tensor, changes: ChangeHypotheses) -> Tensor:
         """White innovations (L, S, sensors); zero where a reading, or one that the whitening needs, is missing."""
-        white = self._white(window, self.run(window, believed, changes)[1])
+        blocks = self.in_blocks(window, changes)
+        white = torch.cat([self._white(window, self.run(window, believed, block)[1]) for block in blocks])
         if not self.constants.columns:
             return white
         directions, shares, known = self._of_constants(window, believed)
@@ -140,8 +146,7 @@ class ObserverBank:
     def _beside_errors(self, window: ObserverWindow, believed: Tensor) -> Tensor:
         """Residuals (1 + P, S, sensors) without a change, and with each of P constants raised by STEP."""
         lanes = torch.cat([believed[None], raised(believed, self.space, self.constants.columns)])
-        never = ChangeHypotheses(lanes, lanes.new_full((len(lanes),), NEVER), torch.zeros(len(lanes)).bool())
-        return self.run(window, lanes, never)[1]
+        return self.run(window, lanes, sudden_changes(lanes, NEVER))[1]
 
     def _of_constants(self, window: ObserverWindow, believed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Directions U (S sensors, P) of the errors of P constants, the shares (P,) that they take, and what their mean

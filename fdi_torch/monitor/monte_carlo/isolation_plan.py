@@ -28,7 +28,7 @@ from fdi_torch.monitor.monte_carlo.simulated_runs import (
     quantiles,
     seeded_generator,
 )
-from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
+from fdi_torch.monitor.noise_model import learn_noise
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.monitor.state_update import advance_observer
@@ -66,8 +66,8 @@ class IsolationPlan:
         return [Task(f"{NAME}/{self.loop}", lambda first=first: self._isolate(first)) for first in firsts]  # type: ignore[misc]
 
     @cached_property
-    def _designed(self) -> tuple[NoiseModel, Monitor, list[FaultScenario], list[float]]:
-        """Noise model from a fault-free run, the monitor, the simulated faults, their smallest isolable sizes."""
+    def _designed(self) -> tuple[Monitor, list[FaultScenario], list[float]]:
+        """The monitor, with the noise of a fault-free run, the simulated faults, their smallest isolable sizes."""
         rig = self.rig
         nominal = rig.space.nominal()
         training = rig.run(fault_free_schedule(rig.space, 1), 3600, seeded_generator(self.seed, 6)).member(0)
@@ -83,7 +83,7 @@ class IsolationPlan:
         window = state.window(self.onset - BEFORE_ONSET * time_scale(rig.network.description))
         smallest = smallest_isolable(monitor.observer, window, nominal, scenarios, self.onset)
         isolable = [(k, s) for k, s in zip(scenarios, smallest, strict=True) if self._in_range(k, s)]
-        return noise, monitor, [k for k, _ in isolable], [s for _, s in isolable]
+        return monitor, [k for k, _ in isolable], [s for _, s in isolable]
 
     def _scenarios(self, monitor: Monitor) -> list[FaultScenario]:
         scenarios, period = [], PERIOD * time_scale(self.rig.network.description)
@@ -96,7 +96,7 @@ class IsolationPlan:
         return scenarios
 
     def _isolate(self, first: int) -> Numbers:
-        _, monitor, scenarios, smallest = self._designed
+        monitor, scenarios, smallest = self._designed
         rig, count = self.rig, min(RUNS_PER_TASK, self.runs - first)
         chosen = [(first + r) % len(scenarios) for r in range(count)]
         nominal, end = rig.space.nominal(), (self.samples - 1) * rig.sampling
@@ -180,9 +180,9 @@ def smallest_isolable(
     base = observer.white_innovations(window, believed, no_change(believed)).flatten(1)
     end = float(window.samples.time[-1])
     offsets = torch.linspace(-0.2, 0.4, RIVAL_ONSETS, dtype=believed.dtype) * (end - onset)
-    trials = [
-        TRIAL_SIZE * float(observer.space_width()[k.fault.size]) * _inward(observer, believed, k) for k in scenarios
-    ]
+    space, columns = observer.space, [k.fault.size for k in scenarios]
+    towards_farther_end = torch.where(space.high() - believed >= believed - space.low(), 1.0, -1.0)
+    trials = (TRIAL_SIZE * observer.space_width() * towards_farther_end)[columns].tolist()
     theta = torch.stack(
         [k.theta(believed, float(believed[k.fault.size]) + t) for k, t in zip(scenarios, trials, strict=True)]
     )
@@ -193,28 +193,19 @@ def smallest_isolable(
         onsets.repeat(len(scenarios)),
         incipient.repeat_interleave(RIVAL_ONSETS),
     )
-    blocks = observer.in_blocks(window, rivals)
-    shapes = torch.cat([base - observer.white_innovations(window, believed, block).flatten(1) for block in blocks])
+    shapes = base - observer.white_innovations(window, believed, rivals).flatten(1)
     unit = shapes / torch.linalg.vector_norm(shapes, dim=1).clamp(min=1e-30).unsqueeze(1)
     at_onset = ChangeHypotheses(theta, torch.full((len(scenarios),), onset, dtype=believed.dtype), incipient)
     signature = base - observer.white_innovations(window, believed, at_onset).flatten(1)
     length = torch.linalg.vector_norm(signature, dim=1)
     cosine = (signature / length.clamp(min=1e-30).unsqueeze(1)) @ unit.mT
-    columns = torch.tensor([k.fault.size for k in scenarios])
-    same_fault = columns.unsqueeze(1) == columns.repeat_interleave(RIVAL_ONSETS)
+    of_each = torch.tensor(columns)
+    same_fault = of_each.unsqueeze(1) == of_each.repeat_interleave(RIVAL_ONSETS)
     nearest = torch.where(same_fault, 0.0, cosine.abs()).amax(1).clamp(max=1.0)
     distance = length * torch.sqrt(1.0 - nearest**2)
     return [
         REACH * abs(t) / float(d) if float(d) > 1e-9 else float("inf") for t, d in zip(trials, distance, strict=True)
     ]
-
-
-def _inward(observer: ObserverBank, believed: Tensor, scenario: FaultScenario) -> float:
-    """Sign of a deviation towards the farther end of the parameter's range."""
-    p = observer.space.parameters[scenario.fault.size]
-    return (
-        1.0 if p.high - float(believed[scenario.fault.size]) >= float(believed[scenario.fault.size]) - p.low else -1.0
-    )
 
 
 @dataclass(frozen=True)
