@@ -205,6 +205,8 @@ WITHOUT_TORCH = [
     *("effects", "effects leak pump_lag", "effects --plant quadruple_tank --json", "completion bash"),
     *("check --plant three_tank", f"view {LOGS} --list"),
     f"compare {LOGS}/log_format_1_train.mcap {LOGS}/log_format_1_gap.mcap",
+    *(f"inspect {LOGS}/log_format_1_{kind}.mcap" for kind in ("train", "gap", "monitor", "study")),
+    "check --keys",
 ]
 
 
@@ -218,7 +220,7 @@ def test_a_command_that_computes_nothing_does_not_load_torch(tmp_path: Path) -> 
 import contextlib, io, sys
 from fdi_torch.cli import main
 for words in sys.argv[1:]:
-    with contextlib.redirect_stdout(io.StringIO()) as printed:
+    with contextlib.redirect_stdout(io.StringIO()) as printed, contextlib.suppress(SystemExit):
         main(words.split())
     if "torch._C" in sys.modules or not printed.getvalue():
         sys.exit(words)

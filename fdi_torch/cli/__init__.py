@@ -115,9 +115,9 @@ def ending(error: KeyboardInterrupt | Terminated) -> str:
 
 
 def _carried_out(name: str, words: list[str]) -> int:
-    arguments = command_parser(name).parse_args(words)
     if getattr(options_of(name), "QUICK", False):
         sys.modules.setdefault("torch", _Deferred("torch"))
+    arguments = command_parser(name).parse_args(words)
     _say_that_it_began(name, arguments.quiet)
     command = importlib.import_module(f"fdi_torch.cli.{name}")
     from fdi_torch.cli.screen import Screen
