@@ -16,7 +16,7 @@ LOWEST = tests/test_units.py tests/test_yaml_files.py tests/test_config_plant.py
 LOWEST_EXTRAS := parquet,excel,hdf5,sql,influx,mqtt,opcua,modbus,prometheus
 EXTRAS := test$(if $(COMPILER),,$(comma)compiler)
 
-.PHONY: run test slow longest mutants lint paper docs lowest clean
+.PHONY: run test slow fast_and_slow longest mutants lint paper docs lowest clean
 
 run: $(STAMP)
 	$(BIN)/python -m fdi_torch.train
@@ -26,6 +26,10 @@ test: $(STAMP)
 
 slow: $(STAMP)
 	$(TESTS) -m slow
+
+# Both in one run, as CI does: libraries are loaded and tests collected once.
+fast_and_slow: $(STAMP)
+	$(TESTS) -m 'not longest'
 
 longest: $(STAMP)
 	$(TESTS) -m longest
@@ -53,9 +57,11 @@ lowest:
 	.venv-lowest/bin/python -m pip install --quiet --constraint constraints-lowest.txt --editable '.[$(LOWEST_EXTRAS)]' pytest hypothesis
 	OMP_NUM_THREADS=1 .venv-lowest/bin/python -m pytest $(LOWEST)
 
+# pip would compile 15000 files to bytecode on one core; of some packages, a few are not meant to be compiled.
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true
 	$(if $(COMPILER),,$(BIN)/python -c 'from fdi_torch.simulate.build import warm_up; warm_up()')
 	touch $@
 

@@ -117,7 +117,7 @@ def ending(error: KeyboardInterrupt | Terminated) -> str:
 def _carried_out(name: str, words: list[str]) -> int:
     arguments = command_parser(name).parse_args(words)
     if getattr(options_of(name), "QUICK", False):
-        sys.modules.setdefault("torch", _Deferred("torch"))
+        defer_torch()
     _say_that_it_began(name, arguments.quiet)
     command = importlib.import_module(f"fdi_torch.cli.{name}")
     from fdi_torch.cli.screen import Screen
@@ -151,6 +151,11 @@ def _resource_problem(error: Exception) -> str:
             "or without noise; fdi check shows which"
         )
     return ""
+
+
+def defer_torch() -> None:
+    """Let `import torch` load it when it is first used."""
+    sys.modules.setdefault("torch", _Deferred("torch"))
 
 
 class _Deferred(ModuleType):

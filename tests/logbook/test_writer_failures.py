@@ -8,13 +8,15 @@ import subprocess
 import sys
 import textwrap
 import time
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
+from typing import TextIO
 
 import pytest
 from example_logs import FIXED, log_generation
 
-from fdi_torch.interruption import Terminated
+from fdi_torch.interruption import Terminated, catch_signals
 from fdi_torch.logbook import LogError, RunLog, read_run
 
 
@@ -141,82 +143,104 @@ def test_a_full_disk_ends_the_log_not_the_process(tmp_path: Path) -> None:
     assert "fdi recover" in run.advice
 
 
-WRITER = """
-import sys, time
-from fdi_torch.interruption import catch_signals
-from fdi_torch.logbook import RunLog
-catch_signals()
-with RunLog(sys.argv[1] + "/a.mcap", "train") as log:
-    number = 0
-    while True:
-        log.trial(number, {"x": number ** 0.5})
-        print(number, time.time(), flush=True)
-        number += 1
-        time.sleep(0.7 if number == 5 else 0.002)
-"""
+def log_forever(folder: Path, printed: TextIO) -> None:
+    """Log trials until a signal ends this process, and print number and time of each."""
+    with RunLog(folder / "a.mcap", "train") as log:
+        number = 0
+        while True:
+            log.trial(number, {"x": number**0.5})
+            print(number, time.time(), file=printed, flush=True)
+            number += 1
+            time.sleep(0.7 if number == 5 else 0.002)
 
 
-def start_writer(folder: Path) -> subprocess.Popen[str]:
-    root = Path(__file__).parents[2]
-    return subprocess.Popen(
-        [sys.executable, "-c", WRITER, str(folder)],
-        env={**os.environ, "PYTHONPATH": str(root)},
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+class Writer:
+    """A child of this process, whose libraries are loaded, that logs until a signal ends it, at the latest the one at
+    the end of the `with` block.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(exist_ok=True)
+        self.folder, self._printed = folder, folder / "printed"
+        self._code: int | None = None
+        self._number = os.fork()
+        if self._number:
+            return
+        try:
+            catch_signals()
+            with self._printed.open("w") as printed:
+                log_forever(folder, printed)
+        except Terminated as ended:
+            os._exit(ended.code)
+        finally:
+            os._exit(99)
+
+    def __enter__(self) -> Writer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end(signal.SIGKILL)
+
+    def wait_for_trials(self, number: int) -> None:
+        """Until it has logged so many."""
+        deadline = time.monotonic() + 60.0
+        while not self._printed.exists() or self._printed.read_bytes().count(b"\n") < number:
+            assert time.monotonic() < deadline, "logs nothing"
+            time.sleep(0.001)
+
+    def end(self, signal_number: signal.Signals) -> int:
+        """Send the signal, and return the exit code; minus the signal's number where that killed it."""
+        if self._code is None:
+            os.kill(self._number, signal_number)
+            self._code = os.waitstatus_to_exitcode(os.waitpid(self._number, 0)[1])
+        return self._code
+
+    def times(self) -> dict[int, float]:
+        """When each trial was logged."""
+        lines = [line.split() for line in self._printed.read_text().splitlines(keepends=True) if line.endswith("\n")]
+        return {int(number): float(moment) for number, moment in lines}
 
 
 def test_sigterm_finishes_the_log(tmp_path: Path) -> None:
-    writer = start_writer(tmp_path)
-    assert writer.stdout is not None
-    for _ in range(3):
-        writer.stdout.readline()
-    writer.send_signal(signal.SIGTERM)
-    writer.communicate(timeout=20)
-    assert writer.returncode == 143
+    with Writer(tmp_path) as writer:
+        writer.wait_for_trials(3)
+        assert writer.end(signal.SIGTERM) == 143
     run = read_run(tmp_path / "a.mcap")
     assert run.complete and run.metadata["fdi_torch.status"]["reason"] == "SIGTERM"
 
 
-def killed_after(folder: Path, seconds: float) -> tuple[float, dict[int, float]]:
-    """Kill a writer; returns when, and when each trial was logged."""
-    writer = start_writer(folder)
-    assert writer.stdout is not None
-    first = writer.stdout.readline()
-    time.sleep(seconds)
-    killed = time.time()
-    writer.kill()
-    # `communicate` would read past what `readline` has buffered, and could begin within a line.
-    with writer.stdout:
-        lines = [first, *writer.stdout]
-    writer.wait(timeout=20)
-    times = {int(line.split()[0]): float(line.split()[1]) for line in lines if line.endswith("\n")}
-    return killed, times
+def check_kills(folder: Path, seconds: Sequence[float]) -> None:
+    """Kill writers that run side by side, each so long after its first trial; the times ascend."""
+    with ExitStack() as stack:
+        writers, logging = [stack.enter_context(Writer(folder / f"{duration:g}")) for duration in seconds], []
+        for writer in writers:
+            writer.wait_for_trials(1)
+            logging.append(time.monotonic())
+        for writer, begun, duration in zip(writers, logging, seconds, strict=True):
+            time.sleep(max(begun + duration - time.monotonic(), 0.0))
+            killed = time.time()
+            assert writer.end(signal.SIGKILL) == -signal.SIGKILL
+            check_what_is_left(writer.folder, writer.times(), killed)
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.65, 1.5])
-def test_a_kill_loses_at_most_the_last_second(tmp_path: Path, seconds: float) -> None:
-    """The second kill falls into a silence after a few messages, which only a clock can save."""
-    check_kill(tmp_path, seconds)
-
-
-@pytest.mark.slow
-def test_fifty_kills_lose_at_most_the_last_second_each(tmp_path: Path) -> None:
-    def one(number: int) -> None:
-        (tmp_path / str(number)).mkdir()
-        check_kill(tmp_path / str(number), 0.03 * number)
-
-    with ThreadPoolExecutor(4) as pool:
-        assert len(list(pool.map(one, range(50)))) == 50
-
-
-def check_kill(folder: Path, seconds: float) -> None:
-    killed, times = killed_after(folder, seconds)
+def check_what_is_left(folder: Path, times: dict[int, float], killed: float) -> None:
     run = read_run(folder / "a.mcap.partial")
     assert not run.complete and run.metadata["fdi_torch.run"]["kind"] == "train"
     kept = {message.payload["trial"] for message in run.messages()}
     lost = [number for number in times if number not in kept]
     assert all(times[number] > killed - 1.0 for number in lost)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.65, 1.5])
+def test_a_kill_loses_at_most_the_last_second(tmp_path: Path, seconds: float) -> None:
+    """The second kill falls into a silence after a few messages, which only a clock can save."""
+    check_kills(tmp_path, [seconds])
+
+
+@pytest.mark.slow
+def test_fifty_kills_lose_at_most_the_last_second_each(tmp_path: Path) -> None:
+    for first in range(0, 50, 5):
+        check_kills(tmp_path, [0.03 * number for number in range(first, first + 5)])
 
 
 def test_a_log_whose_name_was_taken_meanwhile_is_kept_under_its_partial_name(tmp_path: Path) -> None:

@@ -30,6 +30,9 @@ class ShowKeys(argparse.Action):
         self.models = models
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from fdi_torch.cli import defer_torch
+
+        defer_torch()
         from fdi_torch.config.key_reference import config_reference
 
         for model in self.models:

@@ -1,6 +1,7 @@
 """Show what a log contains and whether it is intact (any MCAP file), or with --topic export its messages."""
 
 STEP, SUMMARY = "look", "show what a log contains and whether it is intact, or export its messages"
+QUICK = True
 FORMATS = ("csv", "ndjson", "npz")  # those of logbook.export
 EXAMPLES = """
 examples:
