@@ -16,20 +16,17 @@ LOWEST = tests/test_units.py tests/test_yaml_files.py tests/test_config_plant.py
 LOWEST_EXTRAS := parquet,excel,hdf5,sql,influx,mqtt,opcua,modbus,prometheus
 EXTRAS := test$(if $(COMPILER),,$(comma)compiler)
 
-.PHONY: run test slow fast_and_slow longest mutants lint paper docs lowest clean
+.PHONY: run test slow longest mutants lint paper docs lowest clean
 
 run: $(STAMP)
 	$(BIN)/python -m fdi_torch.train
 
+# The fast tests; MARKS='not longest' adds the slow ones, as CI does: libraries are loaded and tests collected once.
 test: $(STAMP)
-	$(TESTS)
+	$(TESTS) $(if $(MARKS),-m '$(MARKS)')
 
 slow: $(STAMP)
 	$(TESTS) -m slow
-
-# Both in one run, as CI does: libraries are loaded and tests collected once.
-fast_and_slow: $(STAMP)
-	$(TESTS) -m 'not longest'
 
 longest: $(STAMP)
 	$(TESTS) -m longest
