@@ -13,6 +13,7 @@ from fdi_torch.config.simulation import reading_noise
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.misfit import EXACT
 from fdi_torch.gap.answer import adopted
+from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import (
     Noise,
     estimate_noise,
@@ -116,6 +117,29 @@ def test_whitened_noise_is_white_and_of_unit_variance_also_across_masked_samples
     assert float((white[~mask]).abs().max()) == 0.0
     assert float(white[mask].var()) == pytest.approx(1.0, abs=0.02)
     assert float((white[1:] * white[:-1])[mask[1:] & mask[:-1]].mean()) == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.mark.parametrize("mean_of", [0, 4])
+def test_the_likelihood_of_correlated_noise_with_masked_samples_is_that_of_a_dense_normal_distribution(
+    mean_of: int,
+) -> None:
+    """For AR(1) noise the covariance is a^|s - t| within, and 0 between, runs of valid samples."""
+    ar = torch.tensor([0.9, 0.3], dtype=torch.float64)
+    own, samples = Noise(torch.tensor([0.5, 2.0], dtype=torch.float64), ar, mean_of), torch.arange(40)
+    mask = torch.rand(40, 2, generator=torch.Generator().manual_seed(4)) > 0.4
+    basis = own.whiten(torch.eye(40, dtype=torch.float64).unsqueeze(1).expand(40, 2, 40), mask)
+    expected = 0.0
+    for c in range(2):
+        whitening = basis[mask[:, c], c][:, mask[:, c]]
+        covariance = torch.linalg.inv(whitening.T @ whitening)
+        if not mean_of:
+            runs = (~mask[:, c]).cumsum(0)
+            together = (runs.unsqueeze(1) == runs)[mask[:, c]][:, mask[:, c]]
+            lag = (samples.unsqueeze(1) - samples).abs()[mask[:, c]][:, mask[:, c]]
+            torch.testing.assert_close(covariance, own.std[c] ** 2 * torch.where(together, ar[c] ** lag, 0.0))
+        expected += float(torch.linalg.slogdet(covariance).logabsdet)
+    data = replace(data_set_of(nominal_plant(), (), recorded({}, 3, samples=40), 1.0), mask=mask)
+    assert Fitter(data, own).log_det == pytest.approx(expected, rel=1e-10)
 
 
 @pytest.mark.parametrize(("samples", "slow"), [(3, 0.0), (8, 0.0), (8, 0.05)])

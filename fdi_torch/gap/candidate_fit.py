@@ -51,9 +51,7 @@ class Fitter:
     @property
     def log_det(self) -> float:
         """Log determinant of the covariance that `whiten` reduces to the identity, over all readings."""
-        if whitening := self.whitening:
-            return whitening.log_det
-        return float((2.0 * torch.log(self.noise.innovation) * self.data.mask.sum(dim=0)).sum())
+        return whitening.log_det if (whitening := self.whitening) else self.noise.log_det(self.data.mask)
 
     def engine(
         self, candidate: Candidate, free: Sequence[str], by: Sequence[str] | None = None

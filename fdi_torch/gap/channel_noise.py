@@ -102,8 +102,7 @@ class Noise:
         columns, whole = x.shape[-2:] != mask.shape, bool(mask.all())
         broadcast = (lambda t: t.unsqueeze(-1)) if columns else (lambda t: t)
         time, count = -3 if columns else -2, len(mask)
-        keep, follows = broadcast(mask), torch.cat([torch.zeros_like(mask[:1]), mask[:-1]])
-        own = mask / self.innovation * torch.where(follows, 1.0, 1.0 / torch.sqrt(self.energy))
+        keep, follows, own = broadcast(mask), _follows(mask), mask / self._divisors(mask)
         known = x if whole else torch.where(keep, x, 0.0)
         white = known * broadcast(own)
         if not bool((self.ar != 0.0).any()):
@@ -116,6 +115,19 @@ class Noise:
                 returned = broadcast(self.ar**lag) * white.narrow(time, 0, count - lag)
                 white.narrow(time, lag, count - lag).add_(returned)
         return white if whole or not self.mean_of else torch.where(keep, white, 0.0)
+
+    def log_det(self, mask: Tensor) -> float:
+        """Log determinant of the covariance that `whiten` reduces to the identity, over all valid samples."""
+        return 2.0 * float(torch.log(self._divisors(mask))[mask].sum())
+
+    def _divisors(self, mask: Tensor) -> Tensor:
+        """Standard deviation (S, C) of each sample, given the one before it if that is valid."""
+        return torch.where(_follows(mask), self.innovation, self.std)
+
+
+def _follows(mask: Tensor) -> Tensor:
+    """Samples (S, C) after a valid one."""
+    return torch.cat([torch.zeros_like(mask[:1]), mask[:-1]])
 
 
 def low_frequency_excess(white: Tensor) -> float:
