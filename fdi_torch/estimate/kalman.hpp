@@ -115,7 +115,7 @@ inline void backward(const Model& m, int64_t t, const double* __restrict z, doub
 
 // to (C, W) = H z, for z (d, W); H covers x and v, and rows of masked channels are zero
 template <int W>
-inline void look(const Model& m, int64_t t, const double* __restrict z, double* __restrict to) {
+inline void look(const Model& m, int64_t t, const double* z, double* to) {
     std::fill(to, to + C * W, 0.0);
     for (int i = 0; i < C * n; ++i)  // a reading depends on few levels
         if (const double h = m.h[t * C * n + i]; h != 0.0)
