@@ -19,13 +19,15 @@ from fdi_torch.estimate.evidence import ODDS
 from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.candidate import Candidate
+from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
 from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.library import possible_places
 from fdi_torch.gap.localization.localize import localize
 from fdi_torch.gap.marginal_likelihood import evidence_under, with_disturbances, with_estimated_noise
 from fdi_torch.gap.onsets import fine_onsets
-from fdi_torch.gap.problem import problem_of
+from fdi_torch.gap.problem import checked_data_set, problem_of
 from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.remarks import implausible_flows
 from fdi_torch.gap.screening import Option, options_of, screen
@@ -190,6 +192,23 @@ def test_the_two_effects_that_explain_most_together_are_fitted_together(monkeypa
     screening = screen(fitter, null, options_of(problem.library, fitter, reach))
     pool.extend(base, screening, screening)
     assert {("pump_gain", "Q1"), ("leak", "T1")} in [candidate.key for candidate in fitted]
+
+
+def test_flows_decay_by_the_time_between_samples_in_whatever_order_the_recordings_come() -> None:
+    each, told, steps = [gap_recording({}, 3, samples=300), gap_recording({}, 4).every(8)], [], []
+    levels = torch.full((3,), 1e-3, dtype=torch.float64)
+    noise = StateNoise(torch.full((3,), 4e-6, dtype=torch.float64), 20.0, torch.ones(3, dtype=torch.float64))
+    for recordings in (each, each[::-1]):
+        fitter = Fitter(checked_data_set(nominal_plant(), (), recordings, 1.0), Noise(levels, 300.0 * levels))
+        null = fitter.fit(Candidate())
+        under = with_disturbances(fitter, null, noise)
+        assert under.whitening is not None
+        for rows, recording in zip(fitter.data.rows, recordings, strict=True):
+            decay = under.whitening.own.kept(20.0)[rows][:-1]
+            assert decay.tolist() == pytest.approx([math.exp(-recording.interval / 20.0)] * len(decay))
+        told.append(under.cost(null) + under.log_det)
+        steps.append(float(checked_data_set(nominal_plant(), (), recordings, None).experiment.steps.max()))
+    assert told[0] == pytest.approx(told[1], rel=1e-6) and steps[0] == steps[1]
 
 
 def test_onsets_are_as_dense_as_the_random_flows_require() -> None:

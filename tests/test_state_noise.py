@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -20,20 +21,43 @@ INTENSITY = torch.tensor([3e-6, 1e-6], dtype=DOUBLE)  # m^3/s: per second 0.2 an
 AREA = 0.0154
 
 
-def two_tanks(samples: int, fresh: tuple[int, ...] = (0,), masked: float = 0.0) -> Propagation:
-    """Two tanks joined by a pipe, the second one drained; both levels are read each second."""
+def two_tanks(
+    samples: int, fresh: tuple[int, ...] = (0,), masked: float = 0.0, intervals: Tensor | None = None
+) -> Propagation:
+    """Two tanks joined by a pipe, the second one drained; both levels are read each second or after these intervals."""
     rates = torch.tensor([[-0.02, 0.02], [0.02, -0.05]], dtype=DOUBLE)
-    transition = torch.matrix_exp(rates)
+    steps = torch.ones(samples, dtype=DOUBLE) if intervals is None else intervals
+    transition = torch.matrix_exp(rates * steps[:, None, None])
     forcing = torch.linalg.solve(rates, transition - torch.eye(2, dtype=DOUBLE)) / AREA
     starts = torch.zeros(samples, dtype=torch.bool)
     starts[list(fresh)] = True
     seen = torch.rand(samples, 2, generator=torch.Generator().manual_seed(9)) >= masked
-    each = (m.expand(samples, 2, 2).clone() for m in (transition, forcing, torch.eye(2, dtype=DOUBLE)))
-    return Propagation(*each, interval=1.0, fresh=starts, mask=seen)
+    output = torch.eye(2, dtype=DOUBLE).repeat(samples, 1, 1)
+    return Propagation(transition, forcing, output, steps, fresh=starts, mask=seen)
+
+
+def uneven(samples: int, fresh: tuple[int, ...] = (0,), masked: float = 0.0) -> Propagation:
+    """The same tanks, read every 0.2 to 20 s."""
+    steps = torch.exp(4.6 * torch.rand(samples, generator=torch.Generator().manual_seed(5), dtype=DOUBLE)) / 5.0
+    return two_tanks(samples, fresh, masked, steps)
+
+
+TANKS = pytest.mark.parametrize("tanks", [two_tanks, uneven], ids=["even", "uneven"])
 
 
 def correlation_of(noise: StateNoise) -> float:
     return math.exp(-1.0 / noise.correlation_time) if noise.correlation_time else 0.0
+
+
+def flow_factors(p: Propagation, time: float) -> Tensor:
+    """Standard deviations (S,) of a flow over each interval, that over the usual one being 1: the variance of its
+    integral over many intervals dt is dt coth(dt / 2 tau) per second."""
+
+    def variance(dt: float) -> float:
+        return dt / math.tanh(0.5 * dt / time) if time else dt
+
+    usual = variance(sorted(p.interval.tolist())[(len(p.interval) - 1) // 2])
+    return torch.tensor([math.sqrt(usual / variance(dt)) for dt in p.interval.tolist()], dtype=DOUBLE)
 
 
 def simulated(p: Propagation, sensors: SensorNoise, noise: StateNoise, seed: int) -> Tensor:
@@ -58,12 +82,12 @@ def simulated(p: Propagation, sensors: SensorNoise, noise: StateNoise, seed: int
 
 def dense(p: Propagation, sensors: SensorNoise, noise: StateNoise) -> tuple[Tensor, Tensor]:
     """Covariance of all readings (S C, S C), and of the levels (S n) with the readings, of one recording."""
-    samples = len(p.mask)
-    gap = (torch.arange(samples).unsqueeze(0) - torch.arange(samples).unsqueeze(1)).abs().to(DOUBLE)
-    keep = correlation_of(noise)
-    of_flows = (keep**gap if keep else torch.eye(samples, dtype=DOUBLE))[:, None, :, None] * torch.diag(
-        noise.intensity**2
-    ).reshape(1, 2, 1, 2)
+    samples, keep, factor = len(p.mask), correlation_of(noise), flow_factors(p, noise.correlation_time)
+    count, times = torch.arange(samples, dtype=DOUBLE), torch.cat([torch.zeros(1), p.interval[:-1].cumsum(0)])
+    gap, apart = ((x.unsqueeze(0) - x.unsqueeze(1)).abs() for x in (times, count))
+    of_flows = (factor * factor.unsqueeze(1) * (keep**gap if keep else torch.eye(samples, dtype=DOUBLE)))[
+        :, None, :, None
+    ] * torch.diag(noise.intensity**2).reshape(1, 2, 1, 2)
     response = torch.zeros(samples, 2, samples, 2, dtype=DOUBLE)  # levels at s by flows at r
     for s in range(1, samples):
         response[s] = torch.einsum("ij,jrk->irk", p.transition[s - 1], response[s - 1])
@@ -71,7 +95,7 @@ def dense(p: Propagation, sensors: SensorNoise, noise: StateNoise) -> tuple[Tens
     flat = response.reshape(2 * samples, 2 * samples)
     of_levels = flat @ of_flows.reshape(2 * samples, 2 * samples) @ flat.T
     std = noise.scale * sensors.std
-    of_errors = torch.diag_embed(std**2 * sensors.correlation ** gap.unsqueeze(-1))
+    of_errors = torch.diag_embed(std**2 * sensors.correlation ** apart.unsqueeze(-1))
     if noise.wander:
         of_errors[:, :, noise.wander.channel, noise.wander.channel] += drift_covariance(noise.wander, gap)
     of_errors = of_errors.permute(0, 2, 1, 3).reshape(2 * samples, 2 * samples)
@@ -79,13 +103,9 @@ def dense(p: Propagation, sensors: SensorNoise, noise: StateNoise) -> tuple[Tens
 
 
 def drift_covariance(drift: Wander, gap: Tensor) -> Tensor:
-    """Of samples a second apart: of the first order exp(-gap / tau); a smooth one is driven by such a process."""
-    a, variance, times = math.exp(-1.0 / drift.correlation_time), drift.std**2, torch.arange(len(gap))
-    if not drift.smooth:
-        return variance * a**gap
-    later = (times.unsqueeze(1) - times - 1).to(DOUBLE)
-    response = torch.where(later >= 0, a ** later.clamp(min=0.0), 0.0) * (1.0 - a * a) / math.sqrt(1.0 + a * a)
-    return variance * (a ** (times.unsqueeze(1) + times) + response @ a**gap @ response.T)
+    """Matern covariances of order 1/2 and, for a smooth drift, 3/2 (Rasmussen and Williams, 2006, section 4.2.1)."""
+    x = gap / drift.correlation_time
+    return drift.std**2 * (1.0 + x if drift.smooth else 1.0) * torch.exp(-x)
 
 
 def problem(p: Propagation, sensors: SensorNoise, residual: Tensor, columns: int = 0) -> _Problem:
@@ -101,11 +121,14 @@ def one_order_of_magnitude(noise: StateNoise) -> float:
     return -((0.5 * (first - second) / math.log(2.0)) ** 2)
 
 
+@TANKS
 @pytest.mark.parametrize("time", [0.0, 15.0])
 @pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
 @pytest.mark.parametrize("masked", [0.0, 0.3])
-def test_the_likelihood_is_that_of_a_dense_normal_distribution(time: float, correlation: Tensor, masked: float) -> None:
-    p, sensors = two_tanks(12, masked=masked), SensorNoise(STD, correlation)
+def test_the_likelihood_is_that_of_a_dense_normal_distribution(
+    tanks: Callable[..., Propagation], time: float, correlation: Tensor, masked: float
+) -> None:
+    p, sensors = tanks(12, masked=masked), SensorNoise(STD, correlation)
     noise = StateNoise(INTENSITY, time, torch.tensor([1.0, 1.3], dtype=DOUBLE))
     residual, seen = simulated(p, sensors, noise, 1), p.mask.flatten()
     covariance = dense(p, sensors, noise)[0][seen][:, seen]
@@ -119,12 +142,13 @@ def test_the_likelihood_is_that_of_a_dense_normal_distribution(time: float, corr
     assert float(white(residual).square().sum()) == pytest.approx(squares, rel=1e-9)
 
 
+@TANKS
 @pytest.mark.parametrize("smooth", [False, True])
 @pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
 def test_a_sensor_that_wanders_has_the_likelihood_of_a_dense_normal_distribution(
-    correlation: Tensor, smooth: bool
+    tanks: Callable[..., Propagation], correlation: Tensor, smooth: bool
 ) -> None:
-    p, sensors = two_tanks(12, masked=0.3), SensorNoise(STD, correlation)
+    p, sensors = tanks(12, masked=0.3), SensorNoise(STD, correlation)
     noise = StateNoise(INTENSITY, 15.0, torch.tensor([1.0, 1.3], dtype=DOUBLE), Wander(1, 4e-3, 6.0, smooth))
     residual, seen = simulated(p, sensors, noise, 1), p.mask.flatten()
     covariance = dense(p, sensors, noise)[0][seen][:, seen]
@@ -134,10 +158,13 @@ def test_a_sensor_that_wanders_has_the_likelihood_of_a_dense_normal_distribution
     assert value == pytest.approx(expected + one_order_of_magnitude(noise), abs=1e-6)  # nats
 
 
+@TANKS
 @pytest.mark.parametrize("smooth", [False, True])
 @pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
-def test_the_slope_by_a_wander_is_a_central_difference(correlation: Tensor, smooth: bool) -> None:
-    p, sensors = two_tanks(80, masked=0.2), SensorNoise(STD, correlation)
+def test_the_slope_by_a_wander_is_a_central_difference(
+    tanks: Callable[..., Propagation], correlation: Tensor, smooth: bool
+) -> None:
+    p, sensors = tanks(80, masked=0.2), SensorNoise(STD, correlation)
     noise = StateNoise(INTENSITY, 15.0, torch.ones(2, dtype=DOUBLE), Wander(0, 3e-3, 20.0, smooth))
     whole = problem(p, sensors, simulated(p, sensors, noise, 3), columns=2)
 
@@ -146,6 +173,51 @@ def test_the_slope_by_a_wander_is_a_central_difference(correlation: Tensor, smoo
 
     expected = (value(1e-4) - value(-1e-4)) / 2e-4
     assert float(whole.likelihood(noise)[1].slope[-1]) == pytest.approx(expected, rel=1e-5, abs=1e-5)
+
+
+@TANKS
+@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize("time", [1.0, 20.0, 320.0])
+def test_a_wander_keeps_its_variance_from_the_first_sample_on(
+    tanks: Callable[..., Propagation], smooth: bool, time: float
+) -> None:
+    a, b = KalmanFilter(tanks(200), SensorNoise(STD, WHITE)).drift(Wander(0, 1.0, time, smooth))
+    covariance = torch.eye(a.shape[-1], dtype=DOUBLE)
+    for transition, forcing in zip(a, b, strict=True):
+        covariance = transition @ covariance @ transition.T + forcing @ forcing.T
+        torch.testing.assert_close(covariance, torch.eye(len(covariance), dtype=DOUBLE), rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("time", [0.0, 5.0, 80.0])
+def test_random_flows_move_as_much_water_whatever_the_times_between_samples(time: float) -> None:
+    """Variance of the volume after 8000 s, from samples every 1 s, every 10 s, and first every 1, then every 10 s."""
+    both = torch.cat([torch.ones(4000, dtype=DOUBLE), torch.full((400,), 10.0, dtype=DOUBLE)])
+    moved = []
+    for steps in (torch.ones(8000, dtype=DOUBLE), torch.full((800,), 10.0, dtype=DOUBLE), both):
+        p = two_tanks(8001 + len(steps), intervals=torch.cat([torch.ones(8001, dtype=DOUBLE), steps]))  # usually 1 s
+        model = KalmanFilter(p, SensorNoise(STD, WHITE))
+        held = p.interval * model.forced(time)[1][:, 0, 0] / p.forcing[:, 0, 0]
+        volume, together = 0.0, 0.0  # its variance, and its covariance with the flow
+        for k, f in zip(model.kept(time)[8001:].tolist(), held[8001:].tolist(), strict=True):
+            volume, together = volume + 2.0 * f * together + f * f, k * (together + f)
+        moved.append(volume / 8000.0)
+    assert moved == pytest.approx([moved[0]] * 3, rel=0.02)
+
+
+@pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
+def test_the_order_of_recordings_with_other_intervals_is_irrelevant(correlation: Tensor) -> None:
+    sensors, noise = SensorNoise(STD, correlation), StateNoise(INTENSITY, 20.0, torch.ones(2, dtype=DOUBLE))
+    noise = replace(noise, wander=Wander(1, 3e-3, 40.0, smooth=True))
+    each = [(torch.ones(40, dtype=DOUBLE), 6), (torch.full((30,), 10.0, dtype=DOUBLE), 7)]
+    told = []
+    for (first, a), (second, b) in (each, each[::-1]):
+        p = two_tanks(70, (0, len(first)), intervals=torch.cat([first, second]))
+        alone = (
+            simulated(two_tanks(len(steps), intervals=steps), sensors, noise, s)
+            for steps, s in ((first, a), (second, b))
+        )
+        told.append(problem(p, sensors, torch.cat(list(alone))).likelihood(noise)[0])
+    assert told[0] == pytest.approx(told[1], rel=1e-12)
 
 
 @pytest.mark.parametrize("channel", [0, 1])
@@ -200,14 +272,21 @@ def test_the_likelihood_is_that_of_readings_to_which_random_parameters_add(maske
     assert whole.likelihood(noise)[0] == pytest.approx(expected, rel=1e-9)
 
 
+@TANKS
 @pytest.mark.parametrize("time", [0.0, 15.0])
 @pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
 @pytest.mark.parametrize(("fresh", "masked", "apart"), [((0,), 0.0, None), ((0,), 0.3, 1), ((0, 35), 0.0, None)])
 @pytest.mark.parametrize("pull", [1.0, 0.0], ids=["prior", "no prior"])
 def test_slopes_are_central_differences(
-    time: float, correlation: Tensor, fresh: tuple[int, ...], masked: float, apart: int | None, pull: float
+    tanks: Callable[..., Propagation],
+    time: float,
+    correlation: Tensor,
+    fresh: tuple[int, ...],
+    masked: float,
+    apart: int | None,
+    pull: float,
 ) -> None:
-    p, sensors = two_tanks(80, fresh, masked), SensorNoise(STD, correlation)
+    p, sensors = tanks(80, fresh, masked), SensorNoise(STD, correlation)
     noise = StateNoise(INTENSITY, time, torch.tensor([0.9, 1.2], dtype=DOUBLE), apart=apart)
     whole = problem(p, sensors, simulated(p, sensors, noise, 3), columns=2)
     whole = replace(whole, pull=torch.tensor([1.0, pull], dtype=DOUBLE))
@@ -268,10 +347,13 @@ def test_what_is_transposed_has_the_same_products(correlation: Tensor, columns: 
     torch.testing.assert_close((y * whitening.transposed(v)).sum((0, 1)), products, rtol=1e-9, atol=1e-9)
 
 
+@TANKS
 @pytest.mark.parametrize("time", [0.0, 15.0])
 @pytest.mark.parametrize("correlation", [WHITE, COLOURED], ids=["white", "coloured"])
-def test_smoothed_levels_are_the_dense_conditional_mean(time: float, correlation: Tensor) -> None:
-    p, sensors = two_tanks(12, masked=0.2), SensorNoise(STD, correlation)
+def test_smoothed_levels_are_the_dense_conditional_mean(
+    tanks: Callable[..., Propagation], time: float, correlation: Tensor
+) -> None:
+    p, sensors = tanks(12, masked=0.2), SensorNoise(STD, correlation)
     noise = StateNoise(INTENSITY, time, torch.ones(2, dtype=DOUBLE))
     residual, seen = simulated(p, sensors, noise, 7), p.mask.flatten()
     readings, levels = dense(p, sensors, noise)

@@ -2,7 +2,7 @@
 //
 //     x_{s+1} = A_s x_s + B_s w_s,   y_s = H_s x_s + v_s + e_s,   e ~ N(0, diag R)
 //
-// w and v are first-order processes: decay factors `keep`, white shocks of variance q. The state is z = (x, w, v), with
+// w and v are first-order processes: decay factors `keep_s`, white shocks of variance q_s. The state is z = (x, w, v), with
 // dimension d and transition F. At each sample marked `fresh` (the start of a recording) it restarts at zero mean with
 // covariance diag P0. Compile-time sizes: TANKS (dimension of x and w), CHANNELS (of y), and LAYERS, the number of
 // correlated noise terms on each channel, possibly none: v has LAYERS * CHANNELS components. S: samples, W: columns
@@ -19,7 +19,7 @@ constexpr int n = TANKS, C = CHANNELS, decaying = n + LAYERS * C, d = n + decayi
 
 struct Model {
     const double *a, *b, *h;     // (S, n, n), (S, n, n), (S, C, n)
-    const double *keep, *q, *r;  // (decaying), (decaying), (C)
+    const double *keep, *q, *r;  // (S, decaying), (S, decaying), (C)
     const double* p0;            // (d)
     const uint8_t *seen, *fresh; // (S, C), (S)
 };
@@ -100,7 +100,7 @@ inline void forward(const Model& m, int64_t t, const double* __restrict z, doubl
     add_product<n, n, W>(m.a + t * n * n, z, to);
     add_product<n, n, W>(m.b + t * n * n, z + n * W, to);
     for (int i = 0; i < decaying; ++i)
-        for (int k = 0; k < W; ++k) to[(n + i) * W + k] = m.keep[i] * z[(n + i) * W + k];
+        for (int k = 0; k < W; ++k) to[(n + i) * W + k] = m.keep[t * decaying + i] * z[(n + i) * W + k];
 }
 
 // to (d, W) = F' z, for z (d, W)
@@ -109,11 +109,12 @@ inline void backward(const Model& m, int64_t t, const double* __restrict z, doub
     std::fill(to, to + n * W, 0.0);
     add_product_of_transposed<n, n, W>(m.a + t * n * n, z, to);
     for (int i = 0; i < decaying; ++i)
-        for (int k = 0; k < W; ++k) to[(n + i) * W + k] = m.keep[i] * z[(n + i) * W + k];
+        for (int k = 0; k < W; ++k) to[(n + i) * W + k] = m.keep[t * decaying + i] * z[(n + i) * W + k];
     add_product_of_transposed<n, n, W>(m.b + t * n * n, z, to + n * W);
 }
 
-// to (C, W) = H z, for z (d, W); H covers x and v, and rows of masked channels are zero
+// to (C, W) = H z, for z (d, W); H covers x and v, and rows of masked channels are zero. Without __restrict, with which
+// g++ 12.2 -O3 returns wrong gains for four levels and two channels with correlated noise.
 template <int W>
 inline void look(const Model& m, int64_t t, const double* z, double* to) {
     std::fill(to, to + C * W, 0.0);
@@ -211,8 +212,9 @@ void whiten(const Model& m, int64_t samples, int64_t columns, int64_t first, con
     }
 }
 
-// Sums over columns: derivatives of the log-likelihood by the variances q (decaying), r (C) and p0 (d), less the parts that
-// do not depend on the innovations. `shocks` (S, d), of the first column, see kalman_score.
+// Sums over columns: derivatives of the log-likelihood by the logarithm of a factor on q (decaying) and by the variances
+// r (C) and p0 (d), less the parts that do not depend on the innovations. `shocks` (S, d), of the first column, see
+// kalman_score.
 struct Sums {
     double *by_q, *by_r, *by_p0, *shocks;
 };
@@ -224,9 +226,9 @@ void whiten_back(const Model& m, int64_t samples, int64_t columns, int64_t first
                  const double* white, const double* v, double* out, const Sums* sums) {
     double z[d * W], moved[d * W], nu[C * W];
     std::vector<double> block(BLOCK * C * W, 0.0);
-    const auto add_squares = [](const double* x, int count, double* to) {
+    const auto add_squares = [](const double* x, int count, double* to, const double* weight = nullptr) {
         for (int i = 0; i < count; ++i)
-            for (int k = 0; k < W; ++k) to[i] += 0.5 * x[i * W + k] * x[i * W + k];
+            for (int k = 0; k < W; ++k) to[i] += 0.5 * x[i * W + k] * x[i * W + k] * (weight ? weight[i] : 1.0);
     };
     for (int64_t t = samples - 1; t >= 0; --t) {
         double* own = &block[t % BLOCK * C * W];
@@ -235,7 +237,7 @@ void whiten_back(const Model& m, int64_t samples, int64_t columns, int64_t first
         if (t + 1 == samples || m.fresh[t + 1]) {
             std::fill(moved, moved + d * W, 0.0);
         } else {
-            if (sums) add_squares(z + n * W, decaying, sums->by_q);
+            if (sums) add_squares(z + n * W, decaying, sums->by_q, m.q + t * decaying);
             backward<W>(m, t, z, moved);
         }
         std::fill(nu, nu + C * W, 0.0);
@@ -250,7 +252,7 @@ void whiten_back(const Model& m, int64_t samples, int64_t columns, int64_t first
         for (int i = 0; i < d * W; ++i) z[i] = moved[i] - z[i];
         if (sums && m.fresh[t]) add_squares(z, d, sums->by_p0);
         for (int i = 0; i < d && sums && first == 0; ++i)
-            sums->shocks[t * d + i] = -z[i * W] * (m.fresh[t] ? m.p0[i] : i < n ? 0.0 : m.q[i - n]);
+            sums->shocks[t * d + i] = -z[i * W] * (m.fresh[t] ? m.p0[i] : i < n ? 0.0 : m.q[(t - 1) * decaying + i - n]);
     }
 }
 
@@ -310,12 +312,12 @@ double kalman_gains(int64_t samples, const Model* model, double* gain, double* w
         add_product<n, n, n>(m.a + t * n * n, turned, next);
         add_product<n, n, n>(m.b + t * n * n, turned + n * n, next);
         for (int i = 0; i < d; ++i)
-            for (int j = std::max(i, n); j < d; ++j) p[i * d + j] = half[i * d + j] * m.keep[j - n];
+            for (int j = std::max(i, n); j < d; ++j) p[i * d + j] = half[i * d + j] * m.keep[t * decaying + j - n];
         for (int i = 0; i < n; ++i)
             for (int j = i; j < n; ++j) p[i * d + j] = 0.5 * (next[i * n + j] + next[j * n + i]);
         for (int i = 0; i < d; ++i)
             for (int j = 0; j < i; ++j) p[i * d + j] = p[j * d + i];
-        for (int i = 0; i < decaying; ++i) p[(n + i) * (d + 1)] += m.q[i];
+        for (int i = 0; i < decaying; ++i) p[(n + i) * (d + 1)] += m.q[t * decaying + i];
     }
     return log_det;
 }
@@ -338,9 +340,10 @@ void kalman_transposed(int64_t samples, const Model* model, int64_t columns, con
 
 // Disturbance smoother (Durbin and Koopman, 2012, sections 4.5 and 7.3.3). Input: columns nu (C, M, S) of innovations of
 // unit variance, the squares of which add up. Output:
-//   by_q (decaying), by_r (C), by_p0 (d): derivatives of the log-likelihood by the variances q, R and P0;
-//   n_q, n_r, n_p0: minus the parts of these that do not depend on nu; a variance times twice its n is the effective
-//       number of readings that determine it;
+//   by_q (decaying): derivatives of the log-likelihood by the logarithm of a factor on the variances q of all samples;
+//   by_r (C), by_p0 (d): by the variances R and P0;
+//   n_q, n_r, n_p0: minus the parts of these that do not depend on nu; twice n_q, and a variance times twice its n, is
+//       the effective number of readings that determine it;
 //   shocks (S, d): of the first column, the smoothed state at the start of a recording, else the smoothed shock that
 //       leads to the sample.
 void kalman_score(int64_t samples, const Model* model, int64_t columns, const double* gain, const double* white,
@@ -363,11 +366,11 @@ void kalman_score(int64_t samples, const Model* model, int64_t columns, const do
         if (t + 1 == samples || m.fresh[t + 1]) {
             std::fill(big, big + d * d, 0.0);
         } else {
-            for (int i = 0; i < decaying; ++i) n_q[i] += 0.5 * big[(n + i) * (d + 1)];
+            for (int i = 0; i < decaying; ++i) n_q[i] += 0.5 * big[(n + i) * (d + 1)] * m.q[t * decaying + i];
             // F' N F: only the rows and columns of the levels and flows need a product, and N is symmetric.
             backward<d>(m, t, big, half);
             for (int i = 0; i < d; ++i)
-                for (int j = std::max(i, n); j < d; ++j) big[i * d + j] = half[i * d + j] * m.keep[j - n];
+                for (int j = std::max(i, n); j < d; ++j) big[i * d + j] = half[i * d + j] * m.keep[t * decaying + j - n];
             for (int i = 0; i < 2 * n; ++i) std::copy(half + i * d, half + i * d + n, turned + i * n);
             std::fill(by_level, by_level + n * n, 0.0);
             add_product<n, n, n>(turned, m.a + t * n * n, by_level);

@@ -3,15 +3,19 @@
 The deviation x of the state (levels, and states of effects) from the trajectory, the flow disturbances w of the tanks,
 the sensor noise v and the residuals y of the readings obey, from sample s to the next,
 
-    x_{s+1} = A_s x_s + B_s w_s
-    w_{s+1} = exp(-dt / tau) w_s + q_s          var(w_i) = intensity_i^2
+    x_{s+1} = A_s x_s + f_s B_s w_s
+    w_{s+1} = exp(-dt_s / tau) w_s + q_s        var(w_i) = intensity_i^2
     v_{s+1} = a v_s + p_s                       var(v_c) = (scale_c std_c)^2
     y_s     = C_s x_s + v_s
 
-with white shocks q and p. One sensor may have an additional slow random drift z in its reading (`Wander`), a further
-component of x with its own w. The filter turns residuals, and their derivatives by parameters, into innovations of unit
-variance (Särkkä, 2013, "Bayesian filtering and smoothing", chapter 4). The disturbances model waves, pulsation and
-splashing, which occur on every real rig and are not faults.
+with white shocks q and p, and times dt_s between samples that may differ. A flow f w is constant over dt; therefore
+
+    f_s^2 = D(usual dt) / D(dt_s),    D(dt) = dt coth(dt / (2 tau)),
+
+with which the variance of its integral over a long time is the same at any dt. One sensor may have an additional slow
+random drift z in its reading (`Wander`), with further components of x and their own w. The filter turns residuals, and
+their derivatives by parameters, into innovations of unit variance (Särkkä, 2013, "Bayesian filtering and smoothing",
+chapter 4). The disturbances model waves, pulsation and splashing, which occur on every real rig and are not faults.
 
 S: samples, C: sensors (channels), n: states (levels and states of effects), d: states of the filter, M: columns that
 are filtered together.
@@ -29,6 +33,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from fdi_torch.simulate.build import REGISTER, load_library
 
@@ -38,7 +43,8 @@ class Propagation:
     """Linearised dynamics from flow disturbances to readings along a trajectory.
 
     transition (S, n, n): A. forcing (S, n, n), s/m^2: B, for flows in m^3/s that are constant between samples.
-    output (S, C, n): C, in each reading's unit per m. interval: sampling interval, s.
+    output (S, C, n): C, in each reading's unit per m.
+    interval (S,): dt, time to the next sample of the same recording, s; the usual interval where there is none.
     fresh (S,): true at the first sample of each recording, where the deviation of the levels is zero.
     mask (S, C): true for valid readings.
     """
@@ -46,19 +52,24 @@ class Propagation:
     transition: Tensor
     forcing: Tensor
     output: Tensor
-    interval: float
+    interval: Tensor
     fresh: Tensor
     mask: Tensor
+
+    @property
+    def usual_interval(self) -> float:
+        """Median time between samples, s."""
+        return float(self.interval.median())
 
 
 @dataclass(frozen=True)
 class Wander:
-    """Slow random drift z of one sensor's reading, stationary:
+    """Slow random drift z of one sensor's reading: a stationary process with the correlation, after a time t = x tau,
 
-        z_{s+1} = a z_s + b w_s,    w_{s+1} = g w_s + q_s,    a = exp(-dt / correlation_time)
+        exp(-x),    or if smooth (1 + x) exp(-x).
 
-    std: of z, reading's unit. correlation_time: s. smooth: g = a, which makes the rate of the drift continuous, as with
-    temperature; otherwise g = 0, a process of first order.
+    The rate of a smooth drift is continuous, as with temperature (Rasmussen and Williams, 2006, "Gaussian processes for
+    machine learning", equation 4.17). std: of z, reading's unit. correlation_time: tau, s.
     """
 
     channel: int
@@ -76,7 +87,8 @@ SCATTER = math.log(2.0)
 class StateNoise:
     """Parameters of the noise model.
 
-    intensity (tanks,): standard deviation of the random flow into each tank, m^3/s; none acts on other states.
+    intensity (tanks,): standard deviation of the random flow into each tank at the usual sampling interval, m^3/s; none
+    acts on other states.
     correlation_time: of these flows, s; 0: white, with an independent value in each sampling interval.
     scale (C,): factor on the standard deviation of each sensor's noise. wander: drift of one sensor, if any.
     apart: index of a tank whose random flow is not of the same order as the others', if any.
@@ -106,7 +118,11 @@ class StateNoise:
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Sensor noise: standard deviation (C,) in the reading's unit, and correlation of neighbouring samples (C,)."""
+    """Sensor noise: standard deviation (C,) in the reading's unit, and correlation of neighbouring samples (C,).
+
+    The correlation does not depend on the time between the samples, since it is estimated from, and whitened in, their
+    sequence (gap/channel_noise.py), whether a sample is a reading or the mean of several.
+    """
 
     std: Tensor
     correlation: Tensor
@@ -126,23 +142,34 @@ class KalmanFilter:
         """The filter with its gains for this noise model."""
         return KalmanWhitening(self, noise)
 
-    def kept(self, time: float) -> float:
-        """Decay factor exp(-dt / time) over one sampling interval; time: correlation time, s, 0 for white noise."""
-        return math.exp(-self.propagation.interval / time) if time > 0.0 else 0.0
+    def kept(self, time: float) -> Float[Tensor, " S"]:
+        """Decay factors exp(-dt / time) from sample to sample; time: correlation time, s, 0 for white noise."""
+        interval = self.propagation.interval
+        return torch.exp(-interval / time) if time > 0.0 else torch.zeros_like(interval)
 
-    def with_wander(self, wander: Wander) -> tuple[tuple[Tensor, ...], float]:
-        """The matrices A, B and C with the drift as last component of x, and the decay factor g of its w.
+    def forced(self, time: float) -> tuple[Tensor, ...]:
+        """The matrices A, f B and C for flows of this correlation time, s."""
+        p, (transition, forcing, output) = self.propagation, self.matrices
+        steps = torch.cat([p.interval, p.interval.new_tensor([p.usual_interval])])
+        density = steps / torch.tanh(0.5 * steps / time) if time > 0.0 else steps
+        return transition, forcing * torch.sqrt(density[-1] / density[:-1, None, None]), output
 
-        b is such that the stationary variances of z and w are equal.
+    def drift(self, wander: Wander) -> tuple[Tensor, Tensor]:
+        """The matrices A and B (S, k, k) of a drift of unit variance and, if it is smooth, tau times its rate.
+
+        A = exp(F x), F = -1, or for a smooth drift [[0, 1], [-1, -2]]; B B' = 1 - A A', since the stationary covariance
+        is 1.
         """
-        a = self.kept(wander.correlation_time)
-        g = a if wander.smooth else 0.0
-        transition, forcing, output = (
-            torch.nn.functional.pad(x, (0, 1, 0, further)) for x, further in zip(self.matrices, (1, 1, 0), strict=True)
-        )
-        transition[:, -1, -1], output[:, wander.channel, -1] = a, 1.0
-        forcing[:, -1, -1] = math.sqrt((1.0 - a * a) * (1.0 - a * g) / (1.0 + a * g))
-        return (transition, forcing, output), g
+        x = self.propagation.interval / wander.correlation_time
+        if not wander.smooth:
+            return torch.exp(-x)[:, None, None], torch.sqrt(-torch.expm1(-2.0 * x))[:, None, None]
+        decay = torch.exp(-2.0 * x)
+        a = torch.exp(-x)[:, None] * torch.stack([1.0 + x, x, -x, 1.0 - x], dim=-1)
+        # 1 - decay (1 + 2 x + 2 x^2), which is of the order of x^3
+        first = torch.sqrt(torch.special.gammainc(torch.full_like(x, 3.0), 2.0 * x))
+        across = torch.where(first > 0.0, 2.0 * x * x * decay / first, 0.0)
+        second = torch.sqrt((1.0 - decay * (1.0 - 2.0 * x + 2.0 * x * x) - across**2).clamp(min=0.0))
+        return a.reshape(-1, 2, 2), torch.stack([first, 0.0 * x, across, second], dim=-1).reshape(-1, 2, 2)
 
 
 class KalmanWhitening:
@@ -153,19 +180,25 @@ class KalmanWhitening:
     """
 
     def __init__(self, kalman_filter: KalmanFilter, noise: StateNoise) -> None:
-        self.own, self.noise, self.wanders = kalman_filter, noise, noise.wander is not None
+        self.own, self.noise = kalman_filter, noise
         of_sensors, zeros = (noise.scale * kalman_filter.sensors.std) ** 2, torch.zeros_like(noise.scale)
         self.flows = len(noise.intensity)
         variance = torch.cat([noise.intensity**2, noise.intensity.new_zeros(kalman_filter.order - self.flows)])
-        decay, matrices = torch.full_like(variance, kalman_filter.kept(noise.correlation_time)), kalman_filter.matrices
+        matrices = kalman_filter.forced(noise.correlation_time)
+        decay = kalman_filter.kept(noise.correlation_time).unsqueeze(1).repeat(1, len(variance))
         start = torch.zeros_like(variance)
         if (wander := noise.wander) is not None:
-            matrices, kept = kalman_filter.with_wander(wander)
-            further = (variance, wander.std**2), (decay, kept), (start, wander.std**2)
-            variance, decay, start = (torch.cat([x, x.new_tensor([value])]) for x, value in further)
+            drift = kalman_filter.drift(wander)
+            k = drift[0].shape[-1]
+            matrices = tuple(pad(x, (0, k, 0, rows)) for x, rows in zip(matrices, (k, k, 0), strict=True))
+            matrices[0][:, -k:, -k:], matrices[1][:, -k:, -k:] = drift
+            matrices[2][:, wander.channel, -k] = 1.0
+            variance, start = (pad(x, (0, k), value=wander.std**2) for x in (variance, start))
+            decay = pad(decay, (0, k))
         self.order = len(start)
         if kalman_filter.correlated:
-            variance, decay = torch.cat([variance, of_sensors]), torch.cat([decay, kalman_filter.sensors.correlation])
+            of_samples = kalman_filter.sensors.correlation.expand(len(decay), -1)
+            variance, decay = torch.cat([variance, of_sensors]), torch.cat([decay, of_samples], dim=1)
         self.r = zeros if kalman_filter.correlated else of_sensors
         self.keep, self.q = decay, (1.0 - decay**2) * variance
         self.p0 = torch.cat([start, variance])
@@ -199,19 +232,20 @@ class KalmanWhitening:
     def score(self, nu: Float[Tensor, "S C M"]) -> Score:
         """Score of the log-likelihood, given innovations nu (S, C, M) of unit variance, the mean product nu nu' of
         which is the sum over the M columns. Its shocks are those of the first column."""
-        slopes, information = ([torch.empty_like(x) for x in (self.q, self.r, self.p0)] for _ in range(2))
+        slopes, information = ([torch.empty_like(x) for x in (self.q[0], self.r, self.p0)] for _ in range(2))
         shocks = nu.new_empty(self.gain.shape[:2])
         columns = nu.permute(1, 2, 0).contiguous()
         self._run("kalman_score", nu.shape[-1], self.gain, self.white, columns, *slopes, *information, shocks)
         return Score(self._by_deviation(*slopes), self._by_deviation(*information), shocks)
 
     def _by_deviation(self, by_q: Tensor, by_r: Tensor, by_p0: Tensor) -> Tensor:
-        """Derivatives by log standard deviations from derivatives by variances: df/dlog(s) = 2 s^2 df/d(s^2)."""
-        order, at_start = self.order, 2.0 * by_p0 * self.p0
-        decaying = 2.0 * by_q * self.q + at_start[order:]
+        """Derivatives by log standard deviations from those by log factors on q, and by the variances r and p0:
+        df/dlog(s) = 2 s^2 df/d(s^2)."""
+        own, order, at_start = self.own.order, self.order, 2.0 * by_p0 * self.p0
+        decaying = 2.0 * by_q + at_start[order:]
         of_sensors = decaying[order:] if self.own.correlated else 2.0 * by_r * self.r
-        wander = decaying[order - 1 : order] + at_start[order - 1 : order] if self.wanders else decaying[:0]
-        return torch.cat([decaying[: self.flows], of_sensors, wander])
+        of_drift = (decaying[own:order] + at_start[own:order]).sum(0, keepdim=True)
+        return torch.cat([decaying[: self.flows], of_sensors, of_drift[: order - own]])
 
     def smoothed(self, residual: Float[Tensor, "S C"]) -> Float[Tensor, "S n"]:
         """Smoothed deviation of the levels from the trajectory, (S, n) m, given all residuals (S, C)."""

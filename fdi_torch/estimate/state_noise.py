@@ -70,7 +70,7 @@ def estimate_state_noise(
     the flow disturbances.
     """
     problem = _Problem(propagation, sensors, residual, jacobian, pull, off, unit)
-    interval = propagation.interval
+    interval = propagation.usual_interval
     if start is None:
         start = StateNoise(unit, interval * CORRELATION_TIMES[2], torch.ones_like(sensors.std))
     if not climb:

@@ -83,8 +83,8 @@ class DataSet:
 
     @property
     def row_spacing(self) -> float:
-        """Median time between rows of the first recording, s."""
-        return float(torch.median(torch.diff(self.experiment.sample_times)))
+        """Median time between rows, s."""
+        return float(torch.cat([torch.diff(experiment.sample_times) for experiment in self.experiments]).median())
 
     @property
     def longest_duration(self) -> float:

@@ -81,7 +81,7 @@ def estimate_disturbances(
         weight, deviation = torch.cat([weight, further.pull]), torch.cat([deviation, torch.zeros_like(further.pull)])
     # Unit of the flows: it moves a level by a tenth of the sensor noise from one sample to the next.
     gains = propagation.output.abs().amax(dim=0).amax(dim=-1).clamp(min=1e-12)
-    unit = _areas(fitter) * float((sensors.std / gains).median()) / (10.0 * propagation.interval)
+    unit = _areas(fitter) * float((sensors.std / gains).median()) / (10.0 * propagation.usual_interval)
     return estimate_state_noise(propagation, sensors, residual, jacobian, weight, deviation, unit, start, climb)
 
 
@@ -93,7 +93,10 @@ def propagation_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> Propagat
     transition, forcing, output = (with_blanks(each, dim=0) for each in zip(*matrices, strict=True))
     starts = torch.zeros(len(data.mask), dtype=torch.bool)
     starts[[rows.start for rows in data.rows]] = True
-    return Propagation(transition, forcing, output, data.row_spacing, starts, data.mask)
+    interval = torch.full((len(data.mask),), data.row_spacing, dtype=torch.float64)
+    for rows, experiment in zip(data.rows, data.experiments, strict=True):
+        interval[rows.start : rows.stop - 1] = torch.diff(experiment.sample_times)
+    return Propagation(transition, forcing, output, interval, starts, data.mask)
 
 
 def pieces_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:

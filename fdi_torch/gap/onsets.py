@@ -104,6 +104,6 @@ def detection_time(fitter: Fitter) -> float:
     sensitivity = propagation.output.abs().amax(dim=0)[:, : len(areas)]
     std = fitter.noise.std * noise.scale
     level_noise = (std.unsqueeze(1) / sensitivity).amin(dim=0)
-    shortest = float(((level_noise * areas * math.sqrt(propagation.interval) / noise.intensity) ** (2 / 3)).min())
-    shortest = max(shortest, propagation.interval)
+    shortest = float(((level_noise * areas * math.sqrt(propagation.usual_interval) / noise.intensity) ** (2 / 3)).min())
+    shortest = max(shortest, propagation.usual_interval)
     return shortest if noise.correlation_time > shortest else math.inf

@@ -238,7 +238,7 @@ def checked_data_set(
 ) -> DataSet:
     """Lay the recordings out on the grid of their simulation, with the mean of the readings in each step.
 
-    step: s; None for the sampling interval of the first recording, or the multiple or fraction of it that lies between
+    step: s; None for the shortest sampling interval of a recording, or the multiple or fraction of it that lies between
     SHORTEST_STEP and LONGEST_STEP, for about MANY_STEPS at most, in parts where that is not accurate enough.
     """
     data = _laid_out(plant, nominal_effects, recordings, step)
@@ -257,7 +257,7 @@ def _laid_out(
 
 def _step(plant: PlantDescription, recordings: Sequence[Recording]) -> float:
     """A whole multiple, or a whole fraction, of the sampling interval, s."""
-    interval, scale = recordings[0].interval, time_scale(plant)
+    interval, scale = min(recording.interval for recording in recordings), time_scale(plant)
     duration = sum(float(r.time[-1] - r.time[0]) for r in recordings)
     shortest = max(interval, SHORTEST_STEP * scale, duration / MANY_STEPS)
     return commensurate_step(min(shortest, LONGEST_STEP * scale), interval)

@@ -92,7 +92,7 @@ def _likeliest(
         by_levels[first:last, :, k * tanks : (k + 1) * tanks] = moved
         first = last
     a, b, c = (x.expand(count, *x.shape) for x in (linear.transition, forcing(linear.transition), linear.output))
-    propagation = Propagation(a, b, c, start.interval, fresh, torch.isfinite(free))
+    propagation = Propagation(a, b, c, free.new_full((count,), start.interval), fresh, torch.isfinite(free))
     sensors = SensorNoise(start.reading_std, torch.full_like(start.reading_std, start.correlation))
     columns = torch.cat([by_levels, by_constants], dim=-1)
     unit, ones = _usual_flow(linear, start.reading_std, start.start_std), free.new_ones(columns.shape[-1])
