@@ -103,6 +103,23 @@ def test_a_model_error_that_jumps_between_recordings_is_not_taken_for_correlated
     assert float(across.ar.min()) > 0.1
 
 
+@pytest.mark.parametrize("ar", [0.0, 0.8])
+def test_the_noise_of_recordings_side_by_side_is_that_of_each(ar: float) -> None:
+    """Long ones with a misfit that jumps from one to the next, of which each channel misses another part."""
+    lengths, rows = (20000, 20000, 500, 15, 7000), []
+    for samples in lengths:
+        rows.append(slice(rows[-1].stop + 1 if rows else 0, (rows[-1].stop + 1 if rows else 0) + samples))
+    x = noise(rows[-1].stop, ar, 0.002, 3)
+    for k, r in enumerate(rows):
+        x[r] += 0.3 * (-1) ** k * torch.cos(torch.arange(lengths[k], dtype=torch.float64) / 5000.0).unsqueeze(1)
+    mask = torch.rand(x.shape, generator=torch.Generator().manual_seed(2)) > torch.tensor([0.0, 1e-4, 1e-3])
+    mask[[r.stop for r in rows[:-1]]] = False
+    found = estimate_noise(x, mask, rows=rows)
+    assert found.std.tolist() == pytest.approx([0.002] * 3, rel=0.04)
+    assert found.ar.tolist() == pytest.approx([ar] * 3, abs=0.02)
+    assert found.mean_of == 0
+
+
 def test_a_recording_without_noise_tells_no_more_than_the_simulation() -> None:
     recording = recorded({"P13.discharge_coefficient": 0.61}, 5, samples=300, std=0.0)
     fitter = recalibrate(data_set_of(nominal_plant(), (), recording, 1.0))[0]

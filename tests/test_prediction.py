@@ -155,6 +155,23 @@ def test_water_that_goes_missing_while_the_plant_settles_bends_nothing_and_the_r
     assert found.own["h.offset"] == pytest.approx(0.0, abs=1e-3)
 
 
+def test_a_tank_that_no_sensor_shows_changes_nothing_in_how_the_others_settle() -> None:
+    """The tank empties in free fall into another, of which the level above tells nothing."""
+    asked = filling(1.0, 0.0, 1)
+    short = asked.inputs.clone()
+    short[asked.time < 20.0, 0] *= 0.7
+    run = replace(asked, outputs=predict(tank(varying=[]), replace(asked, inputs=short), start_samples=1).readings)
+    size = {"area": "0.5 cm^2", "discharge_coefficient": 0.6}
+    pipes = {
+        "OUT": {"source": "T", "target": "below", "free_fall": True, "valve": "v", **size},
+        "END": {"source": "below", **size},
+    }
+    tanks = {name: {"area": "100 cm^2", "height": "50 cm"} for name in ("T", "below")}
+    alone, above = (predict(plant, run, settle=30.0) for plant in (tank(), tank(tanks=tanks, pipes=pipes)))
+    assert above.own["h.offset"] == pytest.approx(alone.own["h.offset"], abs=1e-5)
+    assert above.rmse["h"] == pytest.approx(alone.rmse["h"], abs=1e-5)
+
+
 def test_a_tank_at_rest_in_steps_of_its_sensor_leaves_the_zero_where_it_is_believed() -> None:
     """The valve opens in the last seconds of the stretch, faster than the plant has it; before, nothing moves."""
     asked = filling(1.0, 0.0, 1)

@@ -20,18 +20,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache
 
 import torch
 from torch import Tensor
 
 RELEVANT = 0.01  # share of the variance of the noise that rounding must add to be considered
 DECAY_SHARE = 0.3  # share of a quantization step over which its error decorrelates
-MOST_BINS = 512  # bins of a spectrum
-CACHED = 2  # layouts whose spectra are cached, 40 MB each: of a recording and of its hold-out
+BINS = 512  # of all spectra, between the corner frequency and half of the sampling rate
 LEAST_SAMPLES = 20  # in a segment that is used for the estimate
 FAST_PERIOD = 30.0  # samples; slower parts of a residual may be model error
-
+_CORNER = 1.0 / FAST_PERIOD  # frequency in cycles per sample
 
 MEAN_DECAY = 0.9  # a^n
 LONGEST_MEAN = 16  # samples of a moving average
@@ -150,12 +149,11 @@ def estimate_noise(residual: Tensor, mask: Tensor, rows: Sequence[slice], steps:
     correlation, because rounding errors have their own.
     """
     quantized = [step > 0.0 for step in steps]
-    spectra = [_spectrum_of_all([residual[r][mask[r][:, c], c] for r in rows]) for c in range(residual.shape[1])]
+    channels = range(residual.shape[1])
+    spectra = [_spectrum([residual[r][mask[r][:, c], c] for r in rows]) for c in channels]
     plain = [not r for r in quantized] if quantized and not all(quantized) else [True] * len(spectra)
-    levels = [_levels(*s) for s in spectra]
-    # (C, colours, errors)
-    likelihoods = torch.stack([_likelihood(*s, x) for s, x in zip(spectra, levels, strict=True)])
-    counts = [int(mask[:, c].sum()) for c in range(residual.shape[1])]
+    levels, likelihoods = _fitted(*map(torch.stack, zip(*spectra, strict=True)))  # (C, correlations, errors)
+    counts = [int(mask[:, c].sum()) for c in channels]
     likelihoods = likelihoods + torch.stack([_cost_of_error(n) for n in counts]).unsqueeze(1)
     likelihoods[:, len(_AR) :] += math.inf if any(quantized) else MEAN_PENALTY
     best = likelihoods.min(dim=-1).values
@@ -175,79 +173,46 @@ _WHITE = int(_CORRELATIONS.abs().argmin())
 _ERRORS = torch.cat([torch.zeros(1), torch.logspace(-4, 2, 25)])  # of the model, as shares of the innovation
 
 
-Layout = tuple[tuple[int, int], ...]
-"""Segments of a spectrum: number of samples of each, and most bins."""
-
-
-def _spectrum_of_all(segments: Sequence[Tensor]) -> tuple[Tensor, Layout, int]:
-    """Power of several segments side by side, its layout, and the number of neighbours averaged in each bin.
+def _spectrum(segments: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Sum of the tapered periodograms of segments (S,) in each bin above the corner frequency, and number of summands,
+    (BINS,) both.
 
     Segments that are too short are left out.
     """
-    if len(segments) == 1:
-        power, width = _fast_spectrum(segments[0], MOST_BINS)
-        return power, ((len(segments[0]), MOST_BINS),), width
-    usable = [x for x in segments if len(x) >= LEAST_SAMPLES] or [max(segments, key=len)]
-    return torch.cat([_fast_spectrum(x, len(x))[0] for x in usable]), tuple((len(x), len(x)) for x in usable), 1
+    total = segments[0].new_zeros(2, BINS)
+    for x in [x for x in segments if len(x) >= LEAST_SAMPLES] or [max(segments, key=len)]:
+        taper = torch.hann_window(len(x), periodic=False, dtype=x.dtype)
+        power = torch.fft.rfft((x - x.mean()) * taper).abs() ** 2 / (taper**2).sum()
+        position = (torch.arange(len(power), dtype=x.dtype) / len(x) - _CORNER) / (0.5 - _CORNER) * BINS
+        fast = position > 0.0
+        bins = position[fast].to(torch.int64).clamp(max=BINS - 1)
+        total.index_add_(1, bins, torch.stack([power[fast], torch.ones_like(power[fast])]))
+    return total[0], total[1]
 
 
-def _fast_spectrum(x: Tensor, bins: int) -> tuple[Tensor, int]:
-    """Tapered periodogram of x (S,) above the corner frequency, averaged in bins."""
-    taper = torch.hann_window(len(x), periodic=False, dtype=x.dtype)
-    power = torch.fft.rfft((x - x.mean()) * taper).abs() ** 2 / (taper**2).sum()
-    return _binned(power, len(x), bins)
-
-
-def _binned(each: Tensor, count: int, bins: int) -> tuple[Tensor, int]:
-    """Means of neighbouring values at the frequencies above the corner, and how many make a mean."""
-    fast = torch.arange(len(each), dtype=each.dtype) / count > 1.0 / FAST_PERIOD
-    width = -(-int(fast.sum()) // bins)
-    return each[fast][: int(fast.sum()) // width * width].reshape(-1, width).mean(dim=1), width
-
-
-def _cosine(count: int, bins: int) -> Tensor:
-    """Cosine of the frequency of each bin."""
-    frequency = torch.arange(count // 2 + 1, dtype=torch.float64) / count
-    return torch.cos(2 * math.pi * _binned(frequency, count, bins)[0])
-
-
-@dataclass(frozen=True)
-class _Shapes:
-    """Spectra with unit innovation at some frequencies (F,), for each correlation and model error.
-
-    inverse: (correlations, errors, F). mean_log: mean logarithm, (correlations, errors).
-    """
-
-    inverse: Tensor
-    mean_log: Tensor
-
-
-@lru_cache(maxsize=CACHED)
-def _shapes(layout: Layout) -> _Shapes:
-    """Cached for the last layouts, which all channels of a recording and the next estimate share."""
-    cosine = torch.cat([_cosine(count, bins) for count, bins in layout])
+@cache
+def _shapes() -> tuple[Tensor, Tensor]:
+    """Inverse and logarithm of the spectra with unit innovation, (correlations, errors, BINS), 40 MB each."""
+    middle = (torch.arange(BINS, dtype=torch.float64) + 0.5) / BINS
+    cosine = torch.cos(2 * math.pi * (_CORNER + (0.5 - _CORNER) * middle))
     a, error = _CORRELATIONS.to(cosine).reshape(-1, 1, 1), _ERRORS.to(cosine).reshape(-1, 1)
     lengths = _MEAN_LENGTHS.to(cosine).reshape(-1, 1, 1)
     remainder = torch.where(lengths > 0, a**lengths, 0.0)
-    numerator = (
-        1.0 - 2.0 * remainder * torch.cos(lengths * torch.arccos(cosine.clamp(-1.0, 1.0))) + remainder * remainder
-    )
+    numerator = 1.0 - 2.0 * remainder * torch.cos(lengths * torch.arccos(cosine)) + remainder * remainder
     shape = numerator / (1.0 - 2.0 * a * cosine + a * a) + error / (2.0 - 2.0 * cosine) ** 2
-    return _Shapes(1.0 / shape, torch.log(shape).mean(dim=-1))
+    return 1.0 / shape, torch.log(shape)
 
 
-def _levels(power: Tensor, layout: Layout, width: int) -> Tensor:
-    """Innovation variance for each correlation and model error, (correlations, errors)."""
-    return (_shapes(layout).inverse @ power) / len(power)
-
-
-def _likelihood(power: Tensor, layout: Layout, width: int, levels: Tensor) -> Tensor:
-    """Twice the negative log-likelihood for each correlation and model error.
+def _fitted(power: Tensor, counts: Tensor) -> tuple[Tensor, Tensor]:
+    """Innovation variance, and twice the negative log-likelihood with it, for each correlation and model error:
+    (C, correlations, errors) both. power, counts (C, BINS): spectra of the channels.
 
     The Hann window correlates neighbouring frequencies, so that N of them count as N / 1.94 independent ones.
     """
-    level = torch.log(torch.clamp(levels, min=torch.finfo(power.dtype).tiny))
-    return 2.0 * (level + _shapes(layout).mean_log) * len(power) * width / 1.94
+    (inverse, logarithm), total = _shapes(), counts.sum(dim=1)
+    level, mean_log = (table @ x.T / total for table, x in ((inverse, power), (logarithm, counts)))
+    cost = 2.0 * (torch.log(level.clamp(min=torch.finfo(level.dtype).tiny)) + mean_log) * total / 1.94
+    return level.movedim(-1, 0), cost.movedim(-1, 0)
 
 
 def _cost_of_error(count: int) -> Tensor:

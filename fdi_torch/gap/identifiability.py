@@ -132,17 +132,17 @@ def simulated_confusions(pairs: Pairs, named: CauseName, gap: float, plant: Plan
     rivals = [i for i, o in enumerate(pairs.options) if kinds[i] != named_kind and _possible(o, pairs.gram[i, i], gap)]
     if not rivals:
         return None
-    scores = _scores(pairs.gram, rivals, gap)  # (R, D, M)
-    strength = torch.diagonal(pairs.gram)
-    gains = torch.where((scores > 0) & (strength > VISIBLE), scores**2 / strength.clamp(min=VISIBLE), 0.0)
+    noise, strength = _score_noise(pairs.gram), torch.diagonal(pairs.gram)
     is_named = torch.tensor([kind == named_kind for kind in kinds])
     confused, passed = 0, dict.fromkeys((kinds[i] for i in rivals), 0)
-    for row, i in enumerate(rivals):
+    for i in rivals:
+        scores = torch.sqrt(gap / strength[i]) * pairs.gram[i] + noise
+        gains = torch.where((scores > 0) & (strength > VISIBLE), scores**2 / strength.clamp(min=VISIBLE), 0.0)
         is_true = torch.tensor([kind == kinds[i] for kind in kinds])
-        best, others = gains[row][:, is_named].amax(1), gains[row][:, ~is_named & ~is_true]
-        confused += int((gains[row].amax(1) <= best).sum())
+        best, others = gains[:, is_named].amax(1), gains[:, ~is_named & ~is_true]
+        confused += int((gains.amax(1) <= best).sum())
         wins = best >= others.amax(1) if others.shape[1] else torch.ones_like(best, dtype=torch.bool)
-        passed[kinds[i]] += int((wins & (best > (1.0 - PASSES) * gains[row][:, is_true].amax(1))).sum())
+        passed[kinds[i]] += int((wins & (best > (1.0 - PASSES) * gains[:, is_true].amax(1))).sum())
     worst = sorted((c for c in passed if passed[c]), key=lambda c: -passed[c])[:5]
     return {
         "draws": DRAWS * len(rivals),
@@ -162,11 +162,9 @@ def _possible(option: Option, strength: Tensor, gap: float) -> bool:
     return size.low <= needed <= size.high
 
 
-def _scores(gram: Tensor, rivals: Sequence[int], gap: float) -> Tensor:
-    """Scores (R, D, M) of all options for each rival at the size of the gap, with noise."""
+def _score_noise(gram: Tensor) -> Tensor:
+    """What the noise of the readings adds to the scores of all options, (DRAWS, M)."""
     generator = torch.Generator().manual_seed(SEED)
     spectrum, basis = torch.linalg.eigh(gram)
     root = basis * torch.sqrt(spectrum.clamp(min=0.0))
-    noise = torch.randn(DRAWS, len(gram), generator=generator, dtype=gram.dtype) @ root.T
-    sizes = torch.sqrt(gap / torch.diagonal(gram)[list(rivals)])
-    return (sizes.unsqueeze(1) * gram[list(rivals)]).unsqueeze(1) + noise
+    return torch.randn(DRAWS, len(gram), generator=generator, dtype=gram.dtype) @ root.T

@@ -90,8 +90,14 @@ def estimate_initial_state(segment: DataSet, starts: Sequence[Mapping[str, float
 
 
 def _negative_log_evidence(fitter: Fitter, fit: Fit) -> float:
-    """Twice the negative log evidence, without terms that all fits of the segment share."""
-    value = fit.cost + float(torch.logdet(fitter.curvature(fit)))
+    """Twice the negative log evidence, without terms that all fits of the segment share.
+
+    A parameter without a tolerance has the information of a uniform prior over its range, 12 / width^2, since the
+    readings may not show it, such as the level of a tank below all sensors.
+    """
+    low, high, scale = fitter.box(fit.space)
+    uniform = torch.where(torch.isinf(fit.space.std(fit.theta)), 12.0 * (scale / (high - low)) ** 2, 0.0)
+    value = fit.cost + float(torch.logdet(fitter.curvature(fit) + torch.diag(uniform)))
     return value if math.isfinite(value) else math.inf
 
 
