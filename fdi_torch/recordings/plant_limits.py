@@ -23,7 +23,7 @@ from fdi_torch.sample_noise import sample_noise
 @dataclass(frozen=True)
 class ChannelFinding:
     """kind: read, clock, gap, constant, constant input, clipped, frozen, quantised, held, range, rim, unit, missing,
-    on change, undersampled, unknown, stuck or slip. values: the numbers stated in `text`, by name, SI.
+    empty, few, on change, undersampled, unknown, stuck or slip. values: the numbers stated in `text`, by name, SI.
     """
 
     kind: str
