@@ -166,9 +166,9 @@ def test_check_speaks_in_the_units_of_the_columns_and_of_too_few_readings(
     (tmp_path / "run.csv").write_text("t_s,Q1_l/min,Q2_l/min,h1_mm,h2_mm,h3_mm\n" + "\n".join(rows))
     cli.main(["check", "--plant", "three_tank", "--recording", str(tmp_path / "run.csv"), "--quiet"])
     said = capsys.readouterr().out
-    assert "Q1: asks for up to 51 l/min of Q1, which delivers 5.4 l/min at most" in said
+    assert "Q1: up to 51 l/min, 9.44 times Q1's maximum of 5.4 l/min; if its unit is cm^3/s, write" in said
     assert "- h1, h2, h3: 20 readings: fdi gap and fdi refit expect at least 60" in said
-    assert "record longer or more often; fdi gap" in said
+    assert "record longer or more often; until then fdi gap and fdi refit refuse the recording" in said
 
 
 def test_a_misspelt_list_of_recordings_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

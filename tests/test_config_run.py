@@ -314,7 +314,7 @@ def test_columns_by_mapping_constants_and_missing_sensors(tmp_path: Path) -> Non
         ({"start_levels": {"T9": "free"}}, "rig.csv: start_levels.T9: expected a tank .* got 'T9'"),
         (
             {"start": "5 s", "stop": "6 s"},
-            "a segment with all inputs known, got none: unknown are Q2 at 0.5 of",
+            "a segment with all inputs known, got none: unknown are Q2 at 1 of 2 samples;",
         ),
         ({"file": "rigg.csv"}, "rigg.csv: file not found .* the nearest is 'rig.csv'"),
     ],

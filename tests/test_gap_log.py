@@ -150,6 +150,34 @@ def test_the_command_prints_the_verdict_and_writes_all_files(
     assert found.tolerances == nominal_plant().tolerances | refitted_later
 
 
+@pytest.mark.parametrize("stopped_at", ["which effects, so far", "noise"])
+def test_an_interrupted_diagnosis_says_what_was_computed(tmp_path: Path, stopped_at: str) -> None:
+    def stop(share: float | None, text: str) -> None:
+        if text.startswith(stopped_at) or share == 0.0:
+            raise KeyboardInterrupt
+
+    path, recording = tmp_path / "gap.mcap", recorded(GAIN, 3, samples=400)
+    with pytest.raises(KeyboardInterrupt) as interruption:
+        run_gap(path, nominal_plant(), recording, (), Settings(LIBRARY), stop)
+    note = interruption.value.__notes__[0]
+    likeliest = ", the likeliest so far was pump gain at Q2" if "so far" in stopped_at else ""
+    assert note == f"no answer was computed{likeliest}; recordings and progress messages are in {path}"
+
+
+def test_the_files_of_a_second_diagnosis_are_named_after_its_log(tmp_path: Path) -> None:
+    file = str(write_csv(recorded({"Q1.pump_lag.time_constant": 4.0}, 9, samples=400, std=2e-3), tmp_path / "run.csv"))
+    words = ["gap", "--plant", "three_tank", "--recording", file, "--quiet", "--out", str(tmp_path / "out")]
+    for library in ("pump_lag,pump_delay", "pump_lag", "pump_lag,pump_delay"):
+        assert cli.main([*words, "--library", library]) == cli.DONE
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    logs = {f"{name}.{ending}" for name in ("gap", "gap_2", "gap_3") for ending in ("mcap", "json")}
+    assert written == logs | {"next_input.csv", "next_input_3.csv"}
+    for name in ("gap", "gap_2", "gap_3"):
+        (verdict,) = read_run(tmp_path / "out" / f"{name}.mcap").messages(["/gap/verdict"])
+        answer = json.loads((tmp_path / "out" / f"{name}.json").read_text())
+        assert answer["verdict"] == verdict.payload["verdict"] == ("named" if name == "gap_2" else "ambiguous")
+
+
 def test_an_ambiguous_answer_writes_the_next_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording = recorded({"Q1.pump_lag.time_constant": 4.0}, 9, samples=400, std=2e-3)
     file = str(write_csv(recording, tmp_path / "run.csv"))

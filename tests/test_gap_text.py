@@ -162,6 +162,18 @@ def test_an_explanation_whose_fit_has_not_converged_says_so() -> None:
     assert not any("two explanations" in step for step in next_steps(answer, True, None, None, None))
 
 
+def test_every_verdict_on_causes_says_that_their_fit_has_not_converged() -> None:
+    """Also that with something unknown; without causes, a better fit would change nothing."""
+    warning = "Its fit has not converged, so that its sizes and its probability may be wrong."
+    posterior = [ProbableExplanation((("leak", "T1"), ODD), 0.97)]
+    unknown = replace(BOTH, ambiguity_set=[posterior[0].causes], posterior=posterior)
+    assert unknown.verdict == "unknown" and "converged" not in verdict_sentence(unknown.to_dict())
+    for answer in (unknown, replace(BOTH, verdict="named"), replace(BOTH, verdict="ambiguous")):
+        sentence = verdict_sentence(replace(answer, converged=False).to_dict())
+        assert sentence.count(warning) == 1 and "Present with" not in sentence
+    assert warning not in verdict_sentence(replace(BOTH, verdict="no_gap", converged=False).to_dict())
+
+
 def test_where_the_plant_as_it_is_remains_plausible_there_may_be_a_gap() -> None:
     posterior = [ProbableExplanation((), 0.88), ProbableExplanation((("unknown", "T1"),), 0.11)]
     answer = replace(BOTH, verdict="ambiguous", ambiguity_set=[(), (("unknown", "T1"),)], posterior=posterior)

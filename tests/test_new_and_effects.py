@@ -401,7 +401,7 @@ def test_a_plant_from_the_columns_of_a_recording_reads_that_recording(
     run = load_run("run.yaml").config
     assert run.recordings[0].file == "trend.csv" and run.estimate is not None
     assert run.estimate.parameters[0].name == "*.leak"
-    said = "then check again; record longer or more often; fdi gap --plant rig.yaml --recording trend.csv says"
+    said = "then check again; record longer or more often; until then fdi gap and fdi refit refuse the recording"
     assert said in capsys.readouterr().out
     Path("german.csv").write_text(
         "Datum/Uhrzeit;Zulauf [l/h];Füllstand B1 [%]\n29.3.2026 08:30:00;3000;40,5\n29.3.2026 08:31:00;3000;41\n"

@@ -20,7 +20,7 @@ from fdi_torch.gap.preprocess.acquisition import CheckedRecording
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import display_in
 from fdi_torch.recordings.check import data_warnings
-from fdi_torch.recordings.plant_units import doubtful_units, wrong_units
+from fdi_torch.recordings.plant_units import doubtful_units, excessive_flows, wrong_units
 from fdi_torch.recordings.volume_balance import balance_along
 
 PLANT = """
@@ -61,7 +61,7 @@ def rows(run: fdi_torch.Recording) -> str:
     return "".join(f"{t},{6e4 * q},{1e3 * a},{1e3 * b}\n" for t, q, a, b in each)
 
 
-@pytest.mark.parametrize(
+each_command = pytest.mark.parametrize(
     "command",
     [
         ["gap", "--plant", "rig.yaml", "--recording", "run.csv"],
@@ -71,6 +71,46 @@ def rows(run: fdi_torch.Recording) -> str:
     ],
     ids=lambda words: words[0],
 )
+
+
+@each_command
+def test_every_command_refuses_many_times_what_a_pump_delivers(
+    folder: Path, command: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = folder / "run.csv"
+    recording.write_text(recording.read_text().replace("Q_l/min", "Q_L/s"))
+    assert main([*command, "--quiet"]) == MISUSE
+    assert (
+        "Q: up to 4.5 L/s, 45 times Q's maximum of 0.1 L/s; if its unit is L/min, write columns: {Q: {unit: L/min}}; "
+        "otherwise correct max_flow of Q; if the recording is right"
+    ) in capsys.readouterr().err
+
+
+def test_the_unit_that_the_refusal_of_a_flow_names_is_right(folder: Path) -> None:
+    recording = folder / "run.csv"
+    recording.write_text(recording.read_text().replace("Q_l/min", "Q_L/s"))
+    plant, entry = load_plant(folder / "rig.yaml"), {"file": str(recording)}
+    assert excessive_flows(plant, fdi_torch.read_recording(entry, plant))
+    right = fdi_torch.read_recording({**entry, "columns": {"Q": {"unit": "L/min"}}}, plant)
+    assert float(right.inputs.max()) == pytest.approx(4.5e-3 / 60.0) and not excessive_flows(plant, right)
+    single = right.inputs.clone()
+    single[3] = 1.0
+    assert not excessive_flows(plant, replace(right, inputs=single)), "one bad value is no wrong unit"
+    assert not excessive_flows(plant, replace(right, inputs=5.0 * right.inputs)), "as a controller may ask"
+
+
+def test_gap_refuses_one_level_in_a_wrong_unit_that_lies_above_the_rim(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Readings above a rim are accepted, but not where the volume balance names the unit that explains them."""
+    recording = folder / "run.csv"
+    recording.write_text(recording.read_text().replace("hB_mm", "hB_cm"))
+    assert main(["gap", "--plant", "rig.yaml", "--recording", "run.csv", "--quiet"]) == MISUSE
+    sentence = "the level hB is 10 times too large (write mm in place of cm), unless hB does not follow the level"
+    assert f"{sentence}; if the recording is right" in capsys.readouterr().err
+
+
+@each_command
 def test_every_command_refuses_areas_in_the_wrong_unit_with_one_sentence(
     folder: Path, command: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -99,10 +99,25 @@ def test_too_few_readings_for_a_diagnosis_are_said_before_it(
 ) -> None:
     for samples in (59, 60):
         path = write_csv(healthy(samples), tmp_path / f"{samples}.csv")
-        cli.main(["check", "--plant", "three_tank", "--recording", str(path)])
+        assert cli.main(["check", "--plant", "three_tank", "--recording", str(path)]) == cli.DONE, "train accepts it"
         said = capsys.readouterr().out
         few = "- h1, h2, h3: 59 readings: fdi gap and fdi refit expect at least 60, of all recordings together"
         assert (few in said) is (samples == 59)
+        assert ("until then fdi gap and fdi refit refuse the recording" in said) is (samples == 59)
+    cli.main(["check", "--plant", "three_tank", "--recording", str(write_csv(healthy(10), tmp_path / "10.csv"))])
+    assert "; units, swapped channels and clocks are examined from 20 samples on" in capsys.readouterr().out
+
+
+def test_a_sensor_without_any_reading_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_csv(with_h1(torch.full((400,), torch.nan)), tmp_path / "run.csv")
+    assert cli.main(["check", "--plant", "three_tank", "--recording", str(path)]) == cli.NOT_EXPLAINED
+    said = capsys.readouterr().out
+    assert "- h1: no reading in 400 samples: wrong column, or leave sensor h1 out of the plant file" in said
+    assert "record longer" not in said and "are missing" not in said
+    runs = tmp_path / "runs.yaml"
+    runs.write_text("recordings: [{file: run.csv, columns: {h1: {recorded: false}}}]")
+    assert cli.main(["check", "--plant", "three_tank", "--recording", str(runs)]) == cli.NOT_EXPLAINED
+    assert "- h1: 0 readings: fdi gap and fdi refit expect at least 60" in capsys.readouterr().out
 
 
 def test_nothing_is_found_in_a_healthy_recording() -> None:

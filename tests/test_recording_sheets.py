@@ -223,8 +223,20 @@ def test_empty_cells_of_inputs_without_held_are_told_once_with_the_fix(plant: Pl
     assert "unknown at 20 of 40 samples, in 20 stretches" in found.text
     assert "columns: {Q: {held: 6 s}}" in found.text
     with pytest.raises(
-        ConfigError, match=r"unknown are Q at 0.5 of the samples; .* columns: \{Q: \{held: 10 s\}\}, or held: always"
+        ConfigError, match=r"unknown are Q at 20 of 40 samples; .* columns: \{Q: \{held: 10 s\}\}, or held: always"
     ):
+        load_recordings([RecordingConfig(file="run.csv")], plant, tmp_path)
+
+
+def test_an_empty_input_is_told_with_its_own_name_and_unit(plant: PlantDescription, tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text("t_s,Q_l_min,V_pct,h_mm\n" + "".join(f"{k},,50,{k}\n" for k in range(40)))
+    fix = r"give it a constant, as in columns: \{Q: \{constant: 0 l/min\}\}$"
+    with pytest.raises(ConfigError, match=rf"unknown are Q at 40 of 40 samples; {fix}"):
+        load_recordings([RecordingConfig(file="run.csv")], plant, tmp_path)
+    mended = RecordingConfig(file="run.csv", columns={"Q": {"constant": "0 l/min"}})
+    assert load_recordings([mended], plant, tmp_path)
+    (tmp_path / "run.csv").write_text("t_s,Q_l_min,V_pct,h_mm\n" + "".join(f"{k},60,,{k}\n" for k in range(40)))
+    with pytest.raises(ConfigError, match=r"columns: \{V: \{constant: 0 %\}\}$"):
         load_recordings([RecordingConfig(file="run.csv")], plant, tmp_path)
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from fdi_torch.recording import Recording
     from fdi_torch.recordings.check import RecordingCheck
 
-WRONG = ("range", "slip", "unit")  # findings that no diagnosis accepts or survives
+WRONG = ("empty", "range", "slip", "unit")  # findings that no diagnosis accepts or survives
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -56,12 +56,14 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
         if spans := usable_spans(recording, config, plant):
             screen.say(f"usable with all inputs known: {spans}")
     wrong = bool(guesses) or any(f.kind in WRONG for check in checks for f in check.findings)
+    few = arguments.config is None and len(checks) == 1 and any(f.kind == "few" for f in checks[0].findings)
     if checks and arguments.config is None:
         named = f"--plant {arguments.plant} --recording {arguments.recording or arguments.file}"
-        few = len(checks) == 1 and any(finding.kind == "few" for finding in checks[0].findings)
         first = "correct the plant file or the columns, then check again; " if wrong else ""
-        first += "record longer or more often; " if few else ""
-        screen.say(f"next: {first}fdi gap {named} says whether the plant file explains it")
+        then = f"fdi gap {named} says whether the plant file explains it"
+        if few:
+            then = "record longer or more often; until then fdi gap and fdi refit refuse the recording"
+        screen.say(f"next: {first}{then}")
     screen.result({"format": "fdi_torch.check/1", "plant": plant, "recordings": checks, "placeholders": guesses})
     return NOT_EXPLAINED if wrong else DONE
 

@@ -52,8 +52,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     settings = Settings(library, arguments.leave_out, arguments.step, arguments.most, arguments.named_only)
     expect_adoptable(arguments.adopt, arguments.replace)
     arguments.with_constants |= arguments.narrow
-    folder = Path(arguments.out)
-    log = free_path(folder, "gap")
+    log = free_path(Path(arguments.out), "gap")
     with screen.progress("gap") as advance:
 
         def next_stage(share: float | None, text: str) -> None:
@@ -65,7 +64,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     diff, refused = _adopt(arguments, plant, recordings, answer, screen)
     if refused:
         screen.complain(f"fdi gap: {refused}")
-    planned = _written(plant, answer, folder)
+    planned = _written(plant, answer, log)
     adopted_file = arguments.adopt if diff else None
     rim_denied = bool(denied_by(plant, recordings))
     steps = next_steps(answer, bool(holdouts), library, planned, adopted_file, rim_denied, refused)
@@ -121,12 +120,16 @@ def _errors(answer: Answer) -> dict[str, float]:
     return causes | {name: float(constant["std"]) for name, constant in answer.constants.items()}
 
 
-def _written(plant: PlantDescription, answer: Answer, folder: Path) -> Path | None:
-    """Write gap.json and, if several explanations are plausible, next_input.csv, whose path is returned."""
-    write_text(folder / "gap.json", json.dumps(answer.to_dict(), indent=1) + "\n")
+def _written(plant: PlantDescription, answer: Answer, log: Path) -> Path | None:
+    """Write gap.json and, if several explanations are plausible, next_input.csv, whose path is returned.
+
+    Beside gap_2.mcap they are gap_2.json and next_input_2.csv, so that no file belongs to another run's log.
+    """
+    write_text(log.with_suffix(".json"), json.dumps(answer.to_dict(), indent=1) + "\n")
     if not answer.next_input:
         return None
-    return write_csv(planned_recording(answer.next_input["input"], plant), folder / "next_input.csv")
+    path = log.with_name(f"{log.stem.replace('gap', 'next_input', 1)}.csv")
+    return write_csv(planned_recording(answer.next_input["input"], plant), path)
 
 
 def _error(plant: PlantDescription, recordings: Sequence[Recording]) -> float:

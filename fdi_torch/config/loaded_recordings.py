@@ -34,14 +34,12 @@ from fdi_torch.config.yaml_files import YAML_ENDINGS, expect_kind, find_data, fi
 from fdi_torch.logbook import LogError
 from fdi_torch.names import nearest, unknown
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.quantities import display_in, displayed_units
+from fdi_torch.quantities import display_in, displayed_units, quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_files import read_csv_files
 from fdi_torch.recordings.database import is_query, write_query
 from fdi_torch.recordings.mcap_files import read_mcap
 from fdi_torch.recordings.source import ChannelSource, FileSource, TagRows
-
-GIVE_A_CONSTANT = "give the unknown one a constant, as in columns: {Q1: {constant: 0 cm^3/s}}"
 
 
 @dataclass(frozen=True)
@@ -85,16 +83,20 @@ def known_segments_of(whole: Recording, config: RecordingConfig, plant: PlantDes
 
 
 def _unknown(whole: Recording) -> str:
-    """The shares of unknown values of the inputs, and advice."""
-    shares = torch.isnan(whole.inputs).double().mean(dim=0).tolist()
-    unknown_shares = {name: share for name, share in zip(whole.input_names, shares, strict=True) if share > 0.0}
-    listing = ", ".join(f"{name} at {share:.3g} of the samples" for name, share in unknown_shares.items())
-    partly_known = next((name for name, share in unknown_shares.items() if share < 1.0), "")
+    """How many values of each input are unknown, and advice."""
+    counts = torch.isnan(whole.inputs).sum(dim=0).tolist()
+    units = dict(zip(whole.input_names, whole.input_units, strict=True))
+    unknown_counts = {name: count for name, count in zip(whole.input_names, counts, strict=True) if count}
+    listing = ", ".join(f"{name} at {count} of {len(whole)} samples" for name, count in unknown_counts.items())
+    partly_known = next((name for name, count in unknown_counts.items() if count < len(whole)), "")
+    never_known = next((name for name in unknown_counts if unknown_counts[name] == len(whole)), partly_known)
+    zero = quantity_text(0.0, units[never_known], name=never_known)
     fix = (
         f"if an input keeps its value over empty cells, give the time: columns: {{{partly_known}: {{held: 10 s}}}}, or "
-        "held: always for one that is recorded on change"
+        "held: always for one that is recorded on change; if it was not recorded, "
     )
-    return f"unknown are {listing}; " + (f"{fix}, or {GIVE_A_CONSTANT}" if partly_known else GIVE_A_CONSTANT)
+    constant = f"give it a constant, as in columns: {{{never_known}: {{constant: {zero}}}}}"
+    return f"unknown are {listing}; " + (fix if partly_known else "") + constant
 
 
 def named_recordings(name: str, plant: PlantDescription, base: Path) -> list[Recording]:

@@ -9,6 +9,9 @@ from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.verdict_words import explanation_words
 from fdi_torch.progress import Tell, silent
 
+SO_FAR = ", so far "
+"""What separates a stage from the likeliest causes so far in a progress message."""
+
 
 @dataclass
 class StageProgress:
@@ -40,7 +43,7 @@ class StageProgress:
     def so_far(self, causes: Collection[CauseName]) -> None:
         """Tell the likeliest causes so far."""
         named = [{"effect": effect, "location": place} for effect, place in sorted(causes)]
-        self._words = f", so far {explanation_words(named)}"
+        self._words = f"{SO_FAR}{explanation_words(named)}"
         self._tell()
 
     def _tell(self) -> None:

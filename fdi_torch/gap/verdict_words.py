@@ -71,7 +71,12 @@ def verdict_sentence(answer: Named, best: str = "") -> str:
 
     best: the likeliest explanation in words, for example with sizes; by default without.
     """
-    sentences = holdout_warning(answer), _verdict(answer, best), rounding_words(answer.get("causes") or [])
+    sentences = (
+        holdout_warning(answer),
+        _verdict(answer, best),
+        convergence_warning(answer),
+        rounding_words(answer.get("causes") or []),
+    )
     return " ".join(filter(None, sentences))
 
 
@@ -87,6 +92,16 @@ def holdout_warning(answer: Named) -> str:
     closed = closure.get("closed")
     fails = isinstance(closed, int | float) and closed < 0.0
     return "These causes do not close the gap of the hold-out." if fails else ""
+
+
+def convergence_warning(answer: Named) -> str:
+    """A sentence if the fit of the likeliest causes has not converged; empty otherwise.
+
+    Without causes it says nothing: a better fit would explain the recording even better.
+    """
+    if answer.get("converged") is not False or answer.get("verdict") == "no_gap":
+        return ""
+    return "Its fit has not converged, so that its sizes and its probability may be wrong."
 
 
 def closed_sentence(closure: Named) -> str:
@@ -118,13 +133,12 @@ def _verdict(answer: Named, best: str) -> str:
     if verdict == "named":
         return f"The gap comes from {best}{chance}."
     explanations, certain = answer.get("ambiguity_set") or [], apart_from_rounding(answer.get("certain") or [])
+    certain = [] if convergence_warning(answer) else certain
     count, surely = len(explanations), f" Present with at least 95 %: {explanation_words(certain)}." if certain else ""
     if verdict == "ambiguous":
         whether = "is" if all(map(apart_from_rounding, explanations)) else "may be"
         plausible = f"{count} explanations are plausible at 95 %, " if count > 1 else ""
-        rest = "" if count > 1 else _unfitted(answer)
-        if answer.get("converged") is False:
-            rest, surely = " Its fit has not converged, so that its sizes and its probability may be wrong.", ""
+        rest = "" if count > 1 or convergence_warning(answer) else _unfitted(answer)
         return f"There {whether} a gap; {plausible}the likeliest is {best}{chance}.{rest}{surely}"
     if verdict != "unknown":
         return ""

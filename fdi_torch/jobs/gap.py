@@ -15,13 +15,17 @@ from fdi_torch.config.plant_writer import dump_plant, plant_mapping
 from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.diagnose import solve_problem
 from fdi_torch.gap.problem import PLAIN, Settings, problem_of
+from fdi_torch.gap.stage_progress import SO_FAR
 from fdi_torch.jobs.log_paths import STARTS_OVER
 from fdi_torch.jobs.logged_recordings import log_prediction, log_recording
-from fdi_torch.logbook import RunLog
+from fdi_torch.logbook import KEPT, RunLog
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.progress import Tell, silent
 from fdi_torch.recording import Recording
+
+NO_ANSWER = "no answer was computed{}; recordings and progress messages are"
+"""What is said of an interrupted diagnosis, before the name of its log."""
 
 
 def run_gap(
@@ -55,18 +59,21 @@ def run_gap(
             log_recording(log, each, group)
         log.flush()
 
-        said = ""
+        said, log.kept = "", NO_ANSWER.format("")
 
         def say(share: float | None, text: str) -> None:
             nonlocal said
             if text != said:
                 log.say(text)
+            if likeliest := text.partition(SO_FAR)[2]:
+                log.kept = NO_ANSWER.format(f", the likeliest so far was {likeliest}")
             said = text
             tell(share, text)
 
         with one_thread():
             answer = solve_problem(case, say)
         log_answer(log, answer.to_dict(), answer.arrays)
+        log.kept = KEPT
         for group, each in zip(groups(len(holdouts), len(recordings)), every, strict=True):
             predicted = answer.arrays.get(f"{group}_augmented" if group else "augmented")
             if predicted is not None and predicted.shape == each.outputs.shape:

@@ -6,9 +6,11 @@ from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from fdi_torch.config.loaded_recordings import known_segments_of, read_recording
 from fdi_torch.config.recording_config import RecordingConfig
-from fdi_torch.gap.preprocess.acquisition import examined
+from fdi_torch.gap.preprocess.acquisition import FEWEST, examined
 from fdi_torch.gap.problem import LEAST
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -31,17 +33,33 @@ def checked(config: RecordingConfig, plant: PlantDescription, base: Path) -> tup
         for e in examinations
         for s in e.stuck
     ]
-    few = {n: k for n, k in zip(whole.output_names, whole.mask.sum(dim=0).tolist(), strict=True) if k < LEAST}
+    empty = [s for s in plant.sensors if _is_empty(whole, s.column, config)]
+    for sensor in empty:
+        text = f"no reading in {len(whole)} samples: wrong column, or leave sensor {sensor.name} out of the plant file"
+        problems.insert(0, ChannelFinding("empty", sensor.column, text, {"samples": len(whole)}))
+    silent = {sensor.column for sensor in empty}
+    counts = zip(whole.output_names, whole.mask.sum(dim=0).tolist(), strict=True)
+    few = {name: count for name, count in counts if count < LEAST and name not in silent}
     if few:
         text = (
             f"{min(few.values())} readings: fdi gap and fdi refit expect at least {LEAST}, of all recordings together"
         )
+        if len(whole) < FEWEST:
+            text += f"; units, swapped channels and clocks are examined from {FEWEST} samples on"
         problems.append(ChannelFinding("few", ", ".join(few), text, {"count": min(few.values())}))
     refused = {channel for e in examinations if e.fault for channel in e.fault.channels}
     doubts = [f for f in check.findings if not (f.kind in ("undersampled", "unit") and f.channel in refused)]
+    doubts = [f for f in doubts if not (f.kind == "missing" and f.channel in silent)]
     beyond = [f for f in doubts if f.kind in ("range", "unit")]
     problems = [p for p in problems if not any(f.text in p.text for f in beyond)]
     return whole, replace(check, findings=(*beyond, *problems, *(f for f in doubts if f not in beyond)))
+
+
+def _is_empty(whole: Recording, column: str, config: RecordingConfig) -> bool:
+    """Whether an output has a column without a single reading, and is not said to be unrecorded."""
+    if column not in whole.output_names or (column in config.columns and not config.columns[column].recorded):
+        return False
+    return not bool(torch.isfinite(whole.outputs[:, whole.output_names.index(column)]).any())
 
 
 def thorough_findings(plant: PlantDescription, recordings: Iterable[Recording]) -> tuple[str, ...]:

@@ -14,4 +14,4 @@ from fdi_torch.logbook.reader import Message, Run, read_run
 from fdi_torch.logbook.recover import Recovery, last_state, recover, set_aside, unfinished
 from fdi_torch.logbook.replay import Replay, replay
 from fdi_torch.logbook.signals import Signals, arrays, mapped_signals, number_at, own_signals, series
-from fdi_torch.logbook.writer import Listener, RunLog
+from fdi_torch.logbook.writer import KEPT, Listener, RunLog

@@ -33,6 +33,8 @@ from fdi_torch.logbook.topics import Topics
 
 Listener = Callable[[Channel, int, bytes], None]
 """Called with each logged message: its channel, its log time in ns and its payload."""
+KEPT = "what was computed until now is"
+"""What an interrupted run says of its log's content, before `in` and the log's path."""
 
 
 class RunLog(Topics):
@@ -42,7 +44,8 @@ class RunLog(Topics):
     given; config: the same, resolved, as plain nested values. seeds: name -> seed. data: one mapping per input file,
     with its "path" and "sha256". env, git: determined if not given. clock: wall time, ns. listener: called with every
     logged message. after_interruption: how to continue after Ctrl-C or SIGTERM, as a clause; it is added to the
-    exception as a note, after the path of the log. Raises LogError if the file cannot be written.
+    exception as a note, after one of what the log contains (`kept`) and its path. Raises LogError if the file cannot be
+    written.
     """
 
     def __init__(
@@ -66,6 +69,7 @@ class RunLog(Topics):
         self.path = Path(path)
         self.partial_path = self.path.with_name(self.path.name + ".partial")
         self.status, self.reason = "completed", ""
+        self.kept = KEPT
         self._clock, self._flush_seconds, self._listener = clock, flush_seconds, listener
         self._after_interruption = after_interruption
         self._start_records = {
@@ -112,7 +116,7 @@ class RunLog(Topics):
                     raise
             if self.status == "interrupted" and error is not None:
                 kept = self.path if self.path.exists() else self.partial_path
-                error.add_note(f"what was computed until now is in {kept}")
+                error.add_note(f"{self.kept} in {kept}")
                 if self._after_interruption:
                     error.add_note(self._after_interruption)
 

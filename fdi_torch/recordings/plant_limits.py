@@ -16,14 +16,14 @@ from fdi_torch.plant.description import PlantDescription, Sensor, Tank, with_tol
 from fdi_torch.plant.metered_flow import MeteredFlow
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
-from fdi_torch.recordings.plant_units import doubtful_units, refusal
+from fdi_torch.recordings.plant_units import EXCESSIVE, doubtful_units, refusal
 from fdi_torch.sample_noise import sample_noise
 
 
 @dataclass(frozen=True)
 class ChannelFinding:
     """kind: read, clock, gap, constant, constant input, clipped, frozen, quantised, held, range, rim, unit, missing,
-    on change, undersampled, unknown, stuck or slip. values: the numbers stated in `text`, by name, SI.
+    empty, few, on change, undersampled, unknown, stuck or slip. values: the numbers stated in `text`, by name, SI.
     """
 
     kind: str
@@ -39,7 +39,8 @@ CHANCE = 0.05
 FAR_ABOVE = 2.0
 """Height of a tank whose rim is unknown, in highest levels that were read in it."""
 SMALL_SHARE = 0.01
-"""The unit is suspect if all values are below this share of the limit, or any is above ten times the limit."""
+"""The unit is suspect if all values are below this share of the limit, if a level is above ten times the limit, or a
+command above EXCESSIVE times."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +185,7 @@ def _pump_findings(pump: MeteredFlow, command: Tensor) -> Iterator[ChannelFindin
         return
     low, high = float(flow.min()), float(flow.max())
     lowest, highest, limit = (quantity_text(each, "m^3/s", name=pump.channel) for each in (low, high, pump.max_flow))
-    if high > 10 * pump.max_flow or 0 < high < SMALL_SHARE * pump.max_flow:
+    if high > EXCESSIVE * pump.max_flow or 0 < high < SMALL_SHARE * pump.max_flow:
         text = f"its highest flow is {highest} of {limit}: is its unit right?"
         yield ChannelFinding("unit", pump.channel, text, {"high": high, "limit": pump.max_flow})
     elif high > (1 + 1e-6) * pump.max_flow:

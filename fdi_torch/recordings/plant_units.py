@@ -10,7 +10,8 @@ An unusual plant is not mistaken for a wrong unit: a leak or a plugged pipe chan
 factor, but rarely by one that is close to the ratio of two units. The unit of one sensor alone, and a misplaced decimal
 point in the area of its tank, are doubts only (`doubtful_units`), because a sensor that follows the level badly looks
 the same: whether its recording is refused is left to `gap.preprocess.recording_faults`, where effects of the plant
-compete.
+compete. A command of many times its pump's maximum needs no balance: no effect of the plant changes what is asked for
+(`excessive_flows`).
 """
 
 from __future__ import annotations
@@ -42,6 +43,11 @@ PRIOR = 0.01
 """Probability that a unit is wrong before the recording is seen, shared equally by all corrections."""
 CONFIDENCE = 0.95
 """Probability of the corrections that are named, together."""
+EXCESSIVE = math.sqrt(60.0)
+"""A command of more than this share of its pump's maximum has a wrong unit, or the maximum is wrong. A unit per second
+in place of one per minute, or per minute in place of one per hour, is a factor of 60: its square root lies, in ratio,
+as far from a right command of the whole maximum as from one in a wrong unit. Controllers that ask for more than their
+pump delivers stay below."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,37 @@ def wrong_units(plant: PlantDescription, recording: Recording) -> str:
     corrections = list(_corrections(plant, recording, as_is)) if as_is.is_metered else []
     credible = _credible(as_is, corrections, UNRELATED)
     return f"units: by the volume balance of the tanks, {_alternatives(credible)}" if credible else ""
+
+
+def excessive_flows(plant: PlantDescription, recording: Recording) -> list[tuple[str, str]]:
+    """Channels that ask for EXCESSIVE times what their pump delivers, in more than a single sample, and a sentence."""
+    excessive = []
+    for pump in plant.metered_flows():
+        if pump.channel not in recording.input_names:
+            continue
+        command = recording.inputs[:, recording.input_names.index(pump.channel)]
+        highest = pump.gain * command[torch.isfinite(command)].sort(descending=True).values[:2]
+        if len(highest) == 2 and float(highest[1]) > EXCESSIVE * pump.max_flow:
+            high, most = float(highest[0]), pump.max_flow
+            texts = [quantity_text(flow, "m^3/s", name=pump.channel) for flow in (high, most)]
+            unit = _unit_within(high / most, _written("m^3/s", pump.channel, recording))
+            named = pump.command_unit == "m^3/s" and unit
+            fix = f"if its unit is {unit}, write" if named else "if its unit is another, state it under"
+            text = (
+                f"{pump.channel}: up to {texts[0]}, {high / most:.3g} times {pump.name}'s maximum of {texts[1]}; {fix} "
+                f"columns: {{{pump.channel}: {{unit: {unit if named else '...'}}}}}; otherwise correct max_flow of "
+                f"{pump.name}"
+            )
+            excessive.append((pump.channel, text))
+    return excessive
+
+
+def _unit_within(excess: float, written: str) -> str:
+    """The usual unit of flow in which a flow of `excess` times a maximum comes closest to it from below; '' if none."""
+    shares = {unit: excess / ratio for unit, ratio in _other_units("m^3/s", written)}
+    within = {unit: share for unit, share in shares.items() if 1.0 / EXCESSIVE < share <= 1.0}
+    unit = max(within, key=lambda each: within[each], default="")
+    return unit.replace("l/", "L/") if "L" in written else unit
 
 
 def doubtful_units(plant: PlantDescription, recording: Recording) -> list[tuple[str, str]]:
@@ -119,7 +156,8 @@ def _alternatives(corrections: list[Correction]) -> str:
 
 def expect_right_units(plant: PlantDescription, recording: Recording) -> None:
     """Raises ValueError if units are wrong, unless the recording is trusted."""
-    if not recording.trusted and (wrong := wrong_units(plant, recording)):
+    excessive = "; ".join(text for _, text in excessive_flows(plant, recording))
+    if not recording.trusted and (wrong := excessive or wrong_units(plant, recording)):
         raise ValueError(refusal(recording, wrong))
 
 

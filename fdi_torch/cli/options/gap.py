@@ -41,5 +41,5 @@ ARGUMENTS = {
     **shared("--replace"),
     "--with-constants": {"action": "store_true", "help": "--adopt also writes the constants fitted with the causes"},
     **shared("--narrow", help=f"as --with-constants, {_STANDARD_ERRORS}"),
-    **shared("--out", default="logs", help="folder for log, gap.json and next_input.csv"),
+    **shared("--out", default="logs", help="folder for log, gap.json and next_input.csv (a second run: gap_2.json)"),
 }

@@ -23,7 +23,7 @@ from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.input_sampling import inputs_not_held
 from fdi_torch.recordings.plant_limits import denied_rims, with_rims_unknown
-from fdi_torch.recordings.plant_units import refusal, wrong_units
+from fdi_torch.recordings.plant_units import doubtful_units, excessive_flows, refusal, wrong_units
 from fdi_torch.recordings.repeated_readings import Scatter, scatter, stuck_runs
 
 FEWEST = 20
@@ -66,12 +66,17 @@ def examined(plant: PlantDescription, recording: Recording, thorough: bool = Fal
 
     thorough: also for a recording fault beside an effect of the plant, which takes some seconds.
     """
+    if not recording.trusted and (excessive := excessive_flows(plant, recording)):
+        channels = tuple(channel for channel, _ in excessive)
+        return CheckedRecording(recording, (), RecordingFault(channels, "; ".join(text for _, text in excessive)))
     plant = _with_recorded_sensors(plant, recording)
     if len(recording) < FEWEST or not plant.sensors:
         return CheckedRecording(recording, (), None)
     if not recording.trusted and (wrong := wrong_units(plant, recording)):
         return CheckedRecording(recording, (), RecordingFault(("units",), wrong))
     rims = [] if recording.trusted else denied_rims(plant, recording)
+    if rims and (fault := _unit_above_rim(plant, recording, {rim.sensor.column for rim in rims})):
+        return CheckedRecording(recording, (), fault)
     plant = with_rims_unknown(plant, [recording])
     stuck = _stuck(plant, recording)
     remaining, fault = without(recording, stuck), None
@@ -91,6 +96,18 @@ def examined(plant: PlantDescription, recording: Recording, thorough: bool = Fal
         columns = tuple(rim.sensor.column for rim in rims)
         fault = RecordingFault(columns, "; ".join(rim.text for rim in rims), physical=True)
     return CheckedRecording(_with_notes(remaining, stuck), tuple(stuck), fault)
+
+
+def _unit_above_rim(plant: PlantDescription, recording: Recording, columns: Collection[str]) -> RecordingFault | None:
+    """The wrong unit of a sensor that reads above its rim (one of the columns), by the volume balance.
+
+    A sensor that follows its level badly could explain the balance as well, but not readings above the rim; a wrong rim
+    in the plant file could explain those, but not the balance.
+    """
+    for names, text in doubtful_units(plant, recording):
+        if not columns.isdisjoint(channels := tuple(names.split(", "))):
+            return RecordingFault(channels, f"{names}: {text}")
+    return None
 
 
 def usable(plant: PlantDescription, recording: Recording, effects: bool = False) -> CheckedRecording:
