@@ -252,6 +252,9 @@ def test_a_cause_shows_its_size_in_whatever_order_its_parameters_were_logged() -
 def test_a_study_says_how_its_errors_compare_with_the_bound() -> None:
     material = material_of(DATA / "log_format_1_study.mcap", load_plant("three_tank"))
     assert headline(material) == "5 trials in 1 setting: errors 1.02 times the Cramér-Rao bound"
+    section = summary_section(material)
+    assert section is not None
+    assert "constants with a tolerance count as exact here; estimate.calibrate: [" in str(section.content[-1])
 
 
 def test_an_axis_by_decades_has_plain_numbers() -> None:
