@@ -17,7 +17,7 @@ from fdi_torch import cli
 from fdi_torch.config.channels import mapped
 from fdi_torch.config.estimation import parameter_values, placements_of
 from fdi_torch.config.file_templates import template
-from fdi_torch.config.loaded_recordings import listed_recordings, read_recording
+from fdi_torch.config.loaded_recordings import listed_recordings, named_recordings, read_recording
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_from_columns import plant_from_recording

@@ -33,7 +33,8 @@ def estimate_section(material: Material) -> Section | None:
     if final is None:
         return None
     names, units = [str(name) for name in final["names"]], final.get("units") or [""] * len(final["names"])
-    combinations, truth = combinations_of(material, "combinations"), {"simulated": material.truth}
+    combinations = combinations_of(material, "combinations")
+    truth = {"simulated": material.truth} if material.truth else {}
     numbers = (names, units, final["values"], final["std"])
     estimates = estimate_table("", *numbers, ends=material.run.at_bounds, combinations=combinations, exact=truth)
     deviating = () if material.unexplained else combinations_of(material, "not_isolated")
