@@ -13,6 +13,7 @@ MISSPELT = (
     0.75  # share of the letters of two names that agree (difflib's ratio), above which one is the other, misspelt
 )
 _WORDS = re.compile(r"[^\W_]+")
+_LAST = re.compile(r"(?:0*([0-9]+)|(?:^|[\W_0-9]|(?<=[a-z])(?=[A-Z]))([A-Za-z])|^[A-Z]{1,2}([A-Z]))\W*$")
 
 
 def shortened(text: str) -> str:
@@ -51,6 +52,14 @@ def _shares_words(name: str, known: str) -> bool:
     words, known_words = set(_WORDS.findall(name)), set(_WORDS.findall(known))
     begins = bool(name) and (known.startswith(name) or name.startswith(known))
     return begins or (bool(words and known_words) and (words <= known_words or known_words <= words))
+
+
+def distinguishing_end(name: str) -> str:
+    """The number or the single letter at the end of a name: 'Pump 01' -> '1', 'LA', 'hA' and 'level a' -> 'A'; '' if
+    the name ends in a word.
+    """
+    match = _LAST.search(name)
+    return next(filter(None, match.groups())).upper() if match else ""
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> str:

@@ -159,6 +159,8 @@ def test_the_tables_are_in_the_units_of_the_plant(capsys: pytest.CaptureFixture[
     assert main([*words, "--faults", "Q1.pump_offset,h1.sensor_bias,T2.leak,OUT2.plugging"]) == 0
     shown = capsys.readouterr().out
     assert "inf" not in shown and " SI" not in shown
+    assert "faults (or combinations) are determined together" in shown.splitlines()[1]
+    assert "sine of the angle between signatures (0: not distinguishable)" not in shown and " sine" in shown
     offset = [line.split() for line in shown.splitlines() if line.startswith("Q1.pump_offset")]
     [bounds, effects] = offset
     assert bounds[1] == effects[1] == "cm^3/s" and 0.1 < float(effects[2]) < 1e3

@@ -200,6 +200,7 @@ def test_a_rig_in_code_from_simulation_to_report(here: Path) -> None:
     assert "301 samples, 300 s" in repr(recording) and "<table>" in recording._repr_html_()
     found = fdi_torch.train(RIG, recording, ["A.leak"], output={"folder": "results"})
     assert found.log.parent.name == "results"
+    assert "nominal" in found.brief().header and "simulated" not in found.brief().header
     run = {"plant": RIG, "recordings": [recording], "estimate": {"parameters": ["A.leak"]}}
     assert torch.equal(fdi_torch.train(run).estimate.value, found.estimate.value)
     row = found.table().columns["parameter"].index("A.leak.size")

@@ -24,6 +24,7 @@ from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import plant_mapping
 from fdi_torch.config.problems import ConfigError
+from fdi_torch.jobs.log_paths import left_unfinished
 from fdi_torch.jobs.logged_monitor import MonitorCallbacks
 from fdi_torch.jobs.monitor import LARGEST_BATCH, DelayWatch, LiveBatches
 from fdi_torch.jobs.monitor_rows import LearningItems, resumed_items, rows_until
@@ -447,7 +448,12 @@ def test_a_growing_file_is_followed_on_after_a_kill_to_the_same_events(
     assert kinds(early) == ["alarm"]
     expected = [json.loads(json.dumps(event).replace("all.csv", "rig.csv")) for event in expected]
     file.write_text(lines[0] + "".join(lines[215:] if rotated else lines[1:]))
-    late = monitored([*words, "--resume"], capsys)
+    assert main(["monitor", *words, "--resume", "--json"]) == 0
+    printed = capsys.readouterr()
+    late = [json.loads(line) for line in printed.out.splitlines()]
+    (last,) = [line for line in printed.err.splitlines() if line.startswith("resumed from ")]
+    assert last.startswith("resumed from watch_2.mcap.partial at ")
+    assert last.endswith(f" s; {len(early)} events already reported")
     assert early + late == expected
     logs = [path for path in (tmp_path / "logs").glob("*.mcap") if "_2" in path.name]
     assert [(m["t"], m["event"], m["message"]) for m in logged_events(logs[0])] == [
@@ -503,6 +509,10 @@ def test_a_run_of_another_configuration_is_not_resumed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], watched: tuple[Path, list[dict[str, object]]]
 ) -> None:
     written(tmp_path / "rig.csv")
+    assert left_unfinished(tmp_path, "watch") is None
+    for name in ("watch.mcap.partial", "watcher.mcap.partial"):
+        (tmp_path / name).write_bytes(b"part")
+    assert left_unfinished(tmp_path, "watch") == tmp_path / "watch.mcap.partial"
     assert main(["monitor", "--config", config(tmp_path), "--resume", "--quiet"]) == 2
     assert "expected an unfinished log" in capsys.readouterr().err
     assert main(["monitor", "--config", config(watched[0]), "--resume", "--quiet"]) == 2

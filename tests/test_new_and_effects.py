@@ -17,7 +17,7 @@ from fdi_torch import cli
 from fdi_torch.config.channels import mapped
 from fdi_torch.config.estimation import parameter_values, placements_of
 from fdi_torch.config.file_templates import template
-from fdi_torch.config.loaded_recordings import listed_recordings, read_recording
+from fdi_torch.config.loaded_recordings import listed_recordings, named_recordings, read_recording
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_from_columns import plant_from_recording
@@ -517,3 +517,35 @@ def test_a_recording_without_a_header_is_mapped_by_numbers(here: Path, capsys: p
     fdi("check", "--config", "run.yaml")
     assert "60 samples, 59 s" in capsys.readouterr().out
     assert load_monitor(Path("watch.yaml")).plant.name == "rig"
+
+
+def test_columns_are_offered_by_name_and_the_file_as_it_was_given(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = ["Füllstand D [mm]", "Füllstand A [mm]", "Pumpe 2 [L/min]", "Füllstand B [mm]", "Pumpe 1 [L/min]"]
+    rows = "".join(f"{k};20;30;{k % 3};40;{k % 2}\n" for k in range(20))
+    Path("data").mkdir()
+    Path("data/trend.csv").write_text(f"t [s];{';'.join(names)}\n{rows}", encoding="utf-8")
+    fdi("new", "plant", "--recording", "data/trend.csv", "--out", "rig.yaml")
+    plant = load_plant(Path("rig.yaml"), unfinished=True)
+    assert [tank.name for tank in plant.tanks] == ["A", "B", "D"]
+    assert {sensor.column: sensor.tank for sensor in plant.sensors} == {
+        "Füllstand D": "D",
+        "Füllstand A": "A",
+        "Füllstand B": "B",
+    }
+    Path("own.yaml").write_text(
+        "tanks: {A: {area: 1 dm^2, height: 5 cm}, B: {area: 1 dm^2, height: 5 cm}, C: {area: 1 dm^2, height: 5 cm}}\n"
+        "pumps: {P1: {target: A, max_flow: 5 l/min}, P2: {target: B, max_flow: 5 l/min}}\n"
+        "sensors: {LA: {tank: A}, LB: {tank: B}, LC: {tank: C}}\n"
+    )
+    capsys.readouterr()
+    assert cli.main(["check", "--plant", "own.yaml", "--recording", "data/trend.csv"]) == cli.MISUSE
+    offered = "recordings:" + capsys.readouterr().err.partition("recordings:")[2]
+    assert "  - file: data/trend.csv\n" in offered
+    assert '      P1: {column: "Pumpe 1 [L/min]"}\n      P2: {column: "Pumpe 2 [L/min]"}\n' in offered
+    assert '      LA: {column: "Füllstand A [mm]"}\n      LB: {column: "Füllstand B [mm]"}\n' in offered
+    assert '      LC: {column: ...}    # one of: "Füllstand D [mm]"' in offered
+    Path("runs.yaml").write_text(offered.replace("...", '"Füllstand D [mm]"'), encoding="utf-8")
+    (read,) = named_recordings("runs.yaml", load_plant(Path("own.yaml")), here)
+    assert read.output_names == ("LA", "LB", "LC") and read.outputs[0].tolist() == pytest.approx([0.03, 0.04, 0.02])

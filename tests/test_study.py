@@ -8,12 +8,17 @@ from pathlib import Path
 import pytest
 import torch
 
+from fdi_torch.cli.screen import Screen
+from fdi_torch.cli.study import show
+from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.problems import ConfigError
 from fdi_torch.config.study_file import Study, load_study
+from fdi_torch.effects import build_network
 from fdi_torch.estimate.evolution import EvolutionResult, distant_members
 from fdi_torch.estimate.refinement import starting_points
 from fdi_torch.jobs.study import TRIAL, StudyResult, progress, run_study
 from fdi_torch.logbook import read_run
+from fdi_torch.plant.exact_constants import exact_constants_sentence
 from fdi_torch.quantities import displayed_in
 from fdi_torch.report.material import gather
 from fdi_torch.report.predictions import progress_of
@@ -312,3 +317,20 @@ def test_errors_are_in_the_unit_of_the_plant() -> None:
     assert table.columns["unit"] == ["l/min"]
     assert table.columns["bias"] == pytest.approx([-0.12]) and table.columns["RMSE"] == pytest.approx([0.18])
     assert printed[:5] == ["free", "Q.pump_offset", "l/min", "-0.12 ± 0.12", "0.18"]
+
+
+def test_constants_that_count_as_exact_are_named_with_the_key_that_estimates_them(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    plant = load_plant("three_tank")
+    constants = build_network(plant).constants.names
+    sentence = exact_constants_sentence(plant, ["T1.leak.size"], constants)
+    assert sentence == (
+        'constants with a tolerance count as exact here; estimate.calibrate: ["*.discharge_coefficient"] estimates them'
+    )
+    of_first = [name for name in plant.tolerances if name.startswith("P")][:1]
+    assert len(of_first) == 1 and of_first[0] not in exact_constants_sentence(plant, of_first, constants)
+    assert "*" not in exact_constants_sentence(plant, of_first, constants)
+    assert exact_constants_sentence(plant, list(plant.tolerances), constants) == ""
+    show(StudyResult((), None, {}, 0, 1.0, Path("study.mcap")), Screen(), sentence)
+    assert f"{sentence}\n" in capsys.readouterr().out

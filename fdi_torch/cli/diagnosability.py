@@ -6,6 +6,8 @@ Path: cli.diagnosability.run → monitor.monitor_setup.usual_faults → monitor.
 from __future__ import annotations
 
 import argparse
+import math
+from itertools import combinations
 from pathlib import Path
 
 import torch
@@ -23,6 +25,9 @@ from fdi_torch.quantities import display_unit, parse_quantity
 from fdi_torch.recording import Recording
 from fdi_torch.tables import Table
 
+CLOSE = 0.1
+"""Sine of an angle below which a pair is listed: it is isolable only from ten times the detectable size on."""
+
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
     plant = chosen_plant(arguments.plant)
@@ -39,7 +44,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     )
     if uncertain:
         screen.say(f"uncertain within their tolerances: {', '.join(uncertain)}")
-    _show(report, screen)
+    _show(report, screen, arguments.angles)
     screen.result({"format": "fdi_torch.diagnosability/1", **report.to_dict()})
     return 0
 
@@ -67,8 +72,14 @@ def _inputs(arguments: argparse.Namespace, plant: PlantDescription) -> tuple[Rec
     return plant.recording(time, inputs, time.new_zeros(len(time), len(plant.sensors))), True
 
 
-def _show(report: Diagnosability, screen: Screen) -> None:
-    screen.say(f"{report.rank} of {len(report.faults)} faults (or combinations) are determined together")
+def _show(report: Diagnosability, screen: Screen, all_angles: bool) -> None:
+    """Print which faults are determined and which only together, then sizes and signatures."""
+    count, determined = len(report.faults), sum(map(math.isfinite, report.std))
+    screen.say(f"{report.rank} of {count} faults (or combinations) are determined together")
+    if determined < count:
+        screen.say(f"{determined} of {count} faults are determined by themselves")
+    screen.points((*report.groups, *report.remarks))
+    screen.say()
     columns = (report.std, report.std_by_correlation, report.smallest_detectable, report.smallest_isolable)
     rows, shows = [], []
     for name, si_unit, seen, *values in zip(report.faults, report.units, report.shows, *columns, strict=True):
@@ -85,8 +96,22 @@ def _show(report: Diagnosability, screen: Screen) -> None:
     title = f"{effect}, in standard deviations of its noise (all samples together)"
     screen.show(Table(("fault", "unit", *report.sensors), shows, title, digits=3))
     screen.say()
+    _show_angles(report, screen, all_angles)
+
+
+def _show_angles(report: Diagnosability, screen: Screen, all_pairs: bool) -> None:
+    """Print the sines of the angles between signatures: of all pairs as a matrix, or of pairs that nearly coincide."""
+    if not all_pairs:
+        detectable = [k for k, size in enumerate(report.smallest_detectable) if math.isfinite(size)]
+        close = [(report.apart[i][j], i, j) for i, j in combinations(detectable, 2) if report.apart[i][j] < CLOSE]
+        close.sort(key=lambda pair: round(pair[0], 3))
+        rows = [[report.faults[i], report.faults[j], f"{sine:.3f}"] for sine, i, j in close]
+        title = f"pairs that are hard to distinguish: sine of the angle between their signatures below {CLOSE:g}"
+        screen.show(Table(("fault", "other fault", "sine"), rows, title, words=2))
+        if not rows:
+            screen.say(f"no two signatures are at an angle with a sine below {CLOSE:g}")
+        return
     angles = enumerate(zip(report.faults, report.apart, strict=True), 1)
     apart = [[str(i), name, *(f"{v:.2f}" for v in row)] for i, (name, row) in angles]
     title = "sine of the angle between signatures (0: not distinguishable)"
     screen.show(Table(("", "fault", *(row[0] for row in apart)), apart, title, words=2))
-    screen.points((*report.groups, *report.remarks))

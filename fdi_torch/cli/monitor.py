@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     monitor_run = load_monitor(arguments.config, overrides(arguments))
     with screen.progress("monitor") as advance, outlets(arguments, monitor_run.name, screen) as (listener, publish):
         callbacks = MonitorCallbacks(
-            advance, lambda e: _show_event(e, screen, publish), lambda p: _show_setup(p, screen), listener
+            advance, lambda e: _show_event(e, screen, publish), lambda p: _show_setup(p, screen), listener, screen.note
         )
         done = run_monitor(monitor_run, callbacks, arguments.follow, arguments.idle, arguments.resume)
     slow = "" if done.spent < done.lasted else "; slower than real time"

@@ -21,7 +21,7 @@ from fdi_torch.config.channels import expect_columns
 from fdi_torch.config.loaded_recordings import load_recordings, named_recordings
 from fdi_torch.config.plant_file import chosen_plant, load_plant
 from fdi_torch.config.recording_config import RecordingConfig
-from fdi_torch.config.yaml_files import YAML_ENDINGS, find_data
+from fdi_torch.config.yaml_files import YAML_ENDINGS
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import Misfit
 from fdi_torch.gap.free_runs.prediction import Prediction, predict
@@ -98,7 +98,7 @@ def _recordings(name: str, plant: PlantDescription, arguments: argparse.Namespac
         return named_recordings(name, plant, Path.cwd())
     columns = _constants(arguments, plant)
     constants = "if it was constant, add --constant {inputs}=0 (--from and --to select a part); "
-    expect_columns(find_data(name, Path.cwd()), plant, columns, constants)
+    expect_columns(name, Path.cwd(), plant, columns, constants)
     limits = {key: f"{vars(arguments)[key]} s" for key in ("start", "stop") if vars(arguments)[key] is not None}
     config = RecordingConfig.model_validate({"file": name, "columns": columns, **limits})
     return [part.recording for part in load_recordings([config], plant, Path.cwd())]

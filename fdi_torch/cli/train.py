@@ -25,6 +25,7 @@ from fdi_torch.estimate.misfit import flow_words
 from fdi_torch.jobs.train import TrainResult, train
 from fdi_torch.jobs.windowed_fit import WindowedFit, fit_windows
 from fdi_torch.parameters import ParameterName
+from fdi_torch.plant.exact_constants import exact_constants_sentence
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.report.sections.windows import period_table, size_text
@@ -72,6 +73,8 @@ def show(done: TrainResult, screen: Screen) -> None:
     screen.show(done.brief())
     if any(ParameterName.parse(name).field == "start_level" for name in space.names):
         screen.say(f"nominal of a start level: the median of the first {FIRST_READINGS} readings")
+    if done.truth and (remark := exact_constants_sentence(done.fitting.plant, space.names, network.constants.names)):
+        screen.say(remark)
     screen.say()
     for line in in_words(done):
         screen.say(line)

@@ -20,7 +20,7 @@ from fdi_torch.report.html import short
 from fdi_torch.tables import Table
 from fdi_torch.view.log_list import SORTS, LogList, selected
 
-LEAST_VERDICT = 24  # letters; a narrower terminal folds the row
+LEAST_VERDICT, PIPED_VERDICT = 24, 100  # letters; a narrower terminal folds the row, a pipe has no width
 
 
 def run(arguments: argparse.Namespace, screen: Screen) -> int:
@@ -54,9 +54,9 @@ def _print_list(folder: Path, words: str, screen: Screen) -> None:
 
 
 def _fitting(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[list[str]]:
-    """The rows with verdicts cut to what the width of the terminal leaves them; uncut where there is no terminal."""
+    """The rows with verdicts cut to what the terminal leaves them, to `PIPED_VERDICT` where there is none."""
     if not sys.stdout.isatty():
-        return [list(row) for row in rows]
+        return [[*row[:-1], short(row[-1], PIPED_VERDICT)] for row in rows]
     taken = sum(2 + max(map(len, column)) for column in zip(header[:-1], *(row[:-1] for row in rows), strict=True))
     most = max(shutil.get_terminal_size().columns - taken, LEAST_VERDICT)
     return [[*row[:-1], short(row[-1], most)] for row in rows]

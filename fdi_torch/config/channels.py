@@ -8,7 +8,8 @@ from pathlib import Path
 
 from fdi_torch.config.recording_config import ColumnConfig, FileConfig
 from fdi_torch.config.strict import Amount, quantity_at
-from fdi_torch.names import shortened, unknown
+from fdi_torch.config.yaml_files import find_data
+from fdi_torch.names import distinguishing_end, shortened, unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text, si_unit_of
 from fdi_torch.recordings.csv_files import first_row, read_header
@@ -119,11 +120,15 @@ def unrecorded_valves(
     return {name: ChannelSource(None, "1", openings[name]) for name in without_column(path, openings, config)}
 
 
-def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[str] = (), other_fix: str = "") -> None:
+def expect_columns(
+    name: str, base: Path, plant: PlantDescription, also_known: Collection[str] = (), other_fix: str = ""
+) -> None:
     """Raises ValueError with all channels that have no column in a table, and the YAML file that maps them.
 
-    also_known: channels that need no column. other_fix: a further way to supply inputs, with {inputs}.
+    name: the table's file, as the user wrote it, relative to the folder `base`. also_known: channels that need no
+    column. other_fix: a further way to supply inputs, with {inputs}.
     """
+    path = find_data(name, base)
     missing = _missing(path, plant, also_known)
     if not missing:
         return
@@ -140,16 +145,22 @@ def expect_columns(path: Path, plant: PlantDescription, also_known: Collection[s
         f"{path}: expected a column for {', '.join(missing)}, got {header or 'numbers without a header'}; "
         f"{other_fix.format(inputs=inputs[0]) if other_fix and inputs else ''}"
         f"{'if columns have other names or no unit, ' if header else ''}save these lines as runs.yaml, completed and "
-        f"checked, and name runs.yaml instead:\nrecordings:\n  - file: {path.name}\n{lines}"
+        f"checked, and name runs.yaml instead:\nrecordings:\n  - file: {_as_yaml(name)}\n{lines}"
     )
+
+
+def _as_yaml(text: str) -> str:
+    """A text as YAML on one line, quoted if it needs that."""
+    return text if re.fullmatch(r"[\w./][\w./ -]*", text) else "'" + text.replace("'", "''") + "'"
 
 
 def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()) -> list[str]:
     """Lines for a recording file, to be completed, that map the channels without a column of their name with a unit.
 
-    Each is mapped to the column of its name, without a known unit, else to the next one with a unit of its kind. A file
-    whose rows have more cells than its first line has no header: its columns are numbered. A file with a row per value
-    is mapped by its tags. Empty if no channel lacks a column.
+    Each is mapped to the column of its name, without a known unit, else by `_of_like_names` to one with a unit of its
+    kind; for other channels the columns of their kind are listed in a comment. A file whose rows have more cells than
+    its first line has no header: its columns are numbered. A file with a row per value is mapped by its tags. Empty if
+    no channel lacks a column.
     """
     kinds, missing = _units(plant), _missing(path, plant, also_known)
     if not missing:
@@ -172,14 +183,47 @@ def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()
         column: si_unit_of(pair[1]) for column in legible if (pair := header_unit(column)) and pair[0] not in kinds
     }
     without_unit = [column for column in legible if header_unit(column) is None]
+    of_name = {
+        name: next((c for c in without_unit if re.match(rf"{re.escape(name)}(?![^\W_])", c)), None) for name in missing
+    }
+    of_like_name: dict[str, str] = {}
+    for kind in dict.fromkeys(kinds.values()):
+        names = [name for name in missing if kinds[name] == kind and of_name[name] is None]
+        of_like_name |= _of_like_names(names, [column for column, its_kind in of_kind.items() if its_kind == kind])
     lines = ["columns:    # units only where the header has none"]
     for name in missing:
-        own = next((c for c in without_unit if re.match(rf"{re.escape(name)}(?![^\W_])", c)), None)
-        same_kind = None if own else next((c for c, kind in of_kind.items() if kind == kinds[name]), None)
-        of_kind.pop(same_kind or "", None)
-        column = f'"{own or same_kind}"' if own or same_kind else "..."
-        lines.append(f"  {name}: {{column: {column}" + ("}" if same_kind else ", unit: ...}"))
+        if column := of_like_name.get(name):
+            lines.append(f'  {name}: {{column: "{column}"}}')
+        elif of_name[name] is not None:
+            lines.append(f'  {name}: {{column: "{of_name[name]}", unit: ...}}')
+        else:
+            unmapped = [c for c, kind in of_kind.items() if kind == kinds[name] and c not in of_like_name.values()]
+            quoted = ", ".join(f'"{c}"' for c in unmapped)
+            choice = f"}}    # one of: {quoted}" if unmapped else ", unit: ...}"
+            lines.append(f"  {name}: {{column: {TO_REPLACE}{choice}")
     return lines
+
+
+def _of_like_names(names: Sequence[str], columns: Sequence[str]) -> dict[str, str]:
+    """The columns that clearly belong to channels of their kind of unit: of an equal name, or the only one with the
+    same number or letter at its end. A last pair belongs together unless their numbers or letters differ.
+    """
+    words = {column: (header_unit(column) or (column,))[0] for column in columns}
+    found: dict[str, str] = {}
+    for key in (str.casefold, distinguishing_end):
+        open_names = [name for name in names if name not in found]
+        open_columns = [column for column in columns if column not in found.values()]
+        for name in open_names:
+            same = [column for column in open_columns if key(words[column]) == key(name) != ""]
+            if len(same) == 1 and [key(other) for other in open_names].count(key(name)) == 1:
+                found[name] = same[0]
+    open_names = [name for name in names if name not in found]
+    open_columns = [column for column in columns if column not in found.values()]
+    if len(open_names) == len(open_columns) == 1:
+        ends = distinguishing_end(open_names[0]), distinguishing_end(words[open_columns[0]])
+        if not all(ends) or ends[0].isdigit() != ends[1].isdigit():
+            found[open_names[0]] = open_columns[0]
+    return found
 
 
 def _missing(path: Path, plant: PlantDescription, also_known: Collection[str]) -> list[str]:

@@ -128,7 +128,7 @@ def listed_recordings(
     if is_query(name):
         return [config_of(name)], base
     if Path(name).suffix not in YAML_ENDINGS:
-        expect_columns(find_data(name, base), plant, optional)
+        expect_columns(name, base, plant, optional)
         return [config_of(name)], base
     path = find_file(name, base)
     data = read_extended(path)

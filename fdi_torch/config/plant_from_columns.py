@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import torch
 
+from fdi_torch.names import distinguishing_end
 from fdi_torch.plant.components import COMMAND_UNITS
 from fdi_torch.plant.description import OUTSIDE
 from fdi_torch.quantities import rounded_up, significant, unit_factor
@@ -77,7 +78,9 @@ def plant_from_recording(path: Path, name: str) -> str:
             f"{', '.join(named)}; add units to the header, or describe the plant with fdi new plant, then let "
             f"fdi check --plant FILE --recording {path} print the lines that map the columns"
         )
-    tanks = [f"T{k + 1}" for k in range(len(sensors))] if len(sensors) > 26 else list(ascii_uppercase[: len(sensors)])
+    tank_of = dict(zip(sensors, _tanks(sensors), strict=True))
+    by_tank = sorted(sensors, key=lambda column: (len(tank_of[column]), tank_of[column]))
+    tanks = [tank_of[column] for column in by_tank]
     pipes = [(f"{a}_{b}", a, b) for a, b in pairwise(tanks)] + [("outlet", tanks[-1], OUTSIDE)]
     commands = [column for column in columns if column not in sensors and column.kind in COMMAND_UNITS.values()]
     pumps = [_pump(column, tanks[0]) for column in commands]
@@ -89,7 +92,7 @@ def plant_from_recording(path: Path, name: str) -> str:
         f"name: {name}",
         "",
         "tanks:    # ! cross-section, and height from the floor to the rim",
-        *(f"  {tank}: {{area: 200 cm^2, height: {_height(c)}}}" for tank, c in zip(tanks, sensors, strict=True)),
+        *(f"  {tank_of[column]}: {{area: 200 cm^2, height: {_height(column)}}}" for column in by_tank),
         "",
         "pipes:    # ! which there are, and the area of each orifice; target outside: an outlet",
         *(
@@ -99,7 +102,7 @@ def plant_from_recording(path: Path, name: str) -> str:
         "",
         *([PUMPS, *pumps, ""] if pumps else []),
         "sensors:  # ! the tank of each, and its gain: reading at the rim divided by height; commands go to pumps",
-        *(_sensor(column, tank) for column, tank in zip(sensors, tanks, strict=True)),
+        *(_sensor(column, tank) for column, tank in tank_of.items()),
         "",
         "tolerances:    # one standard deviation; constants without one count as exact",
         '  "*.discharge_coefficient": 30 %',
@@ -119,6 +122,17 @@ def _columns(path: Path, headers: list[str]) -> list[_Column]:
         _Column(header, name, spelled(unit), kind, high)
         for (header, name, unit), kind, high in zip(split, kinds, highest, strict=True)
     ]
+
+
+def _tanks(sensors: list[_Column]) -> list[str]:
+    """The tank of each sensor: the letter at the end of its name, as of 'level D', if these differ; else A, B and so on
+    in the order of the columns, or T1, T2 for more than the alphabet has.
+    """
+    letters = [distinguishing_end(column.name) for column in sensors]
+    taken = {column.own for column in sensors}
+    if len({*letters}) == len(letters) and all(letter.isalpha() and letter not in taken for letter in letters):
+        return letters
+    return [f"T{k + 1}" for k in range(len(sensors))] if len(sensors) > 26 else list(ascii_uppercase[: len(sensors)])
 
 
 def _height(column: _Column) -> str:

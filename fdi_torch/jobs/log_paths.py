@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from fdi_torch.estimate.evolution import Search
-from fdi_torch.logbook import LogError, Message, last_state, read_run, set_aside, unfinished
+from fdi_torch.logbook import LogError, Message, being_written, last_state, read_run, set_aside, unfinished
 from fdi_torch.logbook.reader import Run as Log
 
 # Topics that a resumed run copies from the log of the killed run.
@@ -35,6 +35,13 @@ def free_path(folder: Path, name: str, ending: str = "mcap") -> Path:
 def partial_path(path: Path) -> Path:
     """Path of a log while its run lasts."""
     return path.with_name(path.name + ".partial")
+
+
+def left_unfinished(folder: Path, name: str) -> Path | None:
+    """The newest `.partial` log of that name, of any configuration, whose writer has ended; None if there is none."""
+    pattern = re.compile(re.escape(name) + r"(_\d+)?\.mcap\.partial")
+    files = [p for p in folder.glob("*.mcap.partial") if pattern.fullmatch(p.name) and p.stat().st_size]
+    return max((p for p in files if not being_written(p)), key=lambda p: p.stat().st_mtime, default=None)
 
 
 def find_unfinished(folder: Path, name: str, text: str) -> tuple[Path, Log | None] | None:

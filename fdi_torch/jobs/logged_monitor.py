@@ -43,13 +43,14 @@ CHUNK = 2048  # samples of a recording that are processed at a time
 class MonitorCallbacks:
     """Functions called during a run. tell(share, text): progress. event: each new event. ready: the prepared monitor.
 
-    log: receives every log message.
+    log: receives every log message. note(text): whether the run continues an earlier one, or could.
     """
 
     tell: Tell = silent
     event: Callable[[Event], None] = lambda event: None
     ready: Callable[[PreparedMonitor], None] = lambda prepared: None
     log: Listener | None = None
+    note: Callable[[str], None] = lambda text: None
 
 
 class LoggedMonitor:

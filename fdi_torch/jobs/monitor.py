@@ -24,7 +24,7 @@ from fdi_torch.config.live_source import live_rows
 from fdi_torch.config.loaded_recordings import expect_file, read_recording
 from fdi_torch.config.monitor_file import MonitorRun
 from fdi_torch.config.problems import naming_source
-from fdi_torch.jobs.log_paths import RESUMES, log_to_write, partial_path
+from fdi_torch.jobs.log_paths import RESUMES, left_unfinished, log_to_write, partial_path
 from fdi_torch.jobs.logged_monitor import LoggedMonitor, MonitorCallbacks
 from fdi_torch.jobs.monitor_rows import (
     ALARM,
@@ -33,6 +33,7 @@ from fdi_torch.jobs.monitor_rows import (
     fault_free_recording,
     logged_items,
     logged_origin,
+    logged_rows,
     resumed_items,
     rows_in,
     rows_until,
@@ -67,7 +68,10 @@ def run_monitor(
     run of the same file or source; the result is the same as without the interruption, and events in the earlier log
     are not reported again.
     """
-    path, unfinished = log_to_write(Path(run.config.output.folder), run.name, run.text, resume)
+    folder = Path(run.config.output.folder)
+    if not resume and (left := left_unfinished(folder, run.name)):
+        callbacks.note(f"{left}: log of a run that did not end; {RESUMES}, if the configuration is the same")
+    path, unfinished = log_to_write(folder, run.name, run.text, resume)
     follow = follow or run.config.source is not None
     whole = None
     if not follow:
@@ -79,6 +83,9 @@ def run_monitor(
     earlier, origin = _earlier(run, unfinished, kept, resume) if follow else ([], None)
     messages = unfinished.messages([ALARM]) if unfinished is not None else ()
     reported = Counter(event_key(message.payload) for message in messages)
+    if resume:
+        rows = rows_in(earlier) or ([] if unfinished is None else logged_rows(unfinished, run))
+        callbacks.note(_resumed_words(partial_path(path).name, rows, reported.total()))
     try:  # before the log begins, so that a source that cannot be reached leaves none
         source = _source(run, idle, origin, rows_in(earlier)) if follow else None
     except BaseException:
@@ -100,6 +107,13 @@ def run_monitor(
         finally:
             log.result({"events": monitor.events, "faults": monitor.faults()})
     return MonitorSummary(monitor.alarms, monitor.lasted, monitor.spent, path)
+
+
+def _resumed_words(name: str, rows: Sequence[Row], events: int) -> str:
+    """Say what a resumed run continues: the log's name, its last sample, and the number of its events."""
+    if not rows:
+        return f"resumed from {name}, which has no samples: starts from the beginning"
+    return f"resumed from {name} at {rows[-1][0]:g} s; {counted(events, 'event')} already reported"
 
 
 def _earlier(

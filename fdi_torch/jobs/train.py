@@ -82,7 +82,7 @@ class TrainResult(Shown):
     def brief(self) -> Table:
         """The estimates and their determined combinations, as `fdi train` prints them."""
         final, space = self.estimate, self.fitting.space
-        exact = {"nominal": {p.name: p.nominal for p in space}, "simulated": self.truth}
+        exact = {"nominal": {p.name: p.nominal for p in space}} | ({"simulated": self.truth} if self.truth else {})
         columns = (final.names, final.units, final.value.tolist(), final.std.tolist())
         return estimate_table("", *columns, ends=final.at_bounds, combinations=final.combinations, exact=exact)
 

@@ -63,9 +63,12 @@ def _better(compared: Comparison, runs: Sequence[Material]) -> str:
     smaller = 1.0 - math.exp(sizes[first] - sizes[second])
     chance = AT_95 / math.sqrt(max(sum(residuals[first][name].readings for name in common), 1))
     best, next_best = compared.labels[first], compared.labels[second]
-    if smaller <= chance:
-        by = percent(smaller) if smaller >= 1e-3 else "less than 0.1 %"
-        return f"{best} and {next_best} explain the recording equally well: residuals differ by {by}."
+    equal = {k: excess for k, size in enumerate(sizes) if (excess := 1.0 - math.exp(sizes[first] - size)) <= chance}
+    if len(equal) > 1:
+        most = max(equal.values())
+        by = f"{'at most ' if len(equal) > 2 else ''}{percent(most)}" if most >= 1e-3 else "less than 0.1 %"
+        names = listed([compared.labels[k] for k in sorted(equal, key=equal.__getitem__)])
+        return f"{names} explain the recording equally well: residuals differ by {by}."
     errors = []
     for name in common:
         pair = residuals[first][name], residuals[second][name]
@@ -148,7 +151,8 @@ def _without_common(key: str, texts: Sequence[str]) -> dict[str, tuple[str, ...]
 
 def _differing_leaves(key: str, values: Sequence[Any]) -> dict[str, Sequence[Any]]:
     """The deepest keys that differ. Lists of tables are compared entry by entry if all runs have as many without a
-    name; lists of other things by what they hold, without what every run has.
+    name; lists of other things as a whole if they are short and one holds nothing but what every run has, else without
+    what every run has.
     """
     if all(value == values[0] for value in values):
         return {}
@@ -166,7 +170,10 @@ def _differing_leaves(key: str, values: Sequence[Any]) -> dict[str, Sequence[Any
         )
         return {name: texts for leaves in each for name, texts in leaves.items()}
     rest = [[entry for entry in value if not all(entry in other for other in values)] for value in values]
-    return {key: rest if any(rest) else values}  # the same entries in another order
+    if not any(rest):  # the same entries in another order
+        return {key: values}
+    short_lists = all(len(_in_words(value)) <= MOST_LETTERS for value in values)
+    return {key: rest if all(rest) or not short_lists else values}
 
 
 def _is_nameless_table(entry: Any) -> bool:

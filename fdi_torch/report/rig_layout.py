@@ -16,9 +16,10 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Polygon
 from matplotlib.textpath import TextPath
 
+from fdi_torch.amounts import probability_words
 from fdi_torch.plant.description import OUTSIDE, PlantDescription
 from fdi_torch.report.html import short
-from fdi_torch.report.numbers import percent, shown_unit
+from fdi_torch.report.numbers import shown_unit
 from fdi_torch.report.style import INK
 
 Place = tuple[int, int]  # row from the top, column from the left
@@ -175,7 +176,7 @@ class Overlay:
             bullet = "• " if len(marks) > 1 else ""
             lines += [(line, colour, "bold") for line in (bullet + first, *others)]
         share = self.probabilities.get(name, 0.0)
-        return [*lines, (percent(share), INK, "bold")] if share >= LEAST_SHARE else lines
+        return [*lines, (probability_words(share), INK, "bold")] if share >= LEAST_SHARE else lines
 
     def opacity(self, name: str) -> float:
         """Opacity of the colour at a location, by the cube of its probability, so that certain ones stand out."""

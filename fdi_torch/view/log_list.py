@@ -17,6 +17,8 @@ from fdi_torch.report.verdict import headline, kind_words
 
 RUNNING, NO_END, UNREADABLE = "running", "did not end", "unreadable"
 PARTIAL = ".partial"
+COMMANDS = {"rehearsal": "rehearse"}
+"""Command by the kind of log, where the names differ."""
 UNSHOWN = (KeyError, IndexError, TypeError, ValueError, OverflowError, OSError)
 """Errors of a log that is damaged or was not written by this program."""
 
@@ -26,7 +28,7 @@ class Entry:
     """One log. name: its path below the folder. verdict: its result in one sentence, or why it cannot be read.
 
     error: root mean square of the residuals in SI, NaN if unknown; error_text: in the plant's units. state: status of
-    the run, or `RUNNING`, `NO_END` or `UNREADABLE`. started: UTC, as text.
+    the run, or `RUNNING`, `NO_END` or `UNREADABLE`. started: UTC, as text. command: that wrote the log, such as train.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Entry:
     state: str
     started: str
     progress: Progress
+    command: str = ""
 
     @property
     def cells(self) -> list[str]:
@@ -47,7 +50,7 @@ class Entry:
     @property
     def text(self) -> str:
         """All in which words are looked for, in lower case."""
-        return f"{self.name} {self.kind} {self.started} {self.verdict} {self.state}".casefold()
+        return f"{self.name} {self.kind} {self.command} {self.started} {self.verdict} {self.state}".casefold()
 
 
 @dataclass
@@ -97,7 +100,8 @@ def _read(name: str, path: Path, running: bool) -> Entry:
             error_text = quantity_text(error, unit, 3, sensor) if error == error else ""
         kind, progress = kind_words(material), progress_of(material)
         state, verdict = (RUNNING, progress.text) if running else (material.status or NO_END, headline(material))
-        return Entry(name, path, kind, verdict, error, error_text, state, material.started, progress)
+        command = COMMANDS.get(material.kind, material.kind)
+        return Entry(name, path, kind, verdict, error, error_text, state, material.started, progress, command)
     except UNSHOWN as problem:
         return _unreadable(name, path, str(problem), running)
 

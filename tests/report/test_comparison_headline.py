@@ -89,6 +89,9 @@ def test_a_difference_that_chance_explains_is_none(tmp_path: Path, share: float,
     a = write_fit(tmp_path / "a.mcap", 0.001, config={"seed": 3})
     b = write_fit(tmp_path / "b.mcap", 0.001 * (1.0 - share))
     assert ("explain the recording equally well" in sentences(a, b)[0]) is equal
+    c = write_fit(tmp_path / "c.mcap", 0.001)
+    all_three = "b, a and c explain the recording equally well: residuals differ by at most 10 %"
+    assert (all_three in sentences(a, b, c)[0]) is equal
 
 
 def test_runs_of_different_recordings_are_not_ranked(tmp_path: Path) -> None:
@@ -122,7 +125,7 @@ def test_settings_are_told_in_words(tmp_path: Path) -> None:
 
 
 def test_of_nested_settings_the_keys_and_entries_that_differ_are_named(tmp_path: Path) -> None:
-    """A run that lacks an entry of a list is told by its label; what all runs have is left out."""
+    """Where a run's list holds nothing of its own, the lists are whole; long ones without what all runs have."""
     recording = {"file": "run.xlsx", "header": True, "columns": {"t": "t", "Q": "Q"}}
     other = recording | {"file": "run_de.txt", "columns": {"t": "column 1", "Q": "Q"}}
     a = write_fit(tmp_path / "a.mcap", 0.001, config={"recordings": [recording], "faults": ["A.leak", "B.leak"]})
@@ -131,9 +134,13 @@ def test_of_nested_settings_the_keys_and_entries_that_differ_are_named(tmp_path:
     assert settings_of(a, b, c)[0] == {
         "recordings.file": ("run.xlsx", "run_de.txt", "run.xlsx"),
         "recordings.columns.t": ("t", "column 1", "t"),
-        "faults": ("B.leak", "none", "B.leak"),
+        "faults": ("A.leak, B.leak", "A.leak", "A.leak, B.leak"),
     }
     assert "recordings.file (a and c: run.xlsx; b: run_de.txt)" in sentences(a, b, c)[-1]
+    long = [f"T{k}.leak" for k in range(12)]
+    d = write_fit(tmp_path / "d.mcap", 0.001, config={"faults": long})
+    e = write_fit(tmp_path / "e.mcap", 0.001, config={"faults": [*long, "P.plugging"]})
+    assert settings_of(d, e)[0] == {"faults": ("none", "P.plugging")}
 
 
 def test_lists_of_several_recordings_and_of_named_entries_are_told_apart(tmp_path: Path) -> None:
@@ -145,7 +152,7 @@ def test_lists_of_several_recordings_and_of_named_entries_are_told_apart(tmp_pat
     )
     assert settings_of(a, b)[0] == {
         "recordings.2.file": ("2.csv", "3.csv"),
-        "plant.effects": ("pump lag at Q1", "none"),
+        "plant.effects": ("leak at T1, pump lag at Q1", "leak at T1"),
     }
 
 

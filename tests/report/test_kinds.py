@@ -33,6 +33,7 @@ from fdi_torch.report.html import unbroken
 from fdi_torch.report.material import gather
 from fdi_torch.report.page import RunReport, page, report_of
 from fdi_torch.report.sections.signals import profile_section
+from fdi_torch.report.sections.study import summary_section
 from fdi_torch.report.verdict import _latest, headline
 
 DATA = Path(__file__).parents[1] / "data"
@@ -252,6 +253,9 @@ def test_a_cause_shows_its_size_in_whatever_order_its_parameters_were_logged() -
 def test_a_study_says_how_its_errors_compare_with_the_bound() -> None:
     material = material_of(DATA / "log_format_1_study.mcap", load_plant("three_tank"))
     assert headline(material) == "5 trials in 1 setting: errors 1.02 times the Cramér-Rao bound"
+    section = summary_section(material)
+    assert section is not None
+    assert "constants with a tolerance count as exact here; estimate.calibrate: [" in str(section.blocks[-1])
 
 
 def test_an_axis_by_decades_has_plain_numbers() -> None:

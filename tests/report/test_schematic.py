@@ -89,7 +89,7 @@ def test_circles_of_pipes_and_of_falls_are_drawn_too() -> None:
 def test_guilty_components_and_shares_stand_on_the_drawing() -> None:
     overlay = Overlay({"T1": 0.5}, {"Q1": ["pump lag 8 s"], "T1-T2": ["cross flow"]}, {"P13": 0.62})
     svg = inline_svg(schematic(load_plant("three_tank"), overlay), "rig", "")
-    assert all(f">{words}<" in svg for words in ("50.0 cm", "pump lag", "8 s", "cross", "flow", "62 %"))
+    assert all(f">{words}<" in svg for words in ("50.0 cm", "pump lag", "8 s", "cross", "flow", "62.0 %"))
     assert svg.count("var(--mark)") > inline_svg(schematic(load_plant("three_tank")), "rig", "").count("var(--mark)")
 
 
@@ -99,7 +99,9 @@ def test_no_word_within_a_tank_stands_on_another(level: float) -> None:
     figure = schematic(load_plant("three_tank"), said)
     figure.canvas.draw()
     words = [
-        t for t in figure.axes[0].texts if t.get_text() in ("T1", "leak", "0.295", "100 %", f"{100 * level:.1f} cm")
+        t
+        for t in figure.axes[0].texts
+        if t.get_text() in ("T1", "leak", "0.295", "over 99.9 %", f"{100 * level:.1f} cm")
     ]
     boxes = sorted((t.get_window_extent() for t in words), key=lambda box: box.y0)
     assert len(boxes) == 5

@@ -261,7 +261,8 @@ def test_what_cannot_be_served_is_said(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_a_verdict_is_cut_to_the_width_of_the_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     header, rows = ("log", "verdict"), [["a.mcap", "leak " * 40], ["longer.mcap", "none"]]
-    assert _fitting(header, rows) == rows
+    piped = _fitting(header, rows)
+    assert len(piped[0][1]) == 100 and piped[0][1].endswith("…") and piped[1] == rows[1]
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     monkeypatch.setenv("COLUMNS", "80")
     first, second = _fitting(header, rows)
@@ -272,6 +273,8 @@ def test_the_list_is_printed_for_a_day_and_for_words(tmp_path: Path, capsys: pyt
     write_fit(tmp_path / "a.mcap", 0.02)
     started = read_run(tmp_path / "a.mcap").metadata["fdi_torch.run"]["started"][:10]
     assert main(["view", str(tmp_path), "--list", started]) == 0
+    assert "a.mcap" in capsys.readouterr().out
+    assert main(["view", str(tmp_path), "--list", "train"]) == 0
     assert "a.mcap" in capsys.readouterr().out
     assert main(["view", str(tmp_path), "--list", "no such words"]) == 0
     assert capsys.readouterr().out == "no log matches 'no such words'\n"

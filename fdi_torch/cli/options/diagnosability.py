@@ -32,5 +32,9 @@ ARGUMENTS = {
         "type": seconds,
         "help": "duration of constant inputs, such as '2 h' (default: 1000 s for three_tank, longer for slower plants)",
     },
+    "--angles": {
+        "action": "store_true",
+        "help": "print the angles between the signatures of all pairs of faults, not only the small ones",
+    },
     **shared("--noise"),
 }

@@ -10,6 +10,7 @@ examples:
   fdi view                                         the logs in ./logs
   fdi view /data/runs --port 8080 --open
   fdi view --list "2026-11-24 leak"                the logs of that day about a leak, on the terminal
+  fdi view --list train                            the logs of fdi train
 """
 ARGUMENTS = {
     "folder": {
@@ -22,7 +23,8 @@ ARGUMENTS = {
         "metavar": "WORDS",
         "nargs": "?",
         "const": "",
-        "help": "only print the logs, latest first; WORDS: those with them in name, kind, start, verdict or state",
+        "help": "only print the logs, latest first; WORDS: those with them in name, kind, command, start, verdict or "
+        "state",
     },
     "--port": {"metavar": "N", "type": int, "default": 0, "help": "port of the pages (default: any free one)"},
     "--open": {"action": "store_true", "help": "open the list in the browser"},

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 from fdi_torch.amounts import end_words
+from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import NOT_ESTABLISHED, flow_words
 from fdi_torch.names import counted
+from fdi_torch.plant.exact_constants import exact_constants_sentence
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.html import bullets, shown, table, tag
@@ -31,7 +33,8 @@ def estimate_section(material: Material) -> Section | None:
     if final is None:
         return None
     names, units = [str(name) for name in final["names"]], final.get("units") or [""] * len(final["names"])
-    combinations, truth = combinations_of(material, "combinations"), {"simulated": material.truth}
+    combinations = combinations_of(material, "combinations")
+    truth = {"simulated": material.truth} if material.truth else {}
     numbers = (names, units, final["values"], final["std"])
     estimates = estimate_table("", *numbers, ends=material.run.at_bounds, combinations=combinations, exact=truth)
     deviating = () if material.unexplained else combinations_of(material, "not_isolated")
@@ -41,6 +44,10 @@ def estimate_section(material: Material) -> Section | None:
     header = ("parameter", "finding", *estimates.header[1:])
     notes = [str(note) for note in final.get("unidentifiable") or ()]
     notes += [end_words(str(name), material.run.at_bounds.get(str(name), "")) for name in final.get("at_bound") or ()]
+    if material.truth and material.plant is not None:
+        constants = build_network(material.plant).constants.names
+        remark = exact_constants_sentence(material.plant, names, constants)
+        notes += [remark] if remark else []
     return Section("Estimate", [table(header, rows, left=3), *_water(material), *bullets(notes)], lead=True)
 
 

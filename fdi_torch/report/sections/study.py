@@ -15,6 +15,7 @@ from fdi_torch.amounts import parameter_words
 from fdi_torch.effects import build_network, effect, full_name
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.exact_constants import exact_constants_sentence
 from fdi_torch.quantities import display_unit
 from fdi_torch.report.html import folded, short, shown, table
 from fdi_torch.report.material import Material, Payload
@@ -40,7 +41,15 @@ def summary_section(material: Material) -> Section | None:
     keys = [key.removesuffix(".rmse") for _, _, m in settings for key in m if key.endswith(".rmse")]
     names = {key.partition(".")[2] for key in keys}
     tables = setting_tables(settings, {name: _si_unit_of(material, name) for name in names})
-    return Section("Settings", [*map(shown, tables), *([LEGEND] if len(tables) == len(settings) else [])])
+    legend, remark = [LEGEND] if len(tables) == len(settings) else [], _exact_constants(material, names)
+    return Section("Settings", [*map(shown, tables), *legend, *([remark] if remark else [])])
+
+
+def _exact_constants(material: Material, estimated: set[str]) -> str:
+    """Which constants with a tolerance the trials take as exact; '' if none, or if the log has no plant."""
+    if material.plant is None:
+        return ""
+    return exact_constants_sentence(material.plant, estimated, build_network(material.plant).constants.names)
 
 
 def error_section(material: Material) -> Section | None:
