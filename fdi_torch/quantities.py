@@ -51,11 +51,9 @@ def _unknown_unit(text: str, si_unit: str) -> str:
         _, unit = number_and_unit(text)
     except UnitError:
         return ""
-    return (
-        ""
-        if len(unit) > MOST_NAMED or is_unit(unit)
-        else f"; the unit {unit} is unknown{nearest(unit, USUAL_UNITS.get(si_unit, ()))}"
-    )
+    if len(unit) > MOST_NAMED or is_unit(unit):
+        return ""
+    return f"; the unit {unit} is unknown{nearest(unit, USUAL_UNITS.get(si_unit, ()))}"
 
 
 def parse_level_deviation(text: str, name: str) -> float:
