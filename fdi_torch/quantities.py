@@ -8,11 +8,26 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import lru_cache
 
-from fdi_torch.names import shortened
+from fdi_torch.names import nearest, shortened
 from fdi_torch.parameters import common_name
-from fdi_torch.units import UnitError, factor, in_unit, number_and_unit, same_kind
+from fdi_torch.units import UnitError, factor, in_unit, is_unit, number_and_unit, same_kind
 
 SI_UNITS = ("m", "s", "V", "Pa", "A", "1/s", "m^2", "m^3", "m^3/s", "m/s", "1")
+USUAL_UNITS = {
+    "m": ("mm", "cm", "dm", "m", "in", "ft"),
+    "s": ("ms", "s", "min", "h", "day"),
+    "V": ("mV", "V"),
+    "Pa": ("Pa", "hPa", "kPa", "mbar", "bar", "psi"),
+    "A": ("mA", "A"),
+    "1/s": ("Hz", "1/min", "1/s"),
+    "m^2": ("mm^2", "cm^2", "dm^2", "m^2"),
+    "m^3": ("ml", "cm^3", "l", "m^3", "gal"),
+    "m^3/s": ("ml/min", "ml/s", "cm^3/s", "l/h", "l/min", "l/s", "m^3/h", "m^3/s", "gal/min"),
+    "m/s": ("mm/s", "cm/s", "m/s"),
+    "1": ("%",),
+}
+"""Units by SI unit, of which a message names the nearest one to an unknown unit."""
+MOST_NAMED = 20  # letters of an unknown unit that is named apart from its quantity
 NO_COMMAS = "write 10.5 for decimals, and 10000 without a separator of thousands"
 
 
@@ -26,8 +41,19 @@ def parse_quantity(text: str, unit: str) -> float:
         return in_unit(*number_and_unit(text), unit)
     except UnitError:
         expected = "a number or a share such as '30 %'" if unit == "1" else f"a quantity in {unit} such as '1 {unit}'"
-        hint = f"; {NO_COMMAS}" if "," in text else ""
+        hint = f"; {NO_COMMAS}" if "," in text else _unknown_unit(text, unit)
         raise ValueError(f"expected {expected}, got '{shortened(text)}'{hint}") from None
+
+
+def _unknown_unit(text: str, si_unit: str) -> str:
+    """The end of a message about a quantity whose unit is unknown: '; the unit L/mn is unknown; the nearest is ...'."""
+    try:
+        _, unit = number_and_unit(text)
+    except UnitError:
+        return ""
+    if len(unit) > MOST_NAMED or is_unit(unit):
+        return ""
+    return f"; the unit {unit} is unknown{nearest(unit, USUAL_UNITS.get(si_unit, ()))}"
 
 
 def parse_level_deviation(text: str, name: str) -> float:
@@ -50,7 +76,8 @@ def unit_factor(unit: str, si_unit: str) -> float:
     try:
         return factor(unit, si_unit)
     except UnitError:
-        raise ValueError(f"expected a unit that converts to {si_unit}, got '{shortened(unit)}'") from None
+        near = "" if is_unit(unit) else nearest(unit, USUAL_UNITS.get(si_unit, ()))
+        raise ValueError(f"expected a unit that converts to {si_unit}, got '{shortened(unit)}'{near}") from None
 
 
 def si_unit_of(unit: str) -> str:

@@ -94,6 +94,15 @@ def in_unit(number: float, unit: str, target: str) -> float:
     return converted
 
 
+def is_unit(text: str) -> bool:
+    """Whether a text is a unit, of whatever dimension."""
+    try:
+        _parsed(text)
+    except UnitError:
+        return False
+    return True
+
+
 @lru_cache(maxsize=4096)
 def _parsed(text: str) -> Any:
     """The unit as an object of pint. Raises UnitError."""

@@ -170,7 +170,8 @@ def test_numbers_without_a_short_form_read_back_to_the_last_bit() -> None:
             "nan m^2",
             "p.yaml: tanks.T1.area: expected a quantity in m\\^2 such as '1 m\\^2', got 'nan m",
         ),
-        ("tanks.T1.area", "-160 cm^2", "p.yaml: plant p: tanks.T1.area: expected a positive number, got -0.016 m\\^2"),
+        ("tanks.T1.area", "-160 cm^2", "p.yaml: plant p: tanks.T1.area: expected a positive number, got -160 cm\\^2"),
+        ("pumps.Q1.max_flow", "12 L/mn", "got '12 L/mn'; the unit L/mn is unknown; the nearest is 'l/min'$"),
         ("tanks.T1.area", "10,000 cm^2", "got '10,000 cm\\^2'; write 10.5 for decimals, and 10000 without a separator"),
         (
             "pipes.P12.discharge_coefficient",
@@ -188,7 +189,7 @@ def test_numbers_without_a_short_form_read_back_to_the_last_bit() -> None:
         ("tanks", {}, "expected at least one tank, got none"),
         ("pipes.P12.target", "T9", "pipes.P12.target: expected one of the tanks T1, T2, outside, got 'T9'"),
         ("pipes.P12.target", "T1", "pipes.P12: expected two different ends, got T1 twice"),
-        ("pipes.P12.area", "0 cm^2", "pipes.P12.area: expected a positive number, got 0.0 m\\^2"),
+        ("pipes.P12.area", "0 cm^2", "pipes.P12.area: expected a positive number, got 0 cm\\^2"),
         ("pumps.Q9", {"max_flow": "1 l/s"}, "p.yaml: pumps.Q9.target: expected a value, got nothing; add it"),
         ("pumps.Q1.target", "T9", "pumps.Q1.target: expected one of the tanks T1, T2, got 'T9'"),
         ("pumps.Q1.gain", "3 kg", "pumps.Q1.gain: expected a quantity in 1 or m\\^3/s/V or m\\^3/s/A or .* got '3 kg'"),

@@ -350,7 +350,7 @@ def test_an_argument_that_is_no_kind_is_named() -> None:
     [
         ("{source: A, target: A, crest: 10 cm, width: 2 cm}", "weirs.W: expected two different ends, got A twice"),
         ("{source: B, crest: 10 cm, width: 2 cm}", "weirs.W.source: expected one of the tanks A, got 'B'"),
-        ("{source: A, crest: 10 cm, width: 0 cm}", "weirs.W.width: expected a positive number, got 0.0 m"),
+        ("{source: A, crest: 10 cm, width: 0 cm}", "weirs.W.width: expected a positive number, got 0 cm"),
         ("{source: A, crest: 10 cm, width: 2 cm, discharge_coefficient: 60}", "weirs.W.discharge_coefficient"),
         ("{source: A, width: 2 cm}", "weirs.W.crest"),
     ],

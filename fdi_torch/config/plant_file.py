@@ -30,7 +30,7 @@ from fdi_torch.plant.description import (
     Sensor,
     Tank,
 )
-from fdi_torch.quantities import SI_UNITS, display_in, unit_factor
+from fdi_torch.quantities import SI_UNITS, display_in, displayed_in, unit_factor
 from fdi_torch.untrusted_input import MOST_COMPONENTS
 
 AnyPlant = PlantDescription | str | Path
@@ -168,9 +168,10 @@ def placeholders(path: Path) -> list[str]:
 def build_plant(data: dict[str, Any], source: str) -> Plant:
     """The plant in a mapping. Raises ConfigError, naming `source` and the field."""
     config = validated(PlantConfig, data, Source(source))
-    with naming(source):
+    written = written_units(data)
+    with naming(source), displayed_in(written):  # messages about numbers are in the units of the file
         plant = _plant(config)
-        return replace(plant, units=written_units(data) | _valid_units(config.units, plant))
+        return replace(plant, units=written | _valid_units(config.units, plant))
 
 
 def _valid_units(units: dict[str, str], plant: Plant) -> dict[str, str]:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from fdi_torch.plant.components import OUTSIDE
 from fdi_torch.plant.flow_component import FlowOrder
+from fdi_torch.quantities import SI_UNITS, quantity_text
 
 if TYPE_CHECKING:
     from fdi_torch.plant.description import PlantDescription
@@ -65,7 +66,8 @@ def check_numbers(plant: PlantDescription) -> None:
     positive += [("gravity", plant.gravity, "m/s^2")]
     for field_name, value, unit in positive:
         if not value > 0:
-            raise ValueError(f"{plant.title}: {field_name}: expected a positive number, got {value} {unit}".rstrip())
+            given = quantity_text(value, unit) if unit in SI_UNITS else f"{value:g} {unit}"
+            raise ValueError(f"{plant.title}: {field_name}: expected a positive number, got {given}")
         if not SMALLEST <= value <= LARGEST:
             raise ValueError(
                 f"{plant.title}: {field_name}: expected {SMALLEST:g} to {LARGEST:g} {unit}, got {value:g}; "
