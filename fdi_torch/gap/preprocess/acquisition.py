@@ -67,8 +67,8 @@ def examined(plant: PlantDescription, recording: Recording, thorough: bool = Fal
     thorough: also for a recording fault beside an effect of the plant, which takes some seconds.
     """
     if not recording.trusted and (excessive := excessive_flows(plant, recording)):
-        fault = RecordingFault(tuple(channel for channel, _ in excessive), "; ".join(text for _, text in excessive))
-        return CheckedRecording(recording, (), fault)
+        commands = tuple(channel for channel, _ in excessive)
+        return CheckedRecording(recording, (), RecordingFault(commands, "; ".join(text for _, text in excessive)))
     plant = _with_recorded_sensors(plant, recording)
     if len(recording) < FEWEST or not plant.sensors:
         return CheckedRecording(recording, (), None)
