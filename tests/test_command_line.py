@@ -226,6 +226,25 @@ def test_a_file_with_a_title_and_no_header_is_refused_with_lines_that_number_its
     assert f"    header: false\n    columns:    # {numbered}\n      t: {{column: 1, unit: s}}\n      Q1: {{" in lines
 
 
+@pytest.mark.parametrize(
+    ("row", "clock"),
+    [
+        ("{k} 40 20 20 20 20", "{column: 1, unit: s}"),
+        ("{a} {k} 20 20 20 20", "{column: 2, unit: s}"),
+        ("2026-11-20T08:30:{k:02d} {a} 20 20 20 20", "{column: 1}"),
+        ("{a} {b} 20 20 20 20", "{period: ...}    # no column increases as a clock does; "),
+    ],
+)
+def test_a_clock_is_proposed_only_for_a_column_that_increases(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], row: str, clock: str
+) -> None:
+    path = tmp_path / "run7.txt"
+    rows = (row.format(k=k, a=40 + k % 3, b=k // 20).replace(" ", "\t") for k in range(40))
+    path.write_text("Versuch 7, 20.11.2026\n" + "\n".join(rows) + "\n")
+    assert cli.main(["check", str(path), "--plant", "three_tank"]) == cli.MISUSE
+    assert f"\n      t: {clock}" in capsys.readouterr().err
+
+
 def test_a_file_without_its_option_is_told_the_option(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main(["train", "leak.yaml"])

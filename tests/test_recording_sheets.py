@@ -228,6 +228,19 @@ def test_empty_cells_of_inputs_without_held_are_told_once_with_the_fix(plant: Pl
         load_recordings([RecordingConfig(file="run.csv")], plant, tmp_path)
 
 
+@pytest.mark.parametrize("sort", [False, True])
+def test_a_column_that_is_no_clock_is_not_sorted(plant: PlantDescription, tmp_path: Path, sort: bool) -> None:
+    """A level for example; times that were rounded, and a file that was exported twice, are sorted as before."""
+    head = "t_s,Q_l_min,V_pct,h_mm\n"
+    level = head + "".join(f"{500 + (7 * k) % 30},60,50,{k}\n" for k in range(200))
+    with pytest.raises(ConfigError, match=r"it is no clock; name the column of time: .* \{t: \{period: 50 ms\}\}"):
+        read(plant, tmp_path, level, columns={"t": {"sort": sort}})
+    twice = head + 2 * "".join(f"{k},60,50,{500 + k}\n" for k in range(100))
+    rounded = head + "".join(f"{k // 20},60,50,{500 + k}\n" for k in range(200))
+    for rows, samples in ((twice, 100), (rounded, 10)):
+        assert len(read(plant, tmp_path, rows, columns={"t": {"sort": True}})) == samples
+
+
 def test_an_empty_input_is_told_with_its_own_name_and_unit(plant: PlantDescription, tmp_path: Path) -> None:
     (tmp_path / "run.csv").write_text("t_s,Q_l_min,V_pct,h_mm\n" + "".join(f"{k},,50,{k}\n" for k in range(40)))
     fix = r"give it a constant, as in columns: \{Q: \{constant: 0 l/min\}\}$"

@@ -12,7 +12,7 @@ from fdi_torch.config.yaml_files import find_data
 from fdi_torch.names import distinguishing_end, shortened, unknown
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text, si_unit_of
-from fdi_torch.recordings.csv_files import first_row, read_header
+from fdi_torch.recordings.csv_files import clock_of, first_row, read_header
 from fdi_torch.recordings.csv_tags import tag_columns
 from fdi_torch.recordings.csv_text import HeaderlessError, header_unit, names_in
 from fdi_torch.recordings.source import ChannelSource, ClockSource
@@ -171,7 +171,7 @@ def mapped(path: Path, plant: PlantDescription, also_known: Collection[str] = ()
         lines = [
             "header: false",
             f"columns:    # by number, 1 to {width}; first row: {row}",
-            "  t: {column: 1, unit: s}",
+            f"  t: {_clock(path)}",
         ]
         return [*lines, *(f"  {name}: {{column: ..., unit: ...}}" for name in missing)]
     if tags := tag_columns(header):
@@ -224,6 +224,15 @@ def _of_like_names(names: Sequence[str], columns: Sequence[str]) -> dict[str, st
         if not all(ends) or ends[0].isdigit() != ends[1].isdigit():
             found[open_names[0]] = open_columns[0]
     return found
+
+
+def _clock(path: Path) -> str:
+    """The entry of time for a table without a header."""
+    clock = clock_of(path)
+    if clock is None:
+        return "{period: ...}    # no column increases as a clock does; the time between rows, such as 1 s"
+    column, stamps = clock
+    return f"{{column: {column}}}" if stamps else f"{{column: {column}, unit: s}}"
 
 
 def _missing(path: Path, plant: PlantDescription, also_known: Collection[str]) -> list[str]:

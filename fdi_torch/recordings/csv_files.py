@@ -26,10 +26,12 @@ from fdi_torch.recordings.csv_tags import read_tags
 from fdi_torch.recordings.csv_text import heading_of, names_in, open_csv
 from fdi_torch.recordings.sheets import Sheet, in_order, informative_rows, merge_sheets, without_missing_rows
 from fdi_torch.recordings.source import ChannelSource, ClockSource, FileSource, clock_in, file_sha256
-from fdi_torch.recordings.time_stamps import StampReader, from_zone, offset_of_zone
+from fdi_torch.recordings.time_stamps import StampReader, from_zone, offset_of_zone, seconds_of
 from fdi_torch.units import spelled
 
 LINES_PER_BLOCK = 1 << 16
+ROWS_OF_CLOCK = 1000
+"""Rows in which a clock is looked for, where none is named."""
 SINCE_1970 = 1e8  # s; larger times are taken to be seconds since 1970
 
 
@@ -202,6 +204,29 @@ def first_row(path: Path) -> list[str]:
     with open_csv(path, None) as handle:
         heading, lines = heading_of(path, handle, header=False)
         return next(lines, "").strip().split(heading.delimiter)
+
+
+def clock_of(path: Path) -> tuple[int, bool] | None:
+    """The number of the first column that increases as a clock does in a table without a header, from 1, and whether it
+    has time stamps; None if there is none. A clock never goes back, and stands still in less than half of the rows.
+    """
+    with open_csv(path, None) as handle:
+        heading, lines = heading_of(path, handle, header=False)
+        rows = [line.strip().split(heading.delimiter) for line in islice(lines, ROWS_OF_CLOCK)]
+    for k in range(len(rows[0]) if rows else 0):
+        cells = [row[k] for row in rows if k < len(row)]
+        for read, stamps in ((_number, False), (seconds_of, True)):
+            try:
+                steps = np.diff([read(cell) for cell in cells])
+            except ValueError:
+                continue
+            if (steps >= 0.0).all() and (steps > 0.0).sum() > 0.5 * len(steps):
+                return k + 1, stamps
+    return None
+
+
+def _number(cell: str) -> float:
+    return float(cell.strip().strip('"').replace(",", "."))
 
 
 def _read_table(lines: Iterator[str], columns: Columns) -> tuple[np.ndarray, list[str]]:

@@ -16,6 +16,10 @@ from fdi_torch.recording import Hold
 
 LONG_AGO = 1e8  # s; larger times are seconds since 1970
 HOUR, NEARLY = 3600.0, 120.0  # s
+LATE_SHARE, LOST_SHARE = 0.1, 0.5
+"""A column is no clock if more than these shares of its rows come late, and have the time of another but other values:
+rows in any order of one clock have times of their own, and times that were rounded rarely decrease.
+"""
 HELD_MARGIN = 1e-3
 """Tolerance on the time for which a value is held, for sampling intervals that vary slightly."""
 
@@ -37,7 +41,8 @@ def in_order(
 
     Rows that repeat the one before are dropped; with `sort`, the others are sorted and rows with equal times merged.
     Of several values of a channel at one time the last one counts. place: format of a row in messages; rows: their
-    numbers. summer: advice for a clock that was set back by an hour. Raises ValueError if time does not increase.
+    numbers. summer: advice for a clock that was set back by an hour. Raises ValueError if time does not increase, and
+    with `sort` if most rows would be lost because the column is no clock.
     """
     notes = []
     repeated = (np.diff(seconds) == 0.0) & _equal(values[1:], values[:-1]).all(axis=1)
@@ -48,6 +53,15 @@ def in_order(
     decreasing = np.flatnonzero(np.diff(seconds) <= 0)
     if not len(decreasing):
         return seconds, values, notes
+    out_of_order = int((np.diff(seconds) < 0).sum())
+    times, merged, lost = _merged(seconds, values)
+    if out_of_order > LATE_SHARE * len(seconds) and lost > LOST_SHARE * len(seconds):
+        drop = int(np.argmax(np.diff(seconds) < 0))
+        raise ValueError(
+            f"{place.format(rows[drop + 1])}: expected time, got a column in which {out_of_order} of {len(seconds)} "
+            f"rows come late and {lost} have the time of another row: it is no clock; name the column of time: "
+            "columns: {t: {column: ..., unit: s}}, or give the time between rows: columns: {t: {period: 50 ms}}"
+        )
     if not sort:
         drop = int(decreasing[0])
         before, after = seconds[drop : drop + 2] - (seconds[0] if seconds[0] > LONG_AGO else 0.0)
@@ -59,8 +73,6 @@ def in_order(
             f"{place.format(rows[drop + 1])}: expected time that increases, got {after:g} s after {before:g} s "
             f"({counted(len(decreasing), 'such row')}); {fix}"
         )
-    out_of_order = int((np.diff(seconds) < 0).sum())
-    times, merged = _merged(seconds, values)
     notes.append(f"rows sorted by time: {out_of_order} came late, {len(seconds) - len(times)} had the time of another")
     return times, merged, notes
 
@@ -69,15 +81,16 @@ def _equal(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (a == b) | (np.isnan(a) & np.isnan(b))
 
 
-def _merged(seconds: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """One row per time, in order, with the last logged value of each channel."""
+def _merged(seconds: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """One row per time, in order, with the last logged value of each channel; and how many rows have another value."""
     order = np.argsort(seconds, kind="stable")
     times, place = np.unique(seconds, return_inverse=True)
     merged = np.full((len(times), values.shape[1]), np.nan)
     for k in range(values.shape[1]):
         logged = order[~np.isnan(values[order, k])]
         merged[place[logged], k] = values[logged, k]  # numpy keeps the last of several values for one index
-    return times, merged
+    lost = int((~np.isnan(values) & (values != merged[place])).any(axis=1).sum())
+    return times, merged, lost
 
 
 def merge_sheets(sheets: Sequence[Sheet], hold_times: Mapping[str, float], hold: Hold) -> Sheet:

@@ -8,7 +8,7 @@ level lies beyond that end. The commands check, gap, train and monitor all use t
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence, Set
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
@@ -67,8 +67,8 @@ def examined(plant: PlantDescription, recording: Recording, thorough: bool = Fal
     thorough: also for a recording fault beside an effect of the plant, which takes some seconds.
     """
     if not recording.trusted and (excessive := excessive_flows(plant, recording)):
-        columns = tuple(channel for channel, _ in excessive)
-        return CheckedRecording(recording, (), RecordingFault(columns, "; ".join(text for _, text in excessive)))
+        commands = tuple(channel for channel, _ in excessive)
+        return CheckedRecording(recording, (), RecordingFault(commands, "; ".join(text for _, text in excessive)))
     plant = _with_recorded_sensors(plant, recording)
     if len(recording) < FEWEST or not plant.sensors:
         return CheckedRecording(recording, (), None)
@@ -98,7 +98,7 @@ def examined(plant: PlantDescription, recording: Recording, thorough: bool = Fal
     return CheckedRecording(_with_notes(remaining, stuck), tuple(stuck), fault)
 
 
-def _unit_above_rim(plant: PlantDescription, recording: Recording, columns: Set[str]) -> RecordingFault | None:
+def _unit_above_rim(plant: PlantDescription, recording: Recording, columns: set[str]) -> RecordingFault | None:
     """The wrong unit of a sensor that reads above its rim (one of the columns), by the volume balance.
 
     A sensor that follows its level badly could explain the balance as well, but not readings above the rim; a wrong rim
