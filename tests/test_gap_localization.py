@@ -516,8 +516,7 @@ def test_constants_stay_within_their_tolerances_beside_an_effect_and_the_error_o
 @pytest.mark.slow
 @pytest.mark.parametrize("values", [{"Q1.pump_lag.time_constant": 15.0}, {"h2.sensor_hysteresis.play": 0.02}])
 def test_an_effect_with_memory_that_the_library_lacks_is_unknown_at_its_place(values: dict[str, float]) -> None:
-    recording = recorded(values, 5, samples=600)
-    answer = diagnose(nominal_plant(), recording, settings=Settings(leave_out=("pump_lag", "pump_delay")))
+    answer = diagnose(nominal_plant(), recorded(values, 5), settings=Settings(leave_out=("pump_lag", "pump_delay")))
     place = next(iter(values)).partition(".")[0]
     assert answer.verdict in ("unknown", "ambiguous")  # play looks much like a lag of the sensor
     assert answer.where[0][0] == place

@@ -18,7 +18,7 @@ from fdi_torch.effects import build_network
 from fdi_torch.estimate.fitting import set_up, start_levels
 from fdi_torch.estimate.hybrid import HybridResult, estimate_parameters
 from fdi_torch.jobs.run_setup import hybrid_settings, requested_space
-from fdi_torch.monitor.detection import NO_ALARM, Detector, make_detector
+from fdi_torch.monitor.detection import Detector, make_detector
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.observer_gain import hand_gain
@@ -161,8 +161,8 @@ def learnt(network: TankNetwork, fault_free: Recording, seed: int) -> tuple[Nois
 
 def first_alarm(time: Tensor, white: Tensor, detector: Detector) -> float | None:
     """Time of the first alarm of the white residual, s."""
-    index = int(detector.first_alarm(white))
-    return None if index == NO_ALARM else float(time[index])
+    alarms = detector.alarms(white).nonzero()
+    return float(time[alarms[0, 0]]) if len(alarms) else None
 
 
 def varies(recording: Recording) -> bool:

@@ -70,12 +70,9 @@ class Fitter:
 
     def network(self, placements: Sequence[Placement]) -> TankNetwork:
         """The plant with these effects added to its nominal effects, or in their place."""
-        known, key = self.data.networks, tuple(placements)
-        if key not in known:
-            replaced = {p.prefix for p in placements}
-            remaining = [p for p in self.data.nominal_effects if p.prefix not in replaced]
-            known[key] = TankNetwork(self.data.plant, _in_library_order([*remaining, *placements]))
-        return known[key]
+        replaced = {p.prefix for p in placements}
+        remaining = [p for p in self.data.nominal_effects if p.prefix not in replaced]
+        return TankNetwork(self.data.plant, _in_library_order([*remaining, *placements]))
 
     def fit(
         self,

@@ -113,11 +113,6 @@ class DataSet:
         )
 
     @cached_property
-    def networks(self) -> dict[tuple[Placement, ...], TankNetwork]:
-        """The plant with effects, by these, as built until now."""
-        return {}
-
-    @cached_property
     def per_recording(self) -> tuple[str, ...]:
         """Parameters that each recording has for itself: initial levels, constants that vary between recordings."""
         return (*self.plant.varying, *(f"{t.name}.start_level" for t in self.plant.tanks))

@@ -95,7 +95,7 @@ class _Run:
                 yield s
             self._set_clock(e.nodes[k], e.steps[k])  # reading a sample has changed the clock
             before = self._levels()
-            self.compute(p.step)
+            self._step()
             if any(0.0 < shares[s] < 1.0 for s in due):
                 self.compute(p.end)
             for s in [s for s in due if shares[s] > 0.0]:
@@ -143,6 +143,10 @@ class _Run:
     def _restore_memory(self, kind: str, first: int, count: int) -> None:
         if self.injection is not None and self.injection.memory is not None:
             self._set_state(kind, self.injection.memory[..., first : first + count])
+
+    def _step(self) -> None:
+        """One step of the grid."""
+        self.compute(self.program.step)
 
     def _levels(self) -> list[tuple[Tensor, Change]]:
         return self.state.group("level", self.program.order)
