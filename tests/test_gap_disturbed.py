@@ -16,7 +16,7 @@ from fdi_torch.config.plant_file import load_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.effects import effect
 from fdi_torch.estimate.evidence import ODDS
-from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.candidate_fit import Fitter

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from fdi_torch.config.plant_file import build_plant
 from fdi_torch.effects import effect
-from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.estimate.linear_parameters import without
+from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate

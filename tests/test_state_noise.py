@@ -10,7 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.kalman import KalmanFilter, Propagation, SensorNoise, StateNoise, Wander
+from fdi_torch.estimate.kalman import KalmanFilter, Propagation
+from fdi_torch.estimate.noise_model import SensorNoise, StateNoise, Wander
 from fdi_torch.estimate.state_noise import _Problem, estimate_state_noise
 
 DOUBLE = torch.float64

@@ -21,7 +21,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.kalman import SCATTER, KalmanFilter, Propagation, Score, SensorNoise, StateNoise
+from fdi_torch.estimate.kalman import KalmanFilter, Propagation, Score
+from fdi_torch.estimate.noise_model import SCATTER, SensorNoise, StateNoise
 
 CORRELATION_TIMES = (0.0, 5.0, 20.0, 80.0, 320.0)  # grid of candidates, in sampling intervals; 0: white
 LIKELIHOOD_TOLERANCE = 0.1  # nats; the optimisation ends when an iteration gains less

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.gap.answer import UNKNOWN, CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter

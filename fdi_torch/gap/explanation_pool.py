@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 
 from fdi_torch.estimate.evidence import RARE, TOLERANCE
-from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit, Key
 from fdi_torch.gap.candidate_fit import Fitter

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from fdi_torch.estimate.evidence import log_prior as prior_of_set
 from fdi_torch.estimate.evidence import log_volume
-from fdi_torch.estimate.kalman import KalmanFilter, KalmanWhitening, Propagation, SensorNoise, StateNoise
+from fdi_torch.estimate.kalman import KalmanFilter, KalmanWhitening, Propagation
+from fdi_torch.estimate.noise_model import SensorNoise, StateNoise
 from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.gap.candidate import Fit, Key
 from fdi_torch.gap.candidate_fit import Fitter
 

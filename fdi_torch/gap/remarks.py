@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from fdi_torch.effects import EFFECTS, all_placements, effect
-from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.estimate.uncertainty import end_reached
 from fdi_torch.gap.answer import CERTAIN
 from fdi_torch.gap.candidate import Candidate, Fit

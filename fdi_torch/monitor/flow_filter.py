@@ -22,7 +22,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.kalman import SCATTER, StateNoise
+from fdi_torch.estimate.noise_model import SCATTER, StateNoise
 from fdi_torch.estimate.state_noise import LOG_BOUND
 from fdi_torch.monitor.observer_gain import Gain, Linear, kalman_gain, riccati, with_effects
 from fdi_torch.simulate.build import load_library

@@ -13,7 +13,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.kalman import Propagation, SensorNoise, StateNoise
+from fdi_torch.estimate.kalman import Propagation
+from fdi_torch.estimate.noise_model import SensorNoise, StateNoise
 from fdi_torch.estimate.state_noise import CORRELATION_TIMES, Likelihood, estimate_state_noise
 from fdi_torch.monitor.flow_filter import FlowFilter, forcing
 from fdi_torch.monitor.observer_gain import Gain, Linear

@@ -23,19 +23,13 @@ from fdi_torch.plant.signals import Clock
 __all__ = [
     *("Effect", "Memory", "Placement", "Stage"),
     *("expect_fit", "fits", "place_kind", "place_kinds_of", "placed_parameters"),
-    *(
-        "Clock",
-        "Equivalents",
-        "Local",
-        "OperatingRange",
-        "Parameter",
-        "PlantDescription",
-        "Values",
-    ),  # for the files of effects
+    # for the files of effects
+    *("Clock", "Equivalents", "Local", "OperatingRange", "Parameter", "PlantDescription", "Values"),
 ]
 
 Memory = tuple["torch.Tensor", ...]
 Equivalents = Mapping[tuple[str, str], Mapping[str, float]]
+"""Parameters (SI, short names) by effect and place."""
 
 
 class Stage(Enum):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.evidence import TOLERANCE
-from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_columns import Discrepancy, Selection

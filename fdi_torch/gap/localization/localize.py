@@ -16,7 +16,7 @@ from operator import itemgetter
 import torch
 
 from fdi_torch.estimate.evidence import RARE, TOLERANCE
-from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_ascent import Ascent, gain_of

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.kalman import StateNoise
 from fdi_torch.estimate.linear_parameters import decomposed, without
+from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_columns import Selection

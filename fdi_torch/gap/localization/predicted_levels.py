@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.kalman import StateNoise
+from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, pieces_of, with_disturbances

@@ -17,7 +17,7 @@ from functools import partial
 import torch
 
 from fdi_torch.estimate.evidence import RARE
-from fdi_torch.estimate.kalman import SCATTER, StateNoise, Wander
+from fdi_torch.estimate.noise_model import SCATTER, StateNoise, Wander
 from fdi_torch.estimate.state_noise import CORRELATION_TIMES, LOG_BOUND
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
