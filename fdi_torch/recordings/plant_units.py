@@ -46,8 +46,8 @@ CONFIDENCE = 0.95
 EXCESSIVE = math.sqrt(60.0)
 """A command of more than this share of its pump's maximum has a wrong unit, or the maximum is wrong. A unit per second
 in place of one per minute, or per minute in place of one per hour, is a factor of 60: its square root lies, in ratio,
-as far from a right command of the whole maximum as from one in a wrong unit. Controllers that ask for more than their
-pump delivers stay below."""
+as far from a right command of the whole maximum as from one in a wrong unit. A controller may ask for somewhat more
+than its pump delivers; of one that asks for more than this, the recording must be declared `trusted`."""
 
 
 @dataclass(frozen=True)
