@@ -23,6 +23,7 @@ from fdi_torch.gap.localization.discrepancy_ascent import Ascent
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.fine_positions import Positions
 from fdi_torch.gap.localization.localize import localize
+from fdi_torch.gap.localization.localized_discrepancy import log_likelihood
 from fdi_torch.gap.localization.predicted_levels import LevelFilter, measured_levels
 from fdi_torch.gap.localization.random_processes import random_flows
 from fdi_torch.gap.localization.regressor_families import Relays
@@ -208,6 +209,24 @@ def test_noise_and_evidence_of_a_discrepancy_refer_to_one_trajectory(
     of_parameters = float(torch.linalg.slogdet(design.T @ design + torch.diag(root**2))[1])
     squares = least_chi_square(under, fit, about) + of_parameters + under.log_det
     assert likely.log_likelihood == pytest.approx(likely.noise.log_prior() - 0.5 * squares, abs=1e-2)
+
+
+def test_a_linearised_plant_so_unstable_that_rounding_hides_the_readings_has_no_evidence(
+    far_from_the_plant: tuple[Fitter, Fit, StateNoise],
+) -> None:
+    fitter, fit, noise = far_from_the_plant
+    own = fit.linearised
+    evidence = []
+    for growth in (1.0, 1.05):
+        deviation = [torch.full_like(own.levels[0, 0], 1e-3)]
+        for transition in growth * own.transition[0]:
+            deviation.append(transition @ deviation[-1])
+        at_samples = torch.stack(deviation)[fitter.data.experiment.sample_step]
+        readings = own.readings + at_samples[..., : own.readings.shape[-1]]
+        unstable = replace(own, transition=growth * own.transition, readings=readings)
+        evidence.append(log_likelihood(with_disturbances(fitter, fit, noise, unstable), fit, unstable))
+    assert evidence[0] > -math.inf
+    assert evidence[1] == -math.inf
 
 
 def test_a_discrepancy_as_fast_as_the_noise_is_found_although_it_has_enlarged_the_estimate_of_the_noise() -> None:

@@ -20,6 +20,7 @@ from fdi_torch.gap.marginal_likelihood import occam, with_disturbances
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.linearised import Linearised
 
+ROUNDED = 1e-3  # rounding errors of readings and their derivatives that count as none, in units of the sensor noise
 COLLINEAR = 1e-12  # minimum share of a parameter's variance that others leave, a limit of rounding
 
 
@@ -111,12 +112,21 @@ class LocalizedDiscrepancy:
 
 
 def log_likelihood(fitter: Fitter, fit: Fit, linearised: Linearised) -> float:
-    """Log evidence of a fit about a linearised trajectory, without prior odds; minus infinity if it is not finite."""
+    """Log evidence of a fit about a linearised trajectory, without prior odds.
+
+    Minus infinity if it is not finite, or if the innovations are lost to rounding. A plant linearised about levels that
+    are none of its trajectories may be unstable: where the cross-section of a tank falls to a tenth within millimetres,
+    deviations grew by a factor of 100 per second, up to 1e57 m. Such innovations are rounding errors, or exactly zero.
+    """
     space, theta = fit.space, fit.theta
     residual, jacobian = (x[0] for x in fitter.white(linearised))
-    if not math.isfinite(fitter.log_det + float(residual.square().sum() + jacobian.square().sum())):
-        return -math.inf
     scale, pull, off = fitter.priors(space, theta)
+    columns = torch.cat([linearised.readings[0].unsqueeze(-1), linearised.jacobian[0] * scale], dim=-1)
+    largest = float((columns.abs().amax(dim=(0, 2)) / fitter.noise.std).max())
+    in_noise = largest * torch.finfo(columns.dtype).eps
+    total = fitter.log_det + float(residual.square().sum() + jacobian.square().sum())
+    if not (math.isfinite(total) and in_noise < ROUNDED):
+        return -math.inf
     basis, _ = decomposed((jacobian * scale).flatten(0, 1), pull)
     remaining = without(basis, torch.cat([residual.flatten(), -off]).unsqueeze(1))
     return -0.5 * float(remaining.square().sum()) - 0.5 * fitter.log_det + occam(fitter, space, theta, jacobian)
