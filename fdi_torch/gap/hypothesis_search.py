@@ -23,7 +23,7 @@ from fdi_torch.gap.cause_hypothesis import (
 )
 from fdi_torch.gap.explanation_pool import EXTENSION, ExplanationPool
 from fdi_torch.gap.hypothesis_weights import HypothesisWeights
-from fdi_torch.gap.localization.localize import localize, localize_beside
+from fdi_torch.gap.localization.localize import CALIBRATED, Shortfall, localize, localize_beside
 from fdi_torch.gap.localization.localized_discrepancy import (
     LocalizedDiscrepancy,
     log_likelihood,
@@ -46,6 +46,7 @@ class HypothesisSearch:
         # By the explanation's id, and the place; and the explanations' ids.
         self._evaluated: dict[tuple[int, str], list[CauseHypothesis]] = {}
         self._at_all_places: set[int] = set()
+        self._shortfall = Shortfall()
         # Unknowns at whose place the effects of the library were fitted: the causes beside each, and its place.
         self._with_names: set[tuple[frozenset[CauseName], str]] = set()
 
@@ -70,12 +71,21 @@ class HypothesisSearch:
             fewer for h in hypotheses if h.weight > least for fewer in self.weights.without_small_effects(h)
         ]
 
-    def alone(self, explanation: RankedExplanation, best: float) -> CauseHypothesis:
-        """An explanation without a discrepancy, linearised about the levels that it predicts, where discrepancies are:
-        their gains shall not contain that of another point. best: weight of the likeliest explanation."""
-        needed = best + math.log(RARE) - explanation.log_weight
-        gain = localize(explanation.fitter, explanation.fit, explanation.noise, (), needed=needed).itself
-        return CauseHypothesis(explanation, causes_in_order(explanation.fit), explanation.log_weight + gain)
+    def alone(self, explanations: Sequence[RankedExplanation]) -> list[CauseHypothesis]:
+        """Explanations without a discrepancy, linearised about the levels that they predict, where discrepancies are:
+        their gains shall not contain that of another point.
+
+        explanations: the likeliest first. One that would be irrelevant even if it gained as much by that as the
+        likeliest ones keeps the evidence about its own trajectory.
+        """
+        hypotheses, best, largest = list[CauseHypothesis](), -math.inf, 0.0
+        for k, e in enumerate(explanations):
+            gain, needed = 0.0, best + math.log(RARE) - e.log_weight
+            if k < CALIBRATED or largest > needed:
+                gain = localize(e.fitter, e.fit, e.noise, (), needed=needed).itself
+            best, largest = max(best, e.log_weight + gain), max(largest, gain)
+            hypotheses.append(CauseHypothesis(e, causes_in_order(e.fit), e.log_weight + gain))
+        return hypotheses
 
     def _everywhere(self, explanation: RankedExplanation, best: CauseHypothesis) -> list[CauseHypothesis]:
         """An explanation with a discrepancy at each place; none if it was evaluated before."""
@@ -88,12 +98,16 @@ class HypothesisSearch:
         self, explanation: RankedExplanation, at: Sequence[str], best: CauseHypothesis | None = None
     ) -> list[CauseHypothesis]:
         """An explanation alone, and with a discrepancy at each of the places unless it is far worse than `best`."""
-        if all((id(explanation), place) in self._evaluated for place in at):
-            return [h for place in at for h in self._evaluated[id(explanation), place]]
+        known = [h for place in at for h in self._evaluated.get((id(explanation), place), ())]
+        at = [place for place in at if (id(explanation), place) not in self._evaluated]
+        if not at:
+            return known
         needed, rival = (self._needed(explanation, best), best.noise) if best else (-math.inf, None)
         fitter, fit, noise = explanation.fitter, explanation.fit, explanation.noise
         odds, step = self.weights.log_odds, self.pool.progress.step
-        localization = localize(fitter, fit, noise, at, needed=needed, rival=rival, log_odds=odds, step=step)
+        localization = localize(
+            fitter, fit, noise, at, needed=needed, rival=rival, log_odds=odds, earlier=self._shortfall, step=step
+        )
         hypotheses = {
             (id(explanation), d.location): self.weights.with_discrepancy(explanation, d)
             for d in localization.discrepancies
@@ -101,7 +115,7 @@ class HypothesisSearch:
         self._evaluated |= hypotheses
         causes = causes_in_order(explanation.fit)
         alone = CauseHypothesis(explanation, causes, explanation.log_weight + localization.itself)
-        return [alone, *(h for each in hypotheses.values() for h in each)]
+        return [alone, *known, *(h for each in hypotheses.values() for h in each)]
 
     def _climbed(self, best: CauseHypothesis) -> list[CauseHypothesis]:
         """Hypotheses with an effect fewer or more than the best, or else with a discrepancy at another place, while

@@ -56,8 +56,7 @@ def posterior_of(
     place is called unknown. named_only: without unknown discrepancies.
     """
     search = HypothesisSearch(pool, options, places)
-    best = max(e.log_weight for e in result.explanations)
-    named = [search.alone(e, best) for e in result.explanations]
+    named = search.alone(result.explanations)
     hypotheses = named if named_only else search.search(result, named)
     by_causes: dict[tuple[frozenset[frozenset[CauseName]], str | None], CauseHypothesis] = {}
     for h in sorted(hypotheses, key=lambda h: -h.weight):

@@ -35,7 +35,24 @@ from fdi_torch.gap.localization.regressors import likely_frequencies, step_funct
 from fdi_torch.gap.localization.single_regressor_gain import SingleRegressorGains
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, occam, with_disturbances
 
-CALIBRATION_PLACES = 3  # places always evaluated; they show how far first-order gains are too low
+CALIBRATED = 3  # evaluations after which a gain that was estimated is trusted to be no further too low than theirs
+
+
+@dataclass
+class Shortfall:
+    """By how much first-order gains were too low in all localizations of a search, relative to the gains of the
+    regressors alone: the largest ratio at the places `examined`."""
+
+    largest: float = -math.inf
+    examined: int = 0
+
+    def note(self, gain: float, expected: float, alone: float) -> None:
+        """A place of which `gain` was found where `expected` is the first-order gain, `alone` that of its regressor."""
+        self.largest, self.examined = max(self.largest, (gain - expected) / max(alone, 1.0)), self.examined + 1
+
+    def excludes(self, expected: float, alone: float, needed: float) -> bool:
+        """Whether a place cannot gain `needed`, if its first-order gain is no further too low than others were."""
+        return self.examined >= CALIBRATED and expected + self.largest * alone < needed
 
 
 @dataclass(frozen=True)
@@ -56,13 +73,15 @@ def localize(
     needed: float = -math.inf,
     rival: StateNoise | None = None,
     log_odds: float = 0.0,
+    earlier: Shortfall | None = None,
     step: Callable[[], None] = lambda: None,
 ) -> Localization:
     """Evaluate a discrepancy at each of the places. One that selects no regressor is not in the result.
 
     fitter: with the disturbance noise of the fit. needed: gain in log evidence below which a discrepancy is irrelevant;
     there are none in the result if none can reach it. rival: the noise that a likelier hypothesis left. log_odds: prior
-    log odds of a discrepancy at one place against none. step: called when a place has been examined.
+    log odds of a discrepancy at one place against none. earlier: in other localizations of the same recordings; these
+    here are added. step: called when a place has been examined.
     """
     base = log_likelihood(fitter, fit, fit.linearised) + noise.log_prior()
     scale = torch.minimum(noise.scale, rival.scale) if rival else noise.scale
@@ -83,14 +102,14 @@ def localize(
     if hopeless and all(expected < needed for expected, _ in first_order.values()):
         return Localization((), itself)
     evaluated: dict[str, LocalizedDiscrepancy] = {}
-    growth, examined = -math.inf, 0  # growth: largest ratio so far of what a first-order gain lacks to that gain
+    earlier, here = earlier or Shortfall(), Shortfall()
     for place, (expected, alone) in sorted(first_order.items(), key=lambda item: -item[1][0]):
-        if examined >= CALIBRATION_PLACES and expected + growth * alone < needed:
+        if any(shortfall.excludes(expected, alone, needed) for shortfall in (earlier, here)):
             continue
         best = ascent.climbed(ascent.under_less_and_less_noise(regression, place, likely), needed)
-        examined += 1
         step()
-        growth = max(growth, (best.gain - expected) / max(alone, 1.0))
+        for shortfall in (earlier, here):
+            shortfall.note(best.gain, expected, alone)
         selected = bool(best.regressed.used.any())
         itself = max(itself, best.without if best.regression is regression or not selected else -math.inf)
         needed = max(needed, itself - log_odds + math.log(RARE))
@@ -119,7 +138,7 @@ def _about_predicted(
     """
     about_each = []
     for measured in (False, True):
-        level_filter = measured_filter(fitter, fit) if measured else LevelFilter(noise)
+        level_filter = measured_filter(fitter, fit, noise) if measured else LevelFilter(noise)
         regression = DiscrepancyRegression(fitter, fit, frequencies, level_filter)
         linearised, likely = regression.linearised, level_filter.noise
         evidence = log_evidence(fitter, fit, likely, linearised)

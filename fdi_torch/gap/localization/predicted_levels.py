@@ -51,10 +51,10 @@ class LevelFilter:
         return levels
 
 
-def measured_filter(fitter: Fitter, fit: Fit) -> LevelFilter:
-    """The filter about the measured levels, with the noise that is most likely there."""
+def measured_filter(fitter: Fitter, fit: Fit, noise: StateNoise) -> LevelFilter:
+    """The filter about the measured levels, with the noise that is most likely there. noise: initial values."""
     along = measured_levels(fitter, fit)
-    return LevelFilter(estimate_disturbances(fitter, fit, _linearised(fitter, fit, along)).noise, along)
+    return LevelFilter(estimate_disturbances(fitter, fit, _linearised(fitter, fit, along), start=noise).noise, along)
 
 
 def _linearised(fitter: Fitter, fit: Fit, levels: Tensor) -> Linearised:
