@@ -11,6 +11,7 @@ import torch
 
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import effect
+from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
@@ -22,7 +23,9 @@ from fdi_torch.gap.localization.localized_discrepancy import Estimate, Localized
 from fdi_torch.gap.marginal_likelihood import log_evidence, occam
 from fdi_torch.gap.problem import PLAIN, problem_of
 from fdi_torch.gap.ranked_explanation import RankedExplanation
+from fdi_torch.gap.screening import options_of
 from fdi_torch.plant.effect import Placement
+from fdi_torch.plant.operating_range import operating_range_of
 from tests.rigs import random_steps
 from tests.test_gap_convergence import recorded
 
@@ -120,6 +123,31 @@ def test_an_effect_that_the_readings_need_is_not_left_out() -> None:
     h = hypothesis_of(fitter, fitter.fit(Candidate((GAIN,), ({"h1.sensor_gain.factor": 1.01},)), null))
     pool = cast(ExplanationPool, SimpleNamespace(fitter=fitter, choices=CHOICES))
     assert all(r.weight < h.weight - 20.0 for r in HypothesisWeights(pool, (), 1).without_small_effects(h))
+
+
+@pytest.mark.parametrize(("second", "describes"), [("area_taper", False), ("unmetered_flow", True)])
+def test_a_cross_section_is_no_error_of_the_law_of_a_leak(
+    sound: tuple[Fitter, Fit], second: str, describes: bool
+) -> None:
+    fitter, null = sound
+    leak, other = Placement(effect("leak"), "T2"), Placement(effect(second), "T2")
+    size = other.effect.parameters("T2", THREE_TANK)[0]
+    start = {"T2.leak.size": 0.1, other.full_name(size.name): 0.1 * size.high}
+    both = RankedExplanation(
+        fitter.fit(Candidate((leak, other), (start,)), null), fitter, StateNoise(torch.ones(3), 0.0, torch.ones(3)), 0.0
+    )
+
+    def without(_: RankedExplanation, cause: CauseName) -> RankedExplanation:
+        (left,) = (p for p in (leak, other) if p.cause != cause)
+        fit = fitter.fit(Candidate((left,), (both.fit.values_of([left]),)), null)
+        return RankedExplanation(fit, fitter, both.noise, 0.0)
+
+    pool = cast(ExplanationPool, SimpleNamespace(fitter=fitter, choices=CHOICES, without=without))
+    options = options_of([leak, other], fitter, operating_range_of(fitter.data.recording, THREE_TANK))
+    variants = HypothesisWeights(pool, options, 1).with_inexact_laws(
+        CauseHypothesis(both, causes_in_order(both.fit), 0.0)
+    )
+    assert bool(variants) is describes
 
 
 @pytest.mark.parametrize("factor", [0.95, 1.05])

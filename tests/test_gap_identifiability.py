@@ -15,7 +15,13 @@ from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.experiment_design import HIGH, discriminating_input, planned_recording
-from fdi_torch.gap.identifiability import DRAWS, identifiability, simulated_confusions, unsearched_twins
+from fdi_torch.gap.identifiability import (
+    DRAWS,
+    exact_areas_like,
+    identifiability,
+    simulated_confusions,
+    unsearched_twins,
+)
 from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.gap.screening import Option, Pairs, options_of, screen
 from fdi_torch.plant.effect import Placement
@@ -123,6 +129,21 @@ def test_a_dead_zone_below_all_commands_has_an_offset_as_twin(
     offsets = [Placement(effect("pump_offset"), pump) for pump in ("Q1", "Q2")]
     reach = operating_range_of(fitter.data.recording, nominal_plant())
     assert unsearched_twins(fitter, fit, placed, options_of(offsets, fitter, reach), 0.95) == twins
+
+
+def test_a_cross_section_that_counts_as_exact_explains_what_a_taper_does() -> None:
+    white = Noise(torch.full((3,), 1e-3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64))
+    area = nominal_plant().tank("T3").area
+    fitter = Fitter(checked_data_set(nominal_plant(), (), [recorded({"T3.area": 1.05 * area}, 9)], None), white)
+    taper, gain = Placement(effect("area_taper"), "T3"), Placement(effect("sensor_gain"), "h3")
+    starts = taper.effect.starts("T3", nominal_plant(), operating_range_of(fitter.data.recording, nominal_plant()))
+    fit = fitter.fit(Candidate((taper,), tuple({taper.full_name(n): v for n, v in s.items()} for s in starts)))
+    areas = exact_areas_like(fitter, fit, taper, 0.95)
+    assert areas["T3.area"] == pytest.approx(1.05 * area, rel=0.01)
+    # A sensor's gain of 1.2 is no cross-section.
+    fitter = Fitter(checked_data_set(nominal_plant(), (), [recorded({"h3.sensor_gain.factor": 1.2}, 9)], None), white)
+    fit = fitter.fit(Candidate((gain,), ({"h3.sensor_gain.factor": 1.1},)))
+    assert not exact_areas_like(fitter, fit, gain, 0.95)
 
 
 def test_explanations_with_the_same_prediction_are_not_separated(rivals: Fitter) -> None:

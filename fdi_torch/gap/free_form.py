@@ -145,7 +145,7 @@ def fitted_free_form(
     placements = [
         p
         for p in free_form(unknown.location, plant, reach, unknown.periods)
-        if ("area" if p.effect.stage is Stage.STORAGE else "flow") in unknown.quantities
+        if ("area" if p.effect.changes_area else "flow") in unknown.quantities
     ]
     start = {p.full_name(c.name): 0.0 for p in placements for c in p.effect.parameters(p.location, plant)}
     start |= fit.values_of(effects)

@@ -104,12 +104,14 @@ class HypothesisWeights:
     def with_inexact_laws(self, h: CauseHypothesis) -> list[CauseHypothesis]:
         """Variants without effects that may only describe the error of the law of another effect at their place.
 
-        Such an effect costs its selection among all effects there instead of the prior odds of one more cause.
+        Such an effect costs its selection among all effects there instead of the prior odds of one more cause. One that
+        changes the cross-section of a tank is no error of a flow's law.
         """
         explained: list[CauseHypothesis] = []
         fitter, fit = self.pool.fitter, h.explanation.fit
+        changes = {p.cause: (p.location, p.effect.changes_area) for p in fit.candidate.placements}
         for cause in h.causes:
-            at_place = [c for c in h.causes if c[1] == cause[1]]
+            at_place = [c for c in h.causes if changes[c] == changes[cause]]
             if len(at_place) > 1:
                 error = relative_size(fitter, fit, influence(fitter, fit, [cause]), at_place)
                 reduced = self.pool.without(h.explanation, cause)

@@ -31,7 +31,18 @@ from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.extensions import size_of
 from fdi_torch.gap.library import equivalence_class, library_of
-from fdi_torch.gap.screening import Option, Pairs, most_visible, options_of, pairs_of, products, screen
+from fdi_torch.gap.screening import (
+    Option,
+    Pairs,
+    effect_columns,
+    most_visible,
+    options_of,
+    pairs_of,
+    products,
+    products_of,
+    screen,
+)
+from fdi_torch.gap.start_choice import vector_of
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of
@@ -114,6 +125,35 @@ def unsearched_twins(
     near = float(gram[0, 0]) - explained < 2.0 * math.log(level / (1.0 - level))
     each = zip(options, near, strength, explained, strict=True)
     return tuple(dict.fromkeys(o.cause for o, is_near, s, gap in each if is_near and _possible(o, s, float(gap))))
+
+
+def exact_areas_like(fitter: Fitter, fit: Fit, explained: Placement | Tensor, level: float) -> dict[str, float]:
+    """Cross-sections of tanks without tolerance that would explain the readings about as well as a cause of a fit, to
+    first order, by name, with the values that they would need, m^2.
+
+    explained: one of the fit's effects, or what something unknown explains of the readings (S, C). level: as in
+    `unsearched_twins`. An error of any other constant is itself an effect of the library: plugging, the gain of a pump,
+    or the gain or bias of a sensor.
+    """
+    constants = fitter.network(fit.candidate.placements).constants
+    areas = [constants[n] for t in fitter.data.plant.tanks if (n := f"{t.name}.area") not in fit.space]
+    if not areas:
+        return {}
+    engine = fitter.engine(fit.candidate, [*fit.effect_values, *(a.name for a in areas)], [a.name for a in areas])
+    theta = vector_of(engine.space, fit.values).unsqueeze(0)
+    columns = engine.linearise(theta, fit.linearised.levels).jacobian[0]
+    besides: dict[str, float] = {} if isinstance(explained, Tensor) else fit.values_of([explained])
+    own = (
+        explained
+        if isinstance(explained, Tensor)
+        else effect_columns(fitter, fit, [Option(explained, besides)])[..., 0]
+    )
+    _, gram = products_of(fitter, fit, torch.cat([own.unsqueeze(-1), columns], dim=-1), tuple(besides))
+    change = gram[0, 1:] / torch.diagonal(gram)[1:].clamp(min=VISIBLE)
+    left = float(gram[0, 0]) - gram[0, 1:] * change
+    near = left < 2.0 * math.log(level / (1.0 - level))
+    values = ((a, a.nominal + float(c)) for a, c, is_near in zip(areas, change, near, strict=True) if is_near)
+    return {a.name: value for a, value in values if a.low < value < a.high}
 
 
 DRAWS, SEED = 40, 0

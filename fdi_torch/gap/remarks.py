@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from fdi_torch.effects import EFFECTS, all_placements, effect
 from fdi_torch.estimate.noise_model import StateNoise
@@ -19,13 +20,14 @@ from fdi_torch.gap.channel_noise import low_frequency_excess
 from fdi_torch.gap.diagnosis_result import DiagnosisResult, unexplained_chi_square
 from fdi_torch.gap.free_form import discrepancy_tables
 from fdi_torch.gap.holdout import HeldOut
-from fdi_torch.gap.identifiability import unsearched_twins
+from fdi_torch.gap.identifiability import exact_areas_like, unsearched_twins
 from fdi_torch.gap.library import equivalence_class
 from fdi_torch.gap.preprocess.outliers import SensorOutliers
 from fdi_torch.gap.screening import options_of
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.constants import flow_scale
 from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.effect import Placement
 from fdi_torch.quantities import quantity_text
 from fdi_torch.recordings.check import data_warnings
 
@@ -59,7 +61,7 @@ def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
     remarks += implausible_flows(data.plant, result.posterior.best.noise, data.row_spacing)
     remarks += [_masked_outliers(s) for group in result.outliers for s in group]
     remarks += [*_nominal_values_out_of_range(data.plant), *_values_at_bounds(result), *_periods(result)]
-    remarks += _twins_outside_library(result)
+    remarks += [*_exact_areas(result), *_twins_outside_library(result)]
     on_holdouts = [remark(result, h) for remark in (_free_form_fails, rig_difference) for h in held]
     return remarks + [sentence for sentence in on_holdouts if sentence]
 
@@ -142,6 +144,29 @@ def _twins_outside_library(result: DiagnosisResult) -> list[str]:
         for cause, others in twins.items()
         if others
     ]
+
+
+def _exact_areas(result: DiagnosisResult) -> list[str]:
+    """Cross-sections without tolerance, each of which would explain the readings about as well as a cause."""
+    best, fitter, plant = result.posterior.best, result.fitter, result.fitter.data.plant
+    each = best.fit.candidate.placements
+    causes: dict[str, Placement | Tensor] = {f"{p.effect.name} at {p.location}": p for p in each}
+    if best.unknown:
+        causes[f"something unknown at {best.unknown_at}"] = best.unknown.explained
+    remarks = []
+    for cause, explained in causes.items():
+        areas = exact_areas_like(fitter, best.fit, explained, CERTAIN)
+        given = [plant.tank(ParameterName.parse(name).place).area for name in areas]
+        shown = [
+            f"{name} {quantity_text(value, 'm^2', 3, name)} in place of {quantity_text(before, 'm^2', 3, name)}"
+            for (name, value), before in zip(areas.items(), given, strict=True)
+        ]
+        if shown:
+            remarks.append(
+                f"a constant without a tolerance counts as exact, but {' or '.join(shown)} would explain the recording "
+                f"about as well as {cause}: measure it, or list a tolerance, as in tolerances: {{{[*areas][-1]}: 10 %}}"
+            )
+    return remarks
 
 
 def _nominal_values_out_of_range(plant: PlantDescription) -> list[str]:

@@ -155,8 +155,12 @@ def products(fitter: Fitter, fit: Fit, options: Sequence[Option], besides: Seque
 
     besides: parameters of the fit that are not projected out.
     """
-    regression = _ProjectedRegression.of(fitter, fit, besides)
-    white, shared, score = regression.projected(effect_columns(fitter, fit, options))
+    return products_of(fitter, fit, effect_columns(fitter, fit, options), besides)
+
+
+def products_of(fitter: Fitter, fit: Fit, columns: Tensor, besides: Sequence[str] = ()) -> tuple[Tensor, Tensor]:
+    """Score (M,) and gram (M, M) of changes of the readings (S, C, M), as in `products`."""
+    white, shared, score = _ProjectedRegression.of(fitter, fit, besides).projected(columns)
     return score, (white @ white.mT).sum(dim=0) - shared @ shared.T
 
 

@@ -75,6 +75,11 @@ class Effect:
     searched: ClassVar[bool] = True
     mistaken_for: ClassVar[tuple[str, ...]] = ()
 
+    @property
+    def changes_area(self) -> bool:
+        """Whether it changes the cross-section of a tank, as opposed to a flow or a reading."""
+        return self.stage is Stage.STORAGE
+
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         """Its parameters at that place, size first, under their short names; ranges may depend on the component."""
         raise NotImplementedError
