@@ -8,12 +8,14 @@ and an effect whose size may be zero is none.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import torch
 
+from fdi_torch.effects import effect
 from fdi_torch.estimate.evidence import ODDS, log_law_error, log_odds_of_law
+from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Key
 from fdi_torch.gap.cause_hypothesis import CauseHypothesis, causes_in_order, influence, relative_size
 from fdi_torch.gap.explanation_pool import ExplanationPool
@@ -44,15 +46,18 @@ class HypothesisWeights:
     def with_discrepancy(self, explanation: RankedExplanation, at: LocalizedDiscrepancy) -> list[CauseHypothesis]:
         """An explanation with a discrepancy at one place, which may be the error of the law of an effect there.
 
-        The odds divide the weight: both hypotheses together have the prior of the explanation.
+        The odds divide the weight: both hypotheses together have the prior of the explanation. A discrepancy that
+        changes only the cross-section of a tank is no error of a flow's law, but a second deviation there.
         """
         causes = causes_in_order(explanation.fit)
         # A random flow into a tank may stand for the error of any flow there.
         flow = at.noise.apart is not None
-        effects = [c for c in causes if c[1] == at.location or (flow and at.location in tanks_of(c[1], self.plant))]
+        beside = [c for c in causes if c[1] == at.location or (flow and at.location in tanks_of(c[1], self.plant))]
+        effects = [c for c in beside if quantity(c) in at.quantities]
         weight = explanation.log_weight + at.gain
         if not effects:
-            return [CauseHypothesis(explanation, causes, weight + self.log_odds, at)]
+            odds = self.log_odds + (math.log(ODDS.same_place) if beside else 0.0)
+            return [CauseHypothesis(explanation, causes, weight + odds, at)]
         error = relative_size(self.pool.fitter, explanation.fit, at.size, effects) if at.size > 0.0 else None
         law, other = _shares([self._log_odds_of_law(error)])
         other += sum(self._log_selection(place) for _, place in effects)  # they describe a part of the other law
@@ -72,7 +77,7 @@ class HypothesisWeights:
         """The hypothesis, and those of single effects in place of its unknown, with its weight divided among them."""
         if h.unknown is None:
             return [h]
-        named = self.named(h)
+        named = [e for e in self.named(h) if _may_be(h.unknown, e.key - set(h.causes))]
         errors = [self._law_error(e, h.explanation, h.unknown) for e in named]
         *shares, other = _shares([self._log_odds_of_law(error) for error in errors])
         weights = [h.weight + share for share in shares]
@@ -109,9 +114,8 @@ class HypothesisWeights:
         """
         explained: list[CauseHypothesis] = []
         fitter, fit = self.pool.fitter, h.explanation.fit
-        changes = {p.cause: (p.location, p.effect.changes_area) for p in fit.candidate.placements}
         for cause in h.causes:
-            at_place = [c for c in h.causes if changes[c] == changes[cause]]
+            at_place = [c for c in h.causes if c[1] == cause[1] and quantity(c) == quantity(cause)]
             if len(at_place) > 1:
                 error = relative_size(fitter, fit, influence(fitter, fit, [cause]), at_place)
                 reduced = self.pool.without(h.explanation, cause)
@@ -152,6 +156,16 @@ class HypothesisWeights:
                     (replace(reduced, causes=causes, weight=weight), key - {p.cause}, {**fixed, i: nothing})
                 )
         return [variant for variant, _, _ in variants[1:]]
+
+
+def quantity(cause: CauseName) -> str:
+    """What an effect changes, in the terms of `LocalizedDiscrepancy.quantities`."""
+    return "area" if effect(cause[0]).changes_area else "flow"
+
+
+def _may_be(unknown: LocalizedDiscrepancy, effects: Collection[CauseName]) -> bool:
+    """Whether the effects change what an unknown changes."""
+    return unknown.quantities <= {quantity(c) for c in effects}
 
 
 def _shares(log_odds: Sequence[float]) -> list[float]:
