@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from fdi_torch.gap.verdict_words import closed_sentence, explanation_words
 from fdi_torch.report.chart import PLANNED, Line
 from fdi_torch.report.gap_tables import (
+    HARDLY_SHOWN,
     absorbed_sentence,
     constant_table,
     error_tables,
@@ -81,7 +82,7 @@ def next_input_section(material: Material) -> Section | None:
 def limits_section(material: Material) -> Section | None:
     """Effects that these inputs hide or confuse, and how often another cause would have got this name."""
     blocks: list[Any] = reliability_sentences(material.answer)
-    small = "Effects that these inputs do not show at their typical size"
+    small = f"Effects that these inputs hardly show ({HARDLY_SHOWN})"
     same = "Pairs of effects with the same signature under these inputs"
     for title, items in {small: hidden_effects(material.answer), same: inseparable_pairs(material.answer)}.items():
         blocks += [folded(f"{title}: {len(items)}", *bullets(items[:MOST_LISTED]))] if items else []
