@@ -155,7 +155,11 @@ def _own_constants(run: FreeRun, screen: Screen) -> None:
 
 def _row(run: FreeRun, plant: PlantDescription) -> tuple[Any, ...]:
     """Recording, times, errors of the sensors of `plant`, initial levels."""
-    levels = ", ".join(f"{tank} {quantity_text(level, 'm')}" for tank, level in run.prediction.start_levels.items())
+    columns = {s.tank: s.column for s in reversed(plant.sensors) if s.unit == "m"}  # so that levels have their units
+    levels = ", ".join(
+        f"{tank} {quantity_text(level, 'm', name=columns.get(tank, ''))}"
+        for tank, level in run.prediction.start_levels.items()
+    )
     times = (float(run.recording.time[i]) for i in (0, -1))
     return (Path(run.recording.source).name, *times, *shown_errors(plant, run.prediction.rmse), levels)
 
