@@ -219,8 +219,8 @@ def reliability_sentences(answer: Answer) -> list[str]:
         mostly = f", mostly where it was {' or '.join(passed_for[:3])}" if passed_for else ""
         sentences.append(
             f"Reliability of the name: {simulated.get('draws')} simulated recordings deviate from the model as much "
-            f"as this one, each because of one of {simulated.get('rivals')} other causes. It would have been mistaken "
-            f"for the one named here in {simulated.get('confused')} of them, and in {simulated.get('passed')} if the "
-            f"library lacked it{mostly}."
+            f"as this one, each because of one of {simulated.get('rivals')} other causes, which would have been "
+            f"mistaken for the one named here in {simulated.get('confused')} of them, and in {simulated.get('passed')} "
+            f"if the library lacked it{mostly}."
         )
     return sentences
