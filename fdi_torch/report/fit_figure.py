@@ -12,6 +12,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.gridspec import SubplotSpec
 
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
@@ -47,7 +48,8 @@ def fit_figure(
         figure = Figure(figsize=(max(4.2 * abreast, 6.0), 5.2 * rows + last), layout="constrained")
         FigureCanvasAgg(figure)
         heights = (2, 1) * rows + ratios
-        axes = figure.subplots(len(heights), abreast, sharex=True, squeeze=False, height_ratios=heights)
+        grid = figure.add_gridspec(len(heights), abreast, height_ratios=heights)
+        axes = grid.subplots(sharex=True, squeeze=False)
         pairs = [(axes[2 * row, k], axes[2 * row + 1, k]) for row in range(rows) for k in range(abreast)]
         for i, (column, (upper, lower)) in enumerate(zip(columns, pairs, strict=False)):
             set_panel_title(upper, short(plant.channel_words(column)))
@@ -56,21 +58,21 @@ def fit_figure(
         for unused in (axis for pair in pairs[len(columns) :] for axis in pair):
             unused.remove()
         if inputs:
-            _draw_inputs(figure, axes[-1], recording, inputs)
+            for unused in axes[-1]:
+                unused.remove()
+            _draw_inputs(figure, grid[-1, :], recording, inputs)
         set_title(figure, typeset(title))
     return figure
 
 
-def _draw_inputs(figure: Figure, row: Sequence[Axes], recording: Recording, inputs: Sequence[int]) -> None:
-    """The inputs with these numbers in place of a row of axes, those of one unit together."""
+def _draw_inputs(figure: Figure, place: SubplotSpec, recording: Recording, inputs: Sequence[int]) -> None:
+    """The inputs with these numbers, those of one unit together."""
     shown = {i: shown_unit(recording.input_units[i], recording.input_names[i]) for i in inputs}
     units = dict.fromkeys(unit for unit, _ in shown.values())
-    places = row[0].get_gridspec()[-1, :].subgridspec(1, len(units))
-    for axes in row:
-        axes.remove()
+    places = place.subgridspec(1, len(units))
     time = recording.time.cpu().numpy()
-    for place, unit in zip(places, units, strict=True):
-        panel = figure.add_subplot(place)
+    for k, unit in enumerate(units):
+        panel = figure.add_subplot(places[0, k])
         own = [i for i in inputs if shown[i][0] == unit]
         for i, colour in zip(own, cycle((MODEL, MARK, OTHER, INK, SOFT))):
             values = shown[i][1] * recording.inputs[:, i].cpu().numpy()
