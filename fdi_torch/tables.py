@@ -20,7 +20,8 @@ from fdi_torch.quantities import display_unit, displayed_in, displayed_units, si
 MOST_ROWS = 60
 """Number of displayed rows; a data frame has all of them."""
 ERRORS = ("std error", "std")
-WITH_ERROR = ("value", "estimate", "median", "fitted", "with the causes", *ERRORS, "95 % low", "95 % high")
+_FITTED = ("fitted", "with the causes", "with a freely fitted curve", "with the causes and a freely fitted curve")
+WITH_ERROR = ("value", "estimate", "median", *_FITTED, *ERRORS, "95 % low", "95 % high")
 """Columns whose displayed digits follow from the standard error in the same row."""
 SIDES = ' style="text-align: left"', ' style="text-align: right"'
 _NUMBER = re.compile(r"[(<>]? ?[-−]?\d")

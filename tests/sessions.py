@@ -1,7 +1,7 @@
 """Run the console sessions of a Markdown page, and compare what they print with what the page shows.
 
 A fenced block with a title (```yaml title="rig.yaml") is a file of the session. A block ```console holds commands
-after `$ ` and the lines that they print; a line `...` stands for any lines. Words must be equal, and numbers to 2 %
+after `$ ` and the lines that they print; a line `...` stands for any lines. Words must be equal, and numbers to 0.1 %
 or to one unit of the last digit shown. `python -m tests.sessions PAGE ...` runs pages and
 rewrites the shown lines in place.
 """
@@ -60,11 +60,11 @@ def run_command(command: str) -> list[str]:
 
 
 def same(expected: str, printed: str) -> bool:
-    """Whether two lines have equal words, and numbers equal to 2 % or to one unit of the last digit shown."""
+    """Whether two lines have equal words, and numbers equal to 0.3 % or to one unit of the last digit shown."""
     if [*NUMBER.sub("#", expected).split()] != [*NUMBER.sub("#", printed).split()]:
         return False
     pairs = zip(NUMBER.findall(expected), NUMBER.findall(printed), strict=True)
-    return all(abs(float(a) - float(b)) <= max(0.02 * abs(float(a)), last_digit(a)) for a, b in pairs)
+    return all(abs(float(a) - float(b)) <= max(0.003 * abs(float(a)), last_digit(a)) for a, b in pairs)
 
 
 def last_digit(number: str) -> float:

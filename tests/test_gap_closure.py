@@ -156,6 +156,18 @@ def test_a_hold_out_of_another_rig_is_reported_with_the_constants_that_differ() 
     assert "of another rig" in remark
 
 
+def test_a_hold_out_that_asks_a_pump_for_more_than_it_delivers_is_doubted() -> None:
+    recording = recorded(LAMINAR, 3, samples=200)
+    other = recorded(LAMINAR, 5, samples=200)
+    inputs = other.inputs.clone()
+    inputs[100:110, 0] = -1e-5
+    inputs[110:120, 0] = 3e-4
+    holdout = replace(other, inputs=inputs, source="control.csv")
+    answer = diagnose(nominal_plant(), recording, holdout, Settings(("laminar_flow@P13",), named_only=True))
+    doubts = [remark for remark in answer.remarks if remark.startswith("control.csv: Q1: asks for")]
+    assert len(doubts) == 2 and "up to 300 cm^3/s of Q1" in doubts[0] and "negative flow" in doubts[1]
+
+
 def test_a_hold_out_with_a_further_cause_is_reported() -> None:
     recording = recorded(LAMINAR, 3, samples=600)
     other = recorded({**LAMINAR, "h2.sensor_lag.time_constant": 60.0}, 5, samples=600)

@@ -208,7 +208,7 @@ def test_planned_inputs_need_no_readings(tmp_path: Path, capsys: pytest.CaptureF
         f"hidden: {name.replace('_', ' ')} at {place}" for name, place in json.loads(capsys.readouterr().out)["hidden"]
     ]
     assert cli.main(["plan", *words, "--noise", "5 mm"]) == cli.DONE
-    counted = f"of 3 effects at their typical size, {len(hidden)} would be hidden by a noise of 5 mm; pairs"
+    counted = f"of 3 effects at a usual size, {len(hidden)} would be hidden by a noise of 5 mm; pairs"
     first, *others = capsys.readouterr().out.splitlines()
     assert first.startswith(counted) and others[: len(hidden)] == hidden and hidden
     for source in map(str, (planned, listing)):

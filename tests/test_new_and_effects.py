@@ -166,6 +166,8 @@ def test_a_tank_of_a_new_plant_holds_the_levels_of_its_column_in_their_unit(tmp_
     path.write_text("Zeit (s);Zulauf (L/min);LI-101 (mm);PI-102 (mbar)\n0;20;832,5;40\n1;20;700;41\n")
     text = plant_from_recording(path, "rig")
     assert "A: {area: 200 cm^2, height: 920 mm}" in text and "B: {area: 200 cm^2, height: 60 cm}" in text
+    (tmp_path / "rig.yaml").write_text(text, encoding="utf-8")
+    assert load_plant(tmp_path / "rig.yaml", unfinished=True).tolerances["Zulauf.gain"] == pytest.approx(0.3)
 
 
 def test_an_effect_of_the_catalogue_is_shown_with_its_parameters() -> None:
@@ -280,7 +282,7 @@ def test_the_fault_free_part_of_a_new_monitor_fits_the_recording(
         capsys.readouterr()
         fdi("monitor", "--config", f"m{lasts}.yaml", "--set", f"recording.stop={last + 10 * interval} s")
         said = capsys.readouterr().out
-        (learnt, needed), *_ = re.findall(r"learnt from (\S+) s \((\S+) s needed\)", said)
+        (learnt, needed), *_ = re.findall(r"learnt from (\S+) s \(.* takes (\S+) s\)", said)
         assert first == start and float(learnt) == pytest.approx(last - first, abs=10 * interval)
         short = lasts == 1000
         assert (float(learnt) < float(needed)) is ("is short" in said) is short

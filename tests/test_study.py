@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from fdi_torch.plant.exact_constants import exact_constants_sentence
 from fdi_torch.quantities import displayed_in
 from fdi_torch.report.material import gather
 from fdi_torch.report.predictions import progress_of
+from fdi_torch.report.setting_tables import setting_tables
 from fdi_torch.study.monte_carlo import Trial, limits, make_trials, run_block, run_blocks
 from fdi_torch.study.study_plan import Block, Plan, Setting, fault_modes, fixed_faults, mode_faults, uniform_faults
 from fdi_torch.study.summary import (
@@ -317,6 +319,21 @@ def test_errors_are_in_the_unit_of_the_plant() -> None:
     assert table.columns["unit"] == ["l/min"]
     assert table.columns["bias"] == pytest.approx([-0.12]) and table.columns["RMSE"] == pytest.approx([0.18])
     assert printed[:5] == ["free", "Q.pump_offset", "l/min", "-0.12 ± 0.12", "0.18"]
+
+
+def test_the_accuracy_of_a_setting_is_said_beside_its_noise_in_the_unit_of_the_sensor() -> None:
+    study = quick(None, "study.snr_db=[40]", "study.trials=4")
+    trials = run_block(study.plan, Block(0, 0, 4, 0))
+    summary = summarise(study.plan, study.plan.settings[0], trials)
+    clean = make_trials(study.plan, Block(0, 0, 1, 0))
+    swing = (clean.readings - clean.noise)[0].std(0, correction=0)
+    assert [std for std, _ in summary.noise.values()] == pytest.approx((0.01 * swing).tolist(), rel=1e-6)
+    units = {score.parameter: score.unit for score in summary.scores} | dict.fromkeys(summary.noise, "m")
+    (table,) = setting_tables([(summary.setting, summary.trials, summary.numbers())], units)
+    words = r"with noise of (\S+) cm at h1, .* at h3, (free|boxed) estimates leak at T1 \(true value (\S+)\) to ± "
+    found = re.match(words, table.summary)
+    assert found and float(found[1]) == pytest.approx(float(swing[0]), rel=1e-2)
+    assert float(found[3]) == pytest.approx(summary.truth["T1.leak.size"])
 
 
 def test_constants_that_count_as_exact_are_named_with_the_key_that_estimates_them(

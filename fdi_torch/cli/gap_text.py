@@ -8,11 +8,11 @@ from typing import Any
 
 from fdi_torch.cli.screen import Screen
 from fdi_torch.gap.answer import UNKNOWN, Answer
+from fdi_torch.gap.constant_remarks import MOVED
 from fdi_torch.gap.verdict_words import closed_sentence, holdout_warning, rounds, verdict_sentence
-from fdi_torch.names import listed
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.report.gap_tables import (
-    MOVED,
+    HARDLY_SHOWN,
     absorbed_sentence,
     cause_table,
     constant_table,
@@ -23,7 +23,6 @@ from fdi_torch.report.gap_tables import (
     hidden_effects,
     inseparable_pairs,
     reliability_sentences,
-    tolerances_off,
 )
 from fdi_torch.tables import Table
 
@@ -44,7 +43,7 @@ def show(answer: Answer, plant: PlantDescription, steps: Sequence[str], screen: 
     if answer.closure and has_causes(as_json):
         screen.say(closed_sentence(answer.closure))
         screen.points(filter(None, [absorbed_sentence(as_json)]))
-    screen.show(constant_table(as_json, MOVED))
+    screen.show(constant_table(as_json, MOVED if has_causes(as_json) else 0.0))
     screen.points([*reliability_sentences(as_json), *_limits(as_json)])
 
 
@@ -65,14 +64,6 @@ def next_steps(
         steps.append(
             "correct the plant file as said above, then repeat the diagnosis; until then train, refit and monitor "
             "refuse this recording"
-        )
-    moved = [name for name, c in answer.constants.items() if abs(tolerances_off(c, "augmented")) > MOVED]
-    if moved:
-        still = "even with the causes, " if has_causes(answer.to_dict()) else ""
-        steps.append(
-            f"{still}{listed(moved)} {'is' if len(moved) == 1 else 'are'} more than {MOVED:g} "
-            f"tolerances off {'its nominal value' if len(moved) == 1 else 'their nominal values'}: calibrate the plant "
-            "file with a fault-free recording (fdi refit --adopt), then repeat the diagnosis with the calibrated file"
         )
     if planned and answer.next_input:
         samples = answer.next_input.get("parted_after_samples")
@@ -106,7 +97,7 @@ def _limits(answer: Mapping[str, Any]) -> list[str]:
     hidden, pairs, sentences = hidden_effects(answer), inseparable_pairs(answer), []
     if hidden:
         more = f" and {len(hidden) - 3} more" if len(hidden) > 3 else ""
-        sentences.append(f"these inputs cannot show at their typical size: {', '.join(hidden[:3])}{more}")
+        sentences.append(f"these inputs hardly show {', '.join(hidden[:3])}{more}: {HARDLY_SHOWN}")
     if pairs:
         many = f"{len(pairs)} pairs of effects, such as {pairs[0]}" if len(pairs) > 1 else pairs[0]
         sentences.append(f"these inputs cannot distinguish {many}")

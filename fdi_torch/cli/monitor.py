@@ -61,10 +61,11 @@ def _show_setup(prepared: PreparedMonitor, screen: Screen) -> None:
         f"{sensor.name} {quantity_text(std, sensor.unit, 3, sensor.column)}"
         for sensor, std in zip(prepared.monitor.network.description.sensors, noise.reading_std.tolist(), strict=True)
     )
+    order = noise.whitening.order
+    memory = f"each residual depends on the {order} before it" if order else "successive residuals are independent"
     screen.note(
-        f"noise of the readings: {stds}, process noise per sample {noise.ratio:.2g} times that, "
-        f"residual autocorrelated to order {noise.whitening.order}; "
-        f"{detector.chart} threshold {detector.threshold:.3g}"
+        f"noise of the readings: {stds}; random drift of the levels per sample: {noise.ratio:.2g} times that; "
+        f"{memory}; alarm when the {detector.chart} statistic exceeds {detector.threshold:.3g}"
     )
     for name, value in prepared.calibrated.items():
         screen.note(f"calibrated {name} = {value:.5g}")

@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 def _show(limits: Identifiability, noise: str, screen: Screen) -> None:
     screen.say(
-        f"of {counted(len(limits.shown), 'effect')} at their typical size, {len(limits.hidden) or 'none'} would be "
+        f"of {counted(len(limits.shown), 'effect')} at a usual size, {len(limits.hidden) or 'none'} would be "
         f"hidden by a noise of {noise}; pairs that could not be distinguished: "
         f"{len(limits.inseparable) or 'none'}"
     )

@@ -24,6 +24,7 @@ from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.yaml_files import YAML_ENDINGS
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import Misfit
+from fdi_torch.gap.constant_remarks import MOVED
 from fdi_torch.gap.free_runs.prediction import Prediction, predict
 from fdi_torch.jobs.python_results import FreeRun, sensor_unit, shown_errors
 from fdi_torch.plant.description import PlantDescription
@@ -31,7 +32,6 @@ from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import doubts_about
 from fdi_torch.report.fit_figure import fit_figure
-from fdi_torch.report.gap_tables import MOVED
 from fdi_torch.report.style import save
 from fdi_torch.tables import Table
 
@@ -155,7 +155,11 @@ def _own_constants(run: FreeRun, screen: Screen) -> None:
 
 def _row(run: FreeRun, plant: PlantDescription) -> tuple[Any, ...]:
     """Recording, times, errors of the sensors of `plant`, initial levels."""
-    levels = ", ".join(f"{tank} {quantity_text(level, 'm')}" for tank, level in run.prediction.start_levels.items())
+    columns = {s.tank: s.column for s in reversed(plant.sensors) if s.unit == "m"}  # so that levels have their units
+    levels = ", ".join(
+        f"{tank} {quantity_text(level, 'm', name=columns.get(tank, ''))}"
+        for tank, level in run.prediction.start_levels.items()
+    )
     times = (float(run.recording.time[i]) for i in (0, -1))
     return (Path(run.recording.source).name, *times, *shown_errors(plant, run.prediction.rmse), levels)
 

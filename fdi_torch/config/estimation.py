@@ -59,7 +59,7 @@ class ObjectiveConfig(Strict):
 
 class RefineConfig(Strict):
     method: Literal["lm", "none"] = Field(
-        "lm", description="Levenberg-Marquardt, or none: the best member of the search is the result"
+        "lm", description="Levenberg-Marquardt, or none: the best candidate of the search is the result"
     )
     iterations: int = Field(50, ge=1, description="at most")
 

@@ -105,7 +105,9 @@ def plant_from_recording(path: Path, name: str) -> str:
         *(_sensor(column, tank) for column, tank in tank_of.items()),
         "",
         "tolerances:    # one standard deviation; constants without one count as exact",
+        "               # generous for a first calibration, which replaces them: fdi refit --adopt --narrow",
         '  "*.discharge_coefficient": 30 %',
+        *(f"  {column.own}.gain: 30 %" for column in commands),
     ]
     return "\n".join(lines) + "\n"
 

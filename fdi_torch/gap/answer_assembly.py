@@ -42,7 +42,7 @@ def build_answer(result: DiagnosisResult, holdouts: Sequence[DataSet]) -> Answer
     """Build the answer. holdouts: laid out for the same plant."""
     has_causes = result.verdict in ("named", "ambiguous")
     posterior = result.posterior
-    runs = _holdout_runs(result, holdouts)
+    runs, constants = _holdout_runs(result, holdouts), _constants(result)
     hypotheses = zip(posterior.hypotheses[:MOST_EXPLANATIONS], posterior.probabilities, strict=False)
     return Answer(
         verdict=result.verdict,
@@ -60,9 +60,9 @@ def build_answer(result: DiagnosisResult, holdouts: Sequence[DataSet]) -> Answer
         next_input=_next_input(result) if result.verdict == "ambiguous" else None,
         impostors=_confusability(result) if has_causes else None,
         excitation=_identifiability(result),
-        constants=_constants(result),
+        constants=constants,
         curves=_curves(result),
-        remarks=remarks_on(result, runs),
+        remarks=remarks_on(result, runs, constants),
         arrays=prediction_arrays(result, runs),
     )
 

@@ -17,6 +17,7 @@ from fdi_torch.gap.answer import CERTAIN
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.channel_noise import low_frequency_excess
+from fdi_torch.gap.constant_remarks import Constants, constant_remarks
 from fdi_torch.gap.diagnosis_result import DiagnosisResult, unexplained_chi_square
 from fdi_torch.gap.free_form import discrepancy_tables
 from fdi_torch.gap.holdout import HeldOut
@@ -36,10 +37,10 @@ WORSE = 1.1  # error of the free form over that of the recalibrated plant
 SWINGS = 0.03  # smallest amplitude of an oscillation, as a share of the free form's scale
 
 
-def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
-    """Remarks on the inputs, the plant file, the fitted parameters, and the hold-outs."""
+def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut], constants: Constants) -> list[str]:
+    """Remarks on the fitted constants, the inputs, the plant file, the fitted effects, and the hold-outs."""
     data = result.fitter.data
-    remarks: list[str] = []
+    remarks = constant_remarks(constants, has_causes=result.verdict != "no_gap")
     remarks += dict.fromkeys(s for part in data.parts for s in data_warnings(part.recording, data.plant))
     inputs = [column for part in data.parts for column in part.recording.inputs.T]
     if inputs and all(float(torch.diff(column).abs().max()) == 0.0 for column in inputs):
@@ -62,8 +63,19 @@ def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut]) -> list[str]:
     remarks += [_masked_outliers(s) for group in result.outliers for s in group]
     remarks += [*_nominal_values_out_of_range(data.plant), *_values_at_bounds(result), *_periods(result)]
     remarks += [*_exact_areas(result), *_twins_outside_library(result)]
+    remarks += _warnings_of_holdouts(held, remarks, data.plant)
     on_holdouts = [remark(result, h) for remark in (_free_form_fails, rig_difference) for h in held]
     return remarks + [sentence for sentence in on_holdouts if sentence]
+
+
+def _warnings_of_holdouts(held: Sequence[HeldOut], remarks: Sequence[str], plant: PlantDescription) -> list[str]:
+    """What limits the trust in each hold-out, and is not among the remarks on the recordings."""
+    return [
+        f"{Path(h.data.recording.source).name or 'the hold-out'}: {warning}"
+        for h in held
+        for warning in data_warnings(h.data.recording, plant)
+        if warning not in remarks
+    ]
 
 
 def implausible_flows(plant: PlantDescription, noise: StateNoise, interval: float) -> list[str]:

@@ -14,6 +14,7 @@ from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import Misfit, misfit_of
 from fdi_torch.estimate.uncertainty import parameters_at_bounds
 from fdi_torch.gap.answer import Answer, adopted
+from fdi_torch.gap.constant_remarks import MOVED
 from fdi_torch.gap.free_runs.between_runs import between_run_spread
 from fdi_torch.gap.free_runs.prediction import LeftOutRun, Prediction
 from fdi_torch.gap.free_runs.refit import Refit, narrowed
@@ -27,7 +28,7 @@ from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import doubts_about
 from fdi_torch.report.fit_figure import fit_figure
-from fdi_torch.report.gap_tables import MOVED, cause_table, explanation_table
+from fdi_torch.report.gap_tables import cause_table, explanation_table
 from fdi_torch.report.material import gather
 from fdi_torch.report.sections.gap import posterior_bars
 from fdi_torch.report.sections.monitor import statistic_section

@@ -47,6 +47,7 @@ class StudyResult(Shown):
     def tables(self) -> list[Table]:
         """The scores of each setting, as `fdi study` prints them."""
         units = {score.parameter: score.unit for summary in self.summaries for score in summary.scores}
+        units |= {sensor: unit for summary in self.summaries for sensor, (_, unit) in summary.noise.items()}
         return setting_tables([(s.setting, s.trials, s.numbers()) for s in self.summaries], units)
 
     @in_its_units

@@ -115,8 +115,9 @@ def false_alarm_rate_text(noise: NoiseModel, detector: Detector, every: float) -
     seconds, needed = learning_times(noise, detector)
     fewest, most = (detector.design.count_quantile(every, p) for p in (0.025, 0.975))
     text = (
-        f"the noise is learnt from {quantity_text(seconds, 's')} ({quantity_text(needed, 's')} needed); expect one "
-        f"false alarm in {quantity_text(every, 's', 5)} ({fewest} to {most} with a probability of 95 %)"
+        f"the noise is learnt from {quantity_text(seconds, 's')} (to know the rate of false alarms within a "
+        f"factor of {RATE_FACTOR:g} takes {quantity_text(needed, 's')}); expect one false alarm in "
+        f"{quantity_text(every, 's', 5)} ({fewest} to {most} with a probability of 95 %)"
     )
     if noise.whitening.flows is None:
         text += ", if no random flow is slow: to model these, install a C++ compiler or the extra fdi_torch[compiler]"

@@ -22,7 +22,6 @@ from fdi_torch.report.style import (
     HEIGHT,
     INK,
     MARK,
-    PAPER,
     SOFT,
     VARIABLES,
     label_lines,
@@ -34,6 +33,7 @@ from fdi_torch.report.style import (
 BINS = 400
 MOST_LABELS = 4  # of dashed lines in a picture
 LEAST_LETTERS = 12  # of a line of such a label
+LABEL_SHARE = 0.12  # of the usual height, for a line of such a label
 FLAT = 1.8  # height of a picture of residuals, inches
 
 
@@ -173,20 +173,20 @@ def draw(chart: Chart) -> Figure:
         )
     for moment in list(chart.events)[:MOST_EVENTS]:
         axes.axvline(moment, color=MARK, lw=0.9, alpha=0.8)
-    _draw_marks(axes, chart)
     kind, width = chart.scale
     if kind != "linear":
         logarithmic(axes, width)
     elif chart.from_zero:
         axes.set_ylim(bottom=0.0)
+    _draw_marks(axes, chart)
     if len(chart.lines) > 1:
         label_lines(axes)
     return figure
 
 
 def _draw_marks(axes: Axes, chart: Chart) -> None:
-    """Dashed lines with their labels, each on the side that has more room, in lines that fit there; many are drawn
-    without labels.
+    """Dashed lines with their labels above the data, each on the side that has more room, in lines that fit there; many
+    are drawn without labels.
     """
     marks = list(chart.marks)[:MOST_EVENTS]
     low, high = axes.get_xlim()
@@ -200,7 +200,7 @@ def _draw_marks(axes: Axes, chart: Chart) -> None:
             text = fill(short(label, 80), max(letters, LEAST_LETTERS), max_lines=3, placeholder="…")
             axes.annotate(
                 text,
-                xy=(moment, 0.97 - 0.15 * HEIGHT / chart.height * lines),
+                xy=(moment, 0.99 - LABEL_SHARE * HEIGHT / chart.height * lines),
                 xycoords=("data", "axes fraction"),
                 xytext=(-4 if right else 4, 0),
                 textcoords="offset points",
@@ -208,9 +208,17 @@ def _draw_marks(axes: Axes, chart: Chart) -> None:
                 va="top",
                 fontsize=9.0,
                 color=INK,
-                bbox={"facecolor": PAPER, "edgecolor": "none", "pad": 1.0, "alpha": 0.8},
             )
             lines += 1 + text.count("\n")
+    _make_room(axes, min(LABEL_SHARE * HEIGHT / chart.height * lines, 0.6))
+
+
+def _make_room(axes: Axes, share: float) -> None:
+    """Extend the vertical axis, so that its upper share is free of lines."""
+    scale = axes.yaxis.get_transform()
+    low, high = scale.transform(np.array(axes.get_ylim()))
+    bottom, top = scale.inverted().transform(np.array((low, high + (high - low) * share / (1.0 - share))))
+    axes.set_ylim(bottom, top)
 
 
 def chart_json(chart: Chart) -> str:

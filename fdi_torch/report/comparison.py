@@ -159,6 +159,6 @@ def _residuals(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:
             lines.setdefault(sensor, []).append(Line(label, recording.time, residual[:, i], colour))
     pictures = []
     for k, ((name, unit), of_sensor) in enumerate(lines.items()):
-        words = f"compare_residual_{k + 1}", runs[0].channel_words(name), "residual"
+        words = f"compare_residual_{k + 1}", runs[0].channel_words(name), "measured − model"
         pictures.append(channel_signals(*words, unit, of_sensor, name, level=0.0, clock="residuals"))
     return pictures

@@ -12,6 +12,7 @@ from typing import Any
 
 from fdi_torch.amounts import kind_words
 from fdi_torch.clock import clock_unit
+from fdi_torch.gap.answer import UNKNOWN
 from fdi_torch.gap.verdict_words import MEAN_FLOW, apart_from_rounding, causes_of, explanation_words
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.scales import emptying_time
@@ -23,15 +24,18 @@ MODEL_NAMES = {
     "nominal": "nominal model",
     "recalibrated": "recalibrated",
     "augmented": "with the causes",
-    "ceiling": "with free functions there",
+    "ceiling": "with freely fitted curves there",
     "noise_floor": "noise",
 }
-FROZEN = {"recalibrated": "constants recalibrated without them", "nominal": "nominal constants"}
+FROZEN = {"recalibrated": "but constants as recalibrated", "nominal": "but constants of the plant file"}
 ABSORBED = 1.5
 """Ratio of free-run errors with the causes, with other constants to fitted ones, from which recalibration counts as
 having absorbed part of the gap."""
-MOVED = 2.0
-"""Tolerances by which a constant must have moved to be mentioned."""
+HARDLY_SHOWN = (
+    "at a usual size (of most effects a tenth of the largest), noise or recalibration within the tolerances would hide "
+    "them"
+)
+"""What it means that inputs hardly show some effects."""
 SMALLEST_MOVE = 0.1
 """Standard deviation of a level, in those of the best sensor's noise. Less adds below 1 % to the readings' variance."""
 
@@ -41,15 +45,26 @@ def has_causes(answer: Answer) -> bool:
     return answer.get("verdict") != "no_gap"
 
 
-def reference_models(answer: Answer) -> dict[str, str]:
-    """Names of the compared models and of the noise, by their key in the closure of the answer, which has errors."""
-    closure = answer.get("closure") or {}
-    models = {key: name for key, name in MODEL_NAMES.items() if isinstance(closure.get(key), int | float)}
+def model_names(answer: Answer) -> dict[str, str]:
+    """Names of the models that suit the answer, and of the noise, by their key in its closure.
+
+    A cause without a name is a freely fitted curve, beside which there is no better one.
+    """
     if not has_causes(answer):
-        return {key: name for key, name in models.items() if key not in ("augmented", "ceiling")}
-    if answer.get("verdict") == "unknown" and "augmented" in models:
-        return {k: n for k, n in (models | {"augmented": "with the free form"}).items() if k != "ceiling"}
-    return models
+        return {key: name for key, name in MODEL_NAMES.items() if key not in ("augmented", "ceiling")}
+    first: Mapping[str, Any] = next(iter(answer.get("posterior") or []), {})
+    unnamed = any(cause.get("effect") == UNKNOWN for cause in causes_of(first))
+    if answer.get("verdict") == "unknown" or (answer.get("verdict") == "ambiguous" and unnamed):
+        named = any(cause.get("effect") != UNKNOWN for cause in apart_from_rounding(causes_of(first)))
+        augmented = f"with {'the causes and ' if named else ''}a freely fitted curve"
+        return {k: n for k, n in (MODEL_NAMES | {"augmented": augmented}).items() if k != "ceiling"}
+    return MODEL_NAMES
+
+
+def reference_models(answer: Answer) -> dict[str, str]:
+    """Names of the compared models and of the noise that the closure of the answer has errors of, by their key."""
+    closure = answer.get("closure") or {}
+    return {key: name for key, name in model_names(answer).items() if isinstance(closure.get(key), int | float)}
 
 
 def cause_table(answer: Answer) -> Table:
@@ -147,8 +162,9 @@ def absorbed_sentence(answer: Answer) -> str:
     if not has_causes(answer) or not closure.get("augmented_with") or not as_float(frozen) > ABSORBED * as_float(own):
         return ""
     return (
-        f"With the causes but with the constants recalibrated without them, the error is {as_float(frozen):.3g} "
-        f"{closure.get('unit', '')}: recalibration had absorbed part of the gap, and using both would count it twice."
+        f"With the causes but with the constants as recalibrated, the error is {as_float(frozen):.3g} "
+        f"{closure.get('unit', '')}: recalibrated without the causes, the constants compensate part of the gap. Do not "
+        "combine them with the causes."
     )
 
 
@@ -163,8 +179,8 @@ def constant_table(answer: Answer, moved: float = 0.0) -> Table:
             numbers = (as_float(constant.get(stage)) for stage in ("nominal", "tolerance", *fits, "std"))
             unit, *shown = in_display_unit(str(name), str(constant.get("unit", "1")), *numbers)
             rows.append((str(name), *shown, float(f"{tolerances_off(constant, 'augmented'):.2g}"), unit))
-    title = f"constants more than {moved:g} tolerances off" if moved else ""
-    header = (*header, "with the causes" if causes else "fitted", "std error", "tolerances off", "unit")
+    title = f"constants more than {moved:g} tolerances off" if moved else "constants with a tolerance"
+    header = (*header, model_names(answer).get("augmented", "fitted"), "std error", "tolerances off", "unit")
     return Table(header, rows, title, digits=4)
 
 
@@ -175,8 +191,11 @@ def tolerances_off(constant: Mapping[str, Any], stage: str) -> float:
 
 
 def hidden_effects(answer: Answer) -> list[str]:
-    """Effects that the inputs cannot show at their typical size."""
-    return [explanation_words([cause]) for cause in (answer.get("excitation") or {}).get("hidden") or []]
+    """Effects that the inputs hardly show, see `HARDLY_SHOWN`; the causes of the answer are not among them."""
+    causes = [cause for cause in answer.get("causes") or [] if isinstance(cause, Mapping)]
+    named = {(c.get("effect"), c.get("location")) for each in causes for c in (each, *(each.get("same_as") or []))}
+    hidden = (answer.get("excitation") or {}).get("hidden") or []
+    return [explanation_words([c]) for c in hidden if (c.get("effect"), c.get("location")) not in named]
 
 
 def inseparable_pairs(answer: Answer) -> list[str]:
@@ -197,10 +216,11 @@ def reliability_sentences(answer: Answer) -> list[str]:
     simulated = confusability.get("simulated")
     if isinstance(simulated, dict):
         passed_for = [explanation_words([c]) for c in simulated.get("passed_for") or []]
-        mostly = f", mostly for {', '.join(passed_for[:3])}" if passed_for else ""
+        mostly = f", mostly where it was {' or '.join(passed_for[:3])}" if passed_for else ""
         sentences.append(
-            f"Reliability of the name: of {simulated.get('draws')} recordings simulated with linearized effects, with "
-            f"a gap of this size from one of {simulated.get('rivals')} other causes, {simulated.get('confused')} were "
-            f"given this name, and {simulated.get('passed')} if the library lacked the true cause{mostly}."
+            f"Reliability of the name: {simulated.get('draws')} simulated recordings deviate from the model as much "
+            f"as this one, each because of one of {simulated.get('rivals')} other causes, which would have been "
+            f"mistaken for the one named here in {simulated.get('confused')} of them, and in {simulated.get('passed')} "
+            f"if the library lacked it{mostly}."
         )
     return sentences

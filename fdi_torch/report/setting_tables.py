@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fdi_torch.amounts import with_error
+from fdi_torch.amounts import parameter_words, with_error
+from fdi_torch.names import listed
+from fdi_torch.quantities import quantity_text
 from fdi_torch.report.numbers import as_float, number
 from fdi_torch.study.estimators import ESTIMATORS
 from fdi_torch.tables import Table, in_display_unit
@@ -14,8 +17,10 @@ MOST_SETTINGS = 10  # of more, the tables are one with a row for each
 RATIOS = {"over_bound": "RMSE / bound", "over_linearised": "RMSE / linearised", "coverage": "coverage"}
 LEGEND = (
     "; ".join(f"{name}: {meaning}" for name, meaning in ESTIMATORS.items())
-    + "\nbias: ± 1.96 of its standard errors; bound: Cramér-Rao bound; coverage: share of trials whose stated 95 % "
-    "interval contains the truth; 95 %: confidence interval of the number before it"
+    + "\nbias: ± 1.96 of its standard errors; RMSE: root mean square error; bound: Cramér-Rao bound, the smallest RMSE "
+    "of an unbiased estimator with this noise (at 1, no such estimator is better; below 1, bounds on the parameters or "
+    "another bias keep the errors small); coverage: share of trials whose stated 95 % interval contains the truth; "
+    "95 %: confidence interval of the number before it"
 )
 Numbers = Mapping[str, Any]
 """The numbers of a setting by their dotted names, `Summary.numbers`."""
@@ -24,7 +29,7 @@ Numbers = Mapping[str, Any]
 def setting_tables(settings: Sequence[tuple[str, Any, Numbers]], units: Mapping[str, str]) -> list[Table]:
     """The scores of settings, given as name, number of trials and numbers; of many, one table with their failures.
 
-    units: SI units by parameter.
+    units: SI units by parameter, and by sensor if the numbers have their noise.
     """
     if len(settings) <= MOST_SETTINGS:
         return [_setting_table(*setting, units) for setting in settings]
@@ -58,7 +63,27 @@ def _setting_table(setting: str, trials: Any, numbers: Numbers, units: Mapping[s
     header = ["estimator", "parameter", "unit", "bias", "RMSE"]
     header += [cell for name in RATIOS.values() for cell in (name, "95 %")]
     title = f"{setting}: {trials} trials, {number(as_float(numbers.get('converged')))} converged"
-    return Table(header, rows, title, summary=_ending(numbers))
+    return Table(header, rows, title, summary="; ".join(filter(None, [*_accuracies(numbers, units), _ending(numbers)])))
+
+
+def _accuracies(numbers: Numbers, units: Mapping[str, str]) -> list[str]:
+    """'with noise of 0.4 mm at h1, free estimates leak at T1 (true value 0.2) to ± 0.003'; of the first estimator."""
+    noise = [
+        f"{quantity_text(as_float(std), units[sensor], 3, sensor)} at {sensor}"
+        for sensor, std in (
+            (key.removeprefix("noise."), std) for key, std in numbers.items() if key.startswith("noise.")
+        )
+        if sensor in units
+    ]
+    estimator = next((name for name in ESTIMATORS if f"{name}.failures" in numbers), "")
+    errors = []
+    for parameter, unit in units.items():
+        rmse = as_float(numbers.get(f"{estimator}.{parameter}.rmse"))
+        if math.isfinite(rmse):
+            truth = numbers.get(f"truth.{parameter}")
+            of = "" if truth is None else f" (true value {quantity_text(as_float(truth), unit, name=parameter)})"
+            errors.append(f"{parameter_words(parameter)}{of} to ± {quantity_text(rmse, unit, 2, parameter)}")
+    return [f"with noise of {listed(noise)}, {estimator} estimates {listed(errors)}"] if noise and errors else []
 
 
 def _ending(numbers: Numbers) -> str:

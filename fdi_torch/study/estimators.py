@@ -10,6 +10,6 @@ ESTIMATORS: Mapping[Estimator, str] = {
     "free": "maximum likelihood without bounds on the parameters",
     "boxed": "maximum likelihood within the bounds",
     "correlation": "maximum correlation of readings and model, the objective of the 2020 paper",
-    "linearised": "the efficient estimator, which knows the truth",
+    "linearised": "the best possible with this noise, because it knows the truth",
     "search": "the best of the global search, not refined",
 }

@@ -117,7 +117,7 @@ CORRELATION_TOLERANCE = 1e-13
 
 @dataclass(frozen=True)
 class Trial:
-    """Result of one trial as logged. numbers: arrays over the parameters, or single numbers, SI."""
+    """Result of one trial as logged. numbers: arrays over the parameters or sensors, or single numbers, SI."""
 
     number: int
     setting: str
@@ -149,7 +149,7 @@ def run_block(plan: Plan, block: Block) -> list[Trial]:
     results |= {"bound": limit.bound, "correlation_bound": limit.correlation_bound}
     if "linearised" in estimators:
         results["linearised"] = limit.linearised
-    results["rho"] = fits.correlations(boxed.theta)
+    results |= {"rho": fits.correlations(boxed.theta), "noise": trials.std}
     return _records(plan, block, results, status)
 
 

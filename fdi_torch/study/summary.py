@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import NormalDist
 
 import torch
@@ -57,7 +57,9 @@ class Score:
 class Summary:
     """failures: trials of each estimator that ended far from the truth; worst: largest error, as a share of the range.
 
-    undetermined: trials in which, by the Fisher information at the truth, a parameter is not determined.
+    undetermined: trials in which, by the Fisher information at the truth, a parameter is not determined. noise: of each
+    output, its standard deviation, mean over the trials, with its SI unit. truth: parameters, SI, that are the same in
+    all trials.
     """
 
     setting: str
@@ -68,11 +70,15 @@ class Summary:
     converged: int
     undetermined: int
     rho: Ratio
+    noise: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    truth: Mapping[str, float] = field(default_factory=dict)
 
     def numbers(self) -> dict[str, float]:
         """The summary as one flat mapping from dotted names, such as `lm.T1.leak.size.bias`, to numbers."""
         flat: dict[str, float] = {"converged": self.converged, "undetermined": self.undetermined}
         flat |= _ends("rho", self.rho)
+        flat |= {f"noise.{sensor}": std for sensor, (std, _) in self.noise.items()}
+        flat |= {f"truth.{name}": value for name, value in self.truth.items()}
         flat |= {f"{name}.failures": count for name, count in self.failures.items()}
         flat |= {f"{name}.worst": error for name, error in self.worst.items()}
         for score in self.scores:
@@ -103,7 +109,18 @@ def summarise(plan: Plan, setting: Setting, trials: Sequence[Trial], tolerance: 
         converged=sum(is_converged(trial.status) for trial in trials),
         undetermined=int((column(trials, "bound") > width).any(-1).sum()),
         rho=mean_with_error(column(trials, "rho").sum(-1)),
+        noise=_noise(plan, setting, trials),
+        truth={p.name: float(truth[0, i]) for i, p in enumerate(space) if bool((truth[:, i] == truth[0, i]).all())},
     )
+
+
+def _noise(plan: Plan, setting: Setting, trials: Sequence[Trial]) -> dict[str, tuple[float, str]]:
+    """Noise of each sensor; none of a setting without noise, or from a log of trials that do not state it."""
+    if setting.snr_db is None or not all("noise" in trial.numbers for trial in trials):
+        return {}
+    stds = column(trials, "noise").mean(0).tolist()
+    sensors = plan.fitting.networks[0].description.sensors
+    return {sensor.column: (std, sensor.unit) for sensor, std in zip(sensors, stds, strict=True)}
 
 
 def column(trials: Sequence[Trial], name: str) -> Float[Tensor, "trials ..."]:

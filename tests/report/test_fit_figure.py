@@ -85,4 +85,18 @@ def test_many_sensors_stand_in_rows() -> None:
     recording = plant.recording(time, read[:, :0], read, source="run.csv")
     figure = fit_figure(recording, {"estimate": read}, "run", plant)
     assert figure.get_figwidth() < 20.0 and len(figure.axes) == 14
-    assert all(axes.xaxis.get_tick_params()["labelbottom"] for axes in figure.axes if "residual" in axes.get_ylabel())
+    assert all(axes.xaxis.get_tick_params()["labelbottom"] for axes in figure.axes if "model" in axes.get_ylabel())
+    assert sum("measured −\nmodel" in axes.get_ylabel() for axes in figure.axes) == 7
+
+
+def test_inputs_stand_below_the_sensors_those_of_one_unit_together() -> None:
+    plant = load_plant("three_tank")
+    time = torch.arange(50.0, dtype=torch.float64)
+    read, inputs = torch.ones(50, 3, dtype=torch.float64), 1e-5 * torch.ones(50, 2, dtype=torch.float64)
+    figure = fit_figure(plant.recording(time, inputs, read), {"estimate": read}, "run", plant)
+    figure.draw_without_rendering()
+    panel = figure.axes[-1]
+    assert len(figure.axes) == 7 and panel.get_ylabel() == "input, cm³/s"
+    assert [line.get_label() for line in panel.lines] == ["Q1", "Q2"] and panel.lines[0].get_ydata()[
+        0
+    ] == pytest.approx(10)

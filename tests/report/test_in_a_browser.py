@@ -190,6 +190,22 @@ def test_rows_of_charts_are_full(browser: Any, tmp_path: Path) -> None:  # noqa:
     tab.context.close()
 
 
+def test_still_pictures_of_charts_have_one_scale(browser: Any, tmp_path: Path) -> None:  # noqa: F811
+    """Without scripts, however many stand in a row."""
+    path = tmp_path / "page.html"
+    style = (resources.files("fdi_torch.report") / "assets" / "page.css").read_text()
+    figure = '<figure data-clock="run"><svg viewBox="0 0 230 166"></svg></figure>'
+    grids = "".join(f"<div class=grid>{figure * count}</div>" for count in (1, 2, 3))
+    path.write_text(f"<style>{style}</style><main><section>{grids}</section></main>")
+    tab, _ = opened(browser, path)
+    for media, width in (("screen", 1280), ("print", PAPER)):
+        tab.set_viewport_size({"width": width, "height": 900})
+        tab.emulate_media(media=media)
+        widths = tab.evaluate("[...document.querySelectorAll('svg')].map(svg => svg.getBoundingClientRect().width)")
+        assert max(widths) < 1.05 * min(widths), (media, widths)
+    tab.context.close()
+
+
 @pytest.mark.slow
 def test_a_page_can_be_printed(browser: Any, path: Path) -> None:  # noqa: F811
     pypdf = pytest.importorskip("pypdf")

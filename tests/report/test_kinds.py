@@ -130,7 +130,7 @@ def test_without_a_gap_nothing_is_said_of_causes(tmp_path: Path, gap_page: str) 
     nothing = {"verdict": "no_gap", "causes": [], "posterior": [{"causes": [], "probability": 1.0}]}
     made = report(lambda path: write_gap(path, **nothing), tmp_path)
     text = page([made])
-    assert "with the cause" not in text and "free functions" not in text
+    assert "with the cause" not in text and "fitted curve" not in text
     assert not {"How far it closes", "Where the gap lies"} & set(titles(made))
     assert {"Hold-out", "Errors on data not used for fitting"} <= set(titles(made))
     models = re.findall("<td[^>]*>(nominal model|recalibrated|noise)</td>", text)

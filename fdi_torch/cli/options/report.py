@@ -1,6 +1,7 @@
 """Make one HTML page of one or more logs: verdict, rig, readings, convergence, uncertainty, configuration, provenance.
 
-The page needs no network and no scripts. It is written next to the (first) log, or where --out says.
+The page needs no network. Where the browser runs scripts, its charts are interactive. It is written next to the (first)
+log, or where --out says.
 """
 
 STEP, SUMMARY = "look", "make one HTML page of one or more logs"

@@ -1,6 +1,7 @@
 """Show the logs of a folder as pages on this machine: list, filter, sort, compare, and follow running jobs.
 
-The pages need no scripts and no network; only this machine can reach them. Ctrl-C ends the command.
+The pages need no network, and only this machine can reach them. Where the browser runs scripts, the charts of a report
+are interactive. Ctrl-C ends the command.
 """
 
 STEP, SUMMARY = "look", "show the logs of a folder as local pages: list, compare, follow running jobs"

@@ -20,6 +20,7 @@ const decoded = (code, Kind) => new Kind(Uint8Array.from(atob(code), letter => l
 const unit = label => (label.includes(", ") ? " " + label.slice(label.lastIndexOf(", ") + 2) : "");
 
 const MOST_LABELS = 4; // of marks
+const LABEL = 15; // pixels of a line of a label
 // Charts of one clock: they share crosshair and zoom.
 class Clock {
   constructor(key) { this.key = key; this.charts = []; this.span = null; }
@@ -116,7 +117,7 @@ class Chart {
     const plain = (plot, splits) => splits.map(value => (value === null ? null : text(value, 8)));
     const residual = this.about.level === 0;
     return {
-      ...this.size(), legend: { show: false }, padding: [6, 20, 0, 0],
+      ...this.size(), legend: { show: false }, padding: [6 + LABEL * this.labelled().length, 20, 0, 0],
       scales: { x: { time: false, range: (plot, low, high) => this.clock.span || [low, high] }, y: this.range() },
       axes: [{ ...axis(this.about.axis, 26), values: plain },
              { ...axis(this.about.y, 50), values: plain, splits: kind === "linear" ? undefined : decades,
@@ -248,14 +249,16 @@ class Chart {
     ctx.restore();
   }
 
-  // The labels of few marks, each on the side that has more room, in lines that fit there.
+  // Marks whose labels are written: few.
+  labelled() { return this.about.marks.length > MOST_LABELS ? [] : this.about.marks; }
+
+  // The labels of marks above the lines, each on the side that has more room, in lines that fit there.
   labels(plot) {
-    const { ctx, bbox: { left, top, width } } = plot, pixel = devicePixelRatio;
-    if (this.about.marks.length > MOST_LABELS) return;
+    const { ctx, bbox: { left, top, width } } = plot, pixel = devicePixelRatio, labelled = this.labelled();
     ctx.save();
     ctx.font = `${12 * pixel}px system-ui, sans-serif`;
-    let y = top + 14 * pixel;
-    for (const [moment, label] of this.about.marks) {
+    let y = top - (LABEL * labelled.length - 9) * pixel;
+    for (const [moment, label] of labelled) {
       const x = plot.valToPos(moment, "x", true), on_left = x > left + width / 2;
       if (x < left || x > left + width) continue;
       const room = (on_left ? x - left : left + width - x) - 8 * pixel, at = x + (on_left ? -4 : 4) * pixel;
@@ -267,14 +270,9 @@ class Chart {
       }
       ctx.textAlign = on_left ? "right" : "left";
       for (const words of lines.filter(words => words)) {
-        const wide = ctx.measureText(words).width;
-        ctx.globalAlpha = 0.8;
-        ctx.fillStyle = colour("paper");
-        ctx.fillRect(on_left ? at - wide : at, y - 11 * pixel, wide, 14 * pixel);
-        ctx.globalAlpha = 1;
         ctx.fillStyle = colour("ink");
         ctx.fillText(words, at, y);
-        y += 15 * pixel;
+        y += LABEL * pixel;
       }
     }
     ctx.restore();

@@ -20,7 +20,7 @@ from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
 from fdi_torch.report.html import bullets, shown, table, tag
 from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import correlation_table, estimate_table, number, shown_unit, signed
+from fdi_torch.report.numbers import correlation_table, estimate_table, shown_unit, signed
 from fdi_torch.report.section import Picture, Section, channel_signals, signals
 from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT, ellipse_panel
 
@@ -116,12 +116,13 @@ def _ellipse(material: Material, final: Payload, covariance: np.ndarray, pair: t
     return Picture(f"ellipse_{k + 1}", ellipse_panel(names, units, centre, part, truth), f"correlation {signed(rho)}")
 
 
+COST = "The cost measures the misfit of model and readings; only its decrease means something, and it ends level."
 GENERATIONS, ITERATIONS = "/estimator/de/generation", "/estimator/refine/iteration"
 MOST_PARAMETERS = 6
 
 
 def search_section(material: Material) -> Section | None:
-    """Cost and best member of differential evolution over its generations."""
+    """Cost and best candidate of differential evolution over its generations."""
     events = [m for m in material.of(GENERATIONS) if not m.get("problem")]
     if len(events) < 2:
         return None
@@ -136,7 +137,7 @@ def search_section(material: Material) -> Section | None:
     last = events[-1]
     words = f"Differential evolution, {int(steps[-1])} generations"
     words += f", {last['evaluations']} simulations" if last.get("evaluations") else ""
-    return Section("Search", [f"{words}; lowest cost {number(float(last['best_cost']))}.", pictures])
+    return Section("Search", [f"{words}. {COST}", pictures])
 
 
 def refinement_section(material: Material) -> Section | None:
@@ -151,8 +152,7 @@ def refinement_section(material: Material) -> Section | None:
         start = [m for m in events if int(m.get("problem", 0)) == lane]
         lines.append(Line(f"start {lane + 1}", np.arange(len(start)), column(start, "cost"), colour))
     chart = Chart("Cost", "iteration", "cost", lines, log=True)
-    lowest = float(np.nanmin(column(events, "cost")))
-    words = f"{counted(len(events), 'iteration')} from {counted(len(lanes), 'start')}; lowest cost {number(lowest, 6)}."
+    words = f"{counted(len(events), 'iteration')} from {counted(len(lanes), 'start')}. {COST}"
     return Section("Refinement", [words, [signals("refinement_cost", chart)]])
 
 
@@ -163,14 +163,14 @@ def column(events: Sequence[Payload], name: str) -> np.ndarray:
 
 
 def _best_members(material: Material, events: Sequence[Payload], steps: np.ndarray) -> list[Picture]:
-    """Parameters of the best member over the generations."""
+    """Parameters of the best candidate over the generations."""
     final = last_estimate(material)
     names = [str(name) for name in (final or {}).get("names", ()) if name in events[-1]][:MOST_PARAMETERS]
     pictures = []
     for k, name in enumerate(names):
-        lines = [Line("best member", steps, column(events, name), MODEL)]
+        lines = [Line("best so far", steps, column(events, name), MODEL)]
         if name in material.truth:
             lines.append(Line("simulated", steps, np.full(len(steps), material.truth[name]), OTHER, dashed=True))
-        about, unit = (f"search_parameter_{k + 1}", name, "best member"), material.unit(GENERATIONS, name)
+        about, unit = (f"search_parameter_{k + 1}", name, "best so far"), material.unit(GENERATIONS, name)
         pictures.append(channel_signals(*about, unit, lines, x_label="generation", clock="search"))
     return pictures

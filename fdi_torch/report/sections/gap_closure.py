@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from fdi_torch.gap.verdict_words import closed_sentence, explanation_words
 from fdi_torch.report.chart import PLANNED, Line
 from fdi_torch.report.gap_tables import (
+    HARDLY_SHOWN,
     absorbed_sentence,
     constant_table,
     error_tables,
@@ -23,7 +24,7 @@ from fdi_torch.report.gap_tables import (
     reference_models,
     reliability_sentences,
 )
-from fdi_torch.report.html import bullets, folded, short, shown
+from fdi_torch.report.html import bullets, folded, short, shown, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, as_vector, axis, number, shown_unit
 from fdi_torch.report.section import Picture, Section, channel_signals
@@ -81,10 +82,11 @@ def next_input_section(material: Material) -> Section | None:
 def limits_section(material: Material) -> Section | None:
     """Effects that these inputs hide or confuse, and how often another cause would have got this name."""
     blocks: list[Any] = reliability_sentences(material.answer)
-    small = "Effects that these inputs do not show at their typical size"
+    small = "Effects that these inputs hardly show"
     same = "Pairs of effects with the same signature under these inputs"
     for title, items in {small: hidden_effects(material.answer), same: inseparable_pairs(material.answer)}.items():
-        blocks += [folded(f"{title}: {len(items)}", *bullets(items[:MOST_LISTED]))] if items else []
+        meaning = [tag("p", f"{HARDLY_SHOWN[:1].upper()}{HARDLY_SHOWN[1:]}.")] if title == small else []
+        blocks += [folded(f"{title}: {len(items)}", *meaning, *bullets(items[:MOST_LISTED]))] if items else []
     return Section("Limits of these inputs", blocks) if blocks else None
 
 

@@ -36,7 +36,11 @@ def residual_section(material: Material) -> Section | None:
     for k, name in enumerate(name for name in columns if name != "t" and not name.endswith(_SUFFIXES)):
         unit, lines = material.unit(RESIDUAL, name), [Line("measured − predicted", time, columns[name], MODEL)]
         about: dict[str, Any] = {"level": 0.0, "events": alarms, "marks": marks, "clock": "monitor", "height": FLAT}
-        about |= {"name": f"observer_residual_{k + 1}", "title": material.channel_words(name), "label": "residual"}
+        about |= {
+            "name": f"observer_residual_{k + 1}",
+            "title": material.channel_words(name),
+            "label": "measured − predicted",
+        }
         pictures.append(channel_signals(si_unit=unit, lines=lines, channel=name, **about))
     words = f"Vertical lines: alarms.{mark_words(marks, 'the residuals are')}"
     return Section("Residuals", [words, pictures]) if pictures else None

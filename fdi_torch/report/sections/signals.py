@@ -13,7 +13,7 @@ import torch
 from fdi_torch.logbook import Signals
 from fdi_torch.quantities import display_unit, quantity_text
 from fdi_torch.report.chart import FLAT, Chart, Line, corner_points
-from fdi_torch.report.gap_tables import MODEL_NAMES, has_causes
+from fdi_torch.report.gap_tables import model_names
 from fdi_torch.report.html import Markup, shown, tag
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, axis, shown_unit
@@ -126,7 +126,7 @@ def _output_panels(
         column = [channel_signals(f"output{suffix}_{i + 1}", name, "reading", lines=lines, marks=marks, **about)]
         if model is not None:
             lines = [Line("measured − estimate", time, readings[:, i] - model[:, i], MODEL)]
-            words = f"residual{suffix}_{i + 1}", f"{name}: residual", "residual"
+            words = f"residual{suffix}_{i + 1}", f"{name}: residual", "measured − estimate"
             column.append(channel_signals(*words, lines=lines, level=0.0, height=FLAT, **about))
         columns.append(tuple(column))
     return columns
@@ -152,9 +152,10 @@ BINS = 24
 COLOURS = {"recalibrated": OTHER, "augmented": MODEL}
 
 
-def _compared_models(material: Material) -> list[str]:
-    """The models whose residuals the page compares: without the causes and, if there are any, with them."""
-    return list(COLOURS) if has_causes(material.answer) else ["recalibrated"]
+def _compared_models(material: Material) -> dict[str, str]:
+    """Names of the models whose residuals the page compares: without the causes and, if there are any, with them."""
+    names = model_names(material.answer)
+    return {model: names[model] for model in COLOURS if model in names}
 
 
 def holdout_section(material: Material) -> Section | None:
@@ -178,10 +179,10 @@ def _holdout_panels(material: Material, prefix: str) -> list[Picture]:
     title = prefix.replace("holdout", "hold-out").replace("_", " ")
     for i, name in enumerate(recording.output_names):
         lines: list[Line] = []
-        for model in _compared_models(material):
+        for model, named in _compared_models(material).items():
             predicted = arrays.get(f"{prefix}_{model}")
             if predicted is not None:
-                lines.append(Line(MODEL_NAMES[model], time, read[:, i] - predicted[:, i], COLOURS[model]))
+                lines.append(Line(named, time, read[:, i] - predicted[:, i], COLOURS[model]))
         if lines:
             about = f"{prefix}_{i + 1}", f"{material.channel_words(name)}, {title}", "measured − model"
             unit, clock = recording.output_units[i], clock_of(prefix)
@@ -194,14 +195,15 @@ def profile_section(material: Material) -> Section | None:
     if not material.recordings:
         return None
     recording = material.recordings[0]
-    each = {model: _excess(material, recording, model) for model in _compared_models(material)}
+    names = _compared_models(material)
+    each = {model: _excess(material, recording, model) for model in names}
     excess = {model: residual for model, residual in each.items() if residual is not None}
     if not excess:
         return None
     pictures = []
     varied = (v for v in _variables(material, recording) if np.nanmin(v[2]) < np.nanmax(v[2]))
     for k, (title, label, variable) in enumerate(varied):
-        lines = [Line(MODEL_NAMES[m], *_binned(variable, size), COLOURS[m]) for m, size in excess.items()]
+        lines = [Line(names[m], *_binned(variable, size), COLOURS[m]) for m, size in excess.items()]
         chart = Chart(title, label, "residual, × noise", lines, log=True, level=1.0, from_zero=True)
         pictures.append(signals(f"gap_by_{k + 1}", chart))
     words = "Root mean square residual of all sensors, each divided by its noise; 1 means noise only."

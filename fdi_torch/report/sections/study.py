@@ -40,7 +40,8 @@ def summary_section(material: Material) -> Section | None:
         return None
     keys = [key.removesuffix(".rmse") for _, _, m in settings for key in m if key.endswith(".rmse")]
     names = {key.partition(".")[2] for key in keys}
-    tables = setting_tables(settings, {name: _si_unit_of(material, name) for name in names})
+    units = {s.column: s.unit for s in material.plant.sensors} if material.plant else {}
+    tables = setting_tables(settings, units | {name: _si_unit_of(material, name) for name in names})
     legend, remark = [LEGEND] if len(tables) == len(settings) else [], _exact_constants(material, names)
     return Section("Settings", [*map(shown, tables), *legend, *([remark] if remark else [])])
 
