@@ -13,7 +13,9 @@ from torch import Tensor
 
 from fdi_torch.amounts import estimate_words, parameter_words, sized_words
 from fdi_torch.estimate.combinations import Combination
+from fdi_torch.estimate.linearisation import Linearise
 from fdi_torch.estimate.misfit import Misfit, fault_statement, kind_of
+from fdi_torch.estimate.rival_faults import RivalFaults, rival_faults
 from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace, common_name
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork
@@ -50,7 +52,8 @@ class Diagnosis:
     """Test results for all suspected faults, valid only if the model explains the recording.
 
     faults: all suspected faults, present or not. not_isolated: combinations of fault sizes, none of them determined
-    alone, that deviate significantly from nominal, so that at least one of their faults is present.
+    alone, that deviate significantly from nominal, so that at least one of their faults is present. rivals: other
+    faults, none of them significant alone, of which at least one is present.
     confidence: joint confidence of all statements (Bonferroni correction).
     """
 
@@ -58,6 +61,12 @@ class Diagnosis:
     confidence: float
     misfit: Misfit
     not_isolated: tuple[Combination, ...] = ()
+    rivals: RivalFaults | None = None
+
+    @property
+    def groups(self) -> tuple[Combination | RivalFaults, ...]:
+        """The groups of faults of which at least one is present, not isolated from each other."""
+        return (*self.not_isolated, *([self.rivals] if self.rivals else []))
 
     @property
     def present(self) -> tuple[Fault, ...]:
@@ -68,13 +77,13 @@ class Diagnosis:
         """'no fault', 'single fault', 'fault not isolated' or 'multiple faults'; 'not established' if the model does
         not explain the recording, because every test of a fault size assumes that it does.
         """
-        return kind_of(len(self.present), len(self.not_isolated), self.misfit.explained)
+        return kind_of(len(self.present), len(self.groups), self.misfit.explained)
 
     @property
     def statement(self) -> str:
         """Kind and names of the faults present: 'multiple faults: leak at T1, leak at T2 or plugging at OUT2'."""
         names = [parameter_words(f.name) for f in self.present]
-        return fault_statement(names, [c.rivals for c in self.not_isolated], self.misfit.explained)
+        return fault_statement(names, [g.rivals for g in self.groups], self.misfit.explained)
 
     @property
     def headline(self) -> str:
@@ -83,7 +92,7 @@ class Diagnosis:
         It begins with a warning if the model does not explain the recording.
         """
         sizes = [sized_words(f.name, [estimate_words(f.name, f.unit, f.value, f.std)]) for f in self.present]
-        not_isolated = [c.sized_rivals for c in self.not_isolated]
+        not_isolated = [g.sized_rivals for g in self.groups]
         return self.misfit.headline(fault_statement(sizes, not_isolated, self.misfit.explained))
 
 
@@ -97,16 +106,18 @@ def diagnose(
     misfit: Misfit,
     confidence: float = 0.95,
     combinations: Sequence[Combination] = (),
+    linearise: Linearise | None = None,
 ) -> Diagnosis:
-    """Test each fault size for a significant deviation from nominal.
+    """Test each fault size for a significant deviation from nominal, then the remaining ones together.
 
     A fault is present if |value - nominal| / std is significant at `confidence`, two-sided and Bonferroni-corrected for
-    the number of faults. A fault with an infinite standard error is never present; combinations: what is determined of
-    such faults, tested in the same way.
+    the number of tests: one of each fault and, of several faults, a joint one. A fault with an infinite standard error
+    is never present; combinations: what is determined of such faults, tested in the same way.
+    linearise: of the negative log-likelihood, for the joint test; None omits it.
     value, std (P,): estimates and standard errors. mean_levels (tanks,), m; mean_channels (channels,): actuator inputs.
     """
     fault_sizes = [i for i, p in enumerate(space) if is_fault_size(network, p)]
-    level = 1.0 - (1.0 - confidence) / max(len(fault_sizes), 1)
+    level = 1.0 - (1.0 - confidence) / (len(fault_sizes) + (len(fault_sizes) > 1))
     faults = []
     for i in fault_sizes:
         p = space.parameters[i]
@@ -123,7 +134,10 @@ def diagnose(
         for c in combinations
         if sizes.issuperset(c.parameters) and probability_of_deviation(c.value, c.std, c.nominal) > level
     )
-    return Diagnosis(tuple(faults), confidence, misfit, not_isolated)
+    decided = {f.name for f in faults if f.present} | {name for c in not_isolated for name in c.parameters}
+    undecided = [i for i in fault_sizes if space.names[i] not in decided]
+    rivals = rival_faults(linearise, space, value, undecided, level) if linearise and len(undecided) > 1 else None
+    return Diagnosis(tuple(faults), confidence, misfit, not_isolated, rivals)
 
 
 def probability_of_deviation(value: float, std: float, nominal: float) -> float:

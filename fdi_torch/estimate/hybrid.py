@@ -200,6 +200,7 @@ def conclude(
         worst(misfits),
         settings.confidence,
         estimate.combinations,
+        likelihood.linearise,
     )
     return HybridResult(
         estimate=estimate,

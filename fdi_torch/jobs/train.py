@@ -263,6 +263,7 @@ def log_result(
         more["draws"] = final.draws.to_dict()
     diagnosis = result.diagnosis
     more["not_isolated"] = [combination.to_dict() for combination in diagnosis.not_isolated]
+    more["rivals"] = [diagnosis.rivals.to_dict()] if diagnosis.rivals else []
     log.result(final.to_dict() | {"kind": diagnosis.kind} | diagnosis.misfit.to_dict() | more)
     if final.status != "converged":
         log.set_status("not_converged", final.status)

@@ -17,7 +17,7 @@ from fdi_torch.estimate.misfit import NOT_ESTABLISHED, flow_words
 from fdi_torch.names import counted
 from fdi_torch.plant.exact_constants import exact_constants_sentence
 from fdi_torch.report.chart import Chart, Line
-from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
+from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects, rivals_of
 from fdi_torch.report.html import bullets, shown, table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import correlation_table, estimate_table, number, shown_unit, signed
@@ -42,7 +42,8 @@ def estimate_section(material: Material) -> Section | None:
     findings += [tag("span", "present", class_="bad") if c in deviating else "" for c in combinations]
     rows = [[name, finding, *row] for finding, (name, *row) in zip(findings, estimates.rows, strict=True)]
     header = ("parameter", "finding", *estimates.header[1:])
-    notes = [str(note) for note in final.get("unidentifiable") or ()]
+    notes = [] if material.unexplained else [s for rivals in rivals_of(material) for s in rivals.sentences]
+    notes += [str(note) for note in final.get("unidentifiable") or ()]
     notes += [end_words(str(name), material.run.at_bounds.get(str(name), "")) for name in final.get("at_bound") or ()]
     if material.truth and material.plant is not None:
         constants = build_network(material.plant).constants.names
@@ -92,6 +93,7 @@ def _finding(material: Material, name: str) -> Any:
             if finding.present:
                 return tag("span", "present", class_="bad")
             not_isolated = any(name in c.parameters for c in combinations_of(material, "not_isolated"))
+            not_isolated |= any(name in rivals.names for rivals in rivals_of(material))
             return tag("span", "not isolated", class_="bad") if not_isolated else "not found"
     return ""
 
