@@ -113,10 +113,10 @@ def in_words(done: TrainResult) -> list[str]:
         if fault.flow is not None:
             parts.append(flow_words(fault.flow, fault.hole, diagnosis.misfit.explained))
         lines.append(f"- {parameter_words(fault.name)}: " + ", ".join(parts))
-    lines += [
-        f"- {sentence}"
-        for sentence in (diagnosis.rivals.sentences if diagnosis.rivals and diagnosis.misfit.explained else ())
-    ]
+    if diagnosis.rivals and diagnosis.misfit.explained:
+        lines += [f"- {sentence}" for sentence in diagnosis.rivals.sentences]
+    if diagnosis.claims and (remark := done.exact_constants):
+        lines.append(f"- {remark}")
     lines += [f"- {end_words(*each)}" for each in final.at_bounds.items()]
     lines += [f"- {sentence}" for sentence in final.undetermined]
     return lines

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.amounts import estimate_words, parameter_words, sized_words
@@ -71,6 +70,11 @@ class Diagnosis:
     @property
     def present(self) -> tuple[Fault, ...]:
         return tuple(f for f in self.faults if f.present)
+
+    @property
+    def claims(self) -> bool:
+        """Whether at least one fault differs significantly from nominal, alone or together with others."""
+        return bool(self.present or self.groups)
 
     @property
     def kind(self) -> str:
@@ -205,17 +209,3 @@ def _inflows(
     commands, _ = network.commands(inputs, network.steady_command_memory(inputs, clock, values), clock, values)
     point = network.operating_point(levels.unbind(), commands, clock, values)
     return network.less_overflow(point, network.net_inflows(point, network.flows(point)))
-
-
-def correlation_inflation(residual: Float[Tensor, "S C"], weight: Float[Tensor, "S C"]) -> Float[Tensor, " C"]:
-    """Variance inflation of each channel due to correlated residuals, (C,): (1 + a) / (1 - a), a: lag-1 correlation.
-
-    This is the ratio of an AR(1) spectrum at frequency zero to white noise of the same variance (Box & Jenkins 1970). A
-    correlation that is negative or within three standard errors of zero counts as zero. residual, weight: (S, C).
-    """
-    pairs = weight[1:] * weight[:-1]
-    square = (weight * residual**2).sum(0) / weight.sum(0).clamp(min=1.0)
-    count = pairs.sum(0).clamp(min=1.0)
-    a = (pairs * residual[1:] * residual[:-1]).sum(0) / count / square.clamp(min=1e-300)
-    a = torch.where(a > 3.0 / torch.sqrt(count), a, torch.zeros_like(a)).clamp(max=1.0 - 20.0 / (count + 20.0))
-    return (1.0 + a) / (1.0 - a)

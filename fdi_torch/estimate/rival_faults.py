@@ -6,12 +6,13 @@ that one is present. The joint test of a set R of faults compares the estimate w
     Lambda = 2 (min over theta with theta_R nominal of f(theta) - min f(theta)),
 
 with f the negative log-likelihood, priors included. Without a fault, Lambda has a chi-square distribution with |R|
-degrees of freedom (Wilks 1938, Annals of Mathematical Statistics 9:60). It is smaller if a nominal size is an end of its
-range (Self and Liang 1987), so that the test is then conservative. The threshold also holds for each subset of R
+degrees of freedom (Wilks 1938, Annals of Mathematical Statistics 9:60). It is smaller if a nominal size is an end of a
+range (Self and Liang 1987), so that the test is then conservative. Other parameters of these faults, such as an onset,
+count as degrees of freedom as well. The threshold also holds for each subset of R
 (Scheffe 1953, Biometrika 40:87).
 
-Each subset S of R is then an explanation, in which the other faults of R are nominal. Its probability follows from the
-evidence of `estimate.evidence`.
+Each subset S of R but the empty one is then an explanation, in which the other faults of R are nominal. Its
+probability, given that at least one is present, follows from the evidence of `estimate.evidence`.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from fdi_torch.estimate.levenberg_marquardt import RefineSettings, levenberg_mar
 from fdi_torch.estimate.linearisation import Linearise, Refined, held_back
 from fdi_torch.estimate.refinement import CONVERGED_WITHIN, TIGHT_DECREASE
 from fdi_torch.names import listed
-from fdi_torch.parameters import ParameterName, ParameterSpace
+from fdi_torch.parameters import ParameterName, ParameterSpace, common_name
 
 SETTINGS = RefineSettings(iterations=200, decrease_tolerance=TIGHT_DECREASE)
 LEAST_PROBABILITY, LEAST_LISTED = 0.01, 2
@@ -48,7 +49,7 @@ MOST_FAULTS = 4
 class Explanation:
     """Faults that together explain the readings, the other rivals being nominal, with sizes and standard errors (SI).
 
-    No names: no rival is present. probability: among all explanations.
+    probability: among all explanations with at least one of the rivals.
     """
 
     names: tuple[str, ...]
@@ -59,19 +60,16 @@ class Explanation:
 
     @property
     def sentence(self) -> str:
-        """'leak at A (size 0.197 ± 0.015) explains the readings: probability 97.0 %'."""
+        """'leak at A (size 0.197 ± 0.015) alone explains the readings: probability 97.0 %'."""
         each = zip(self.names, self.units, self.value, self.std, strict=True)
         faults = [sized_words(n, [estimate_words(n, unit, value, std)]) for n, unit, value, std in each]
-        verb = "explains" if len(faults) == 1 else "explain"
-        subject = f"{listed(faults)}{' alone' if len(faults) == 1 else ' together'}" if faults else "none of them"
-        verb = verb if faults else "is present"
-        return f"{subject} {verb}{' the readings' if faults else ''}: probability {probability_words(self.probability)}"
+        verb = "alone explains" if len(faults) == 1 else "together explain"
+        return f"{listed(faults)} {verb} the readings: probability {probability_words(self.probability)}"
 
     @property
     def words(self) -> str:
         """'leak at A: 97.0 %'."""
-        faults = listed([parameter_words(name) for name in self.names]) or "none"
-        return f"{faults}: {probability_words(self.probability)}"
+        return f"{listed([parameter_words(name) for name in self.names])}: {probability_words(self.probability)}"
 
 
 @dataclass(frozen=True)
@@ -127,9 +125,9 @@ def rival_faults(
 
     linearise: of the negative log-likelihood with known noise. theta (P,): the estimate. level: confidence level.
     """
-    fits = _Fits(linearise, space, theta)
+    fits = Fits(linearise, space, theta)
     without = fits.fit([tuple(tested)])[0]
-    if without is None or fits.p_value(without, len(tested)) >= 1.0 - level:
+    if without is None or fits.p_value(without, tested) >= 1.0 - level:
         return None
     explanations = _explanations(fits, tested)
     weights = posterior([fits.log_evidence(e, tested) for e in explanations])
@@ -137,18 +135,18 @@ def rival_faults(
     listed_ones = [pair for k, pair in enumerate(ranked) if k < LEAST_LISTED or pair[1] >= LEAST_PROBABILITY]
     rivals = tuple(i for i in tested if any(i in e.present for e, _ in listed_ones))
     subset = fits.fit([rivals])[0]
-    if subset is None or fits.p_value(subset, len(tested)) >= 1.0 - level:
+    if subset is None or fits.p_value(subset, tested) >= 1.0 - level:
         rivals, subset = tuple(tested), without
     return RivalFaults(
         tuple(space.names[i] for i in rivals),
         fits.ratio(subset),
-        1.0 - fits.p_value(subset, len(tested)),
+        1.0 - fits.p_value(subset, tested),
         tuple(e.described(space, w) for e, w in listed_ones),
     )
 
 
 @dataclass(frozen=True)
-class _Fit:
+class Fit:
     """Best fit with some faults nominal. free (P,) bool: parameters that were fitted. present: the tested faults that
     were."""
 
@@ -166,7 +164,7 @@ class _Fit:
         return Explanation(names, units, values, errors, probability)
 
 
-class _Fits:
+class Fits:
     """Fits from an estimate, with some faults held at their nominal sizes."""
 
     def __init__(self, linearise: Linearise, space: ParameterSpace, theta: Tensor) -> None:
@@ -174,20 +172,33 @@ class _Fits:
         self.low, self.high, self.nominal = (x.to(theta) for x in (space.low(), space.high(), space.nominal()))
         self.lowest = float(linearise(theta[None], torch.zeros(1, dtype=torch.int64)).cost)
 
-    def ratio(self, fit: _Fit) -> float:
+    def shapes(self, faults: Sequence[int]) -> list[int]:
+        """The other parameters of these faults, such as an onset."""
+        prefixes = {ParameterName.parse(self.space.names[i]).prefix for i in faults}
+        named = enumerate(self.space.names)
+        return [i for i, n in named if i not in faults and ParameterName.parse(common_name(n)).prefix in prefixes]
+
+    def ratio(self, fit: Fit) -> float:
         """Likelihood ratio of a fit against the best one."""
         return max(2.0 * (fit.cost - self.lowest), 0.0)
 
-    def p_value(self, fit: _Fit, degrees: int) -> float:
-        """Probability of such a ratio by chance, of chi-square with `degrees` degrees of freedom."""
+    def p_value(self, fit: Fit, faults: Sequence[int]) -> float:
+        """Probability of such a ratio by chance, of chi-square with one degree of freedom for each parameter of the
+        faults."""
+        degrees = len(faults) + len(self.shapes(faults))
         half = torch.tensor([0.5 * degrees, 0.5 * self.ratio(fit)], dtype=torch.float64)
         return float(torch.special.gammaincc(half[0], half[1]))
 
-    def fit(self, held: Sequence[tuple[int, ...]]) -> list[_Fit | None]:
-        """The best fits with these parameters nominal, from two starts each: the estimate, and its deviations without
-        those of tested faults. None for one that did not converge."""
+    def fit(self, held: Sequence[tuple[int, ...]]) -> list[Fit | None]:
+        """The best fits with these faults nominal, None for one that did not converge.
+
+        Each starts twice: at the estimate, and there with the constants of the plant nominal. The shape of a nominal
+        fault has no effect and stays as estimated.
+        """
         low, high = self.low.repeat(len(held), 1), self.high.repeat(len(held), 1)
         for row, which in enumerate(held):
+            shapes = self.shapes(which)
+            low[row, shapes] = high[row, shapes] = self.theta[shapes]
             low[row, list(which)] = high[row, list(which)] = self.nominal[list(which)]
         start = self.theta.expand_as(low)
         rough = torch.where(torch.isfinite(self.space.std(self.theta)), self.nominal, start)
@@ -197,13 +208,13 @@ class _Fits:
         best = replace(refined, cost=torch.where(near, refined.cost, math.inf)).best()
         lowest = best.cost
         self.lowest = min([self.lowest, *lowest[torch.isfinite(lowest)].tolist()])
-        fits: list[_Fit | None] = []
+        fits: list[Fit | None] = []
         for row in range(len(held)):
             free = low[row] < high[row]
             fits.append(_fit_of(best, row, free) if bool(torch.isfinite(lowest[row])) else None)
         return fits
 
-    def log_evidence(self, fit: _Fit, tested: Sequence[int]) -> float:
+    def log_evidence(self, fit: Fit, tested: Sequence[int]) -> float:
         """Log evidence of an explanation; `evidence.log_prior` has the odds."""
         std = self.space.std(fit.theta)
         widths = torch.where(torch.isfinite(std), math.sqrt(2.0 * math.pi) * std, self.high - self.low)
@@ -215,31 +226,30 @@ class _Fits:
         return volume - fit.cost + log_prior(len(fit.present), len(places), len(tested))
 
 
-def _fit_of(best: Refined, row: int, free: Tensor) -> _Fit:
-    return _Fit(float(best.cost[row]), best.theta[row], best.gradient[row], best.curvature[row], free)
+def _fit_of(best: Refined, row: int, free: Tensor) -> Fit:
+    return Fit(float(best.cost[row]), best.theta[row], best.gradient[row], best.curvature[row], free)
 
 
-def _explanations(fits: _Fits, tested: Sequence[int]) -> list[_Fit]:
-    """Fits with no tested fault, one, two ... of them, until one more fault than suffices.
+def _explanations(fits: Fits, tested: Sequence[int]) -> list[Fit]:
+    """Fits with one tested fault, two ... of them, until one more fault than suffices.
 
     Of each number, the likeliest ones are extended by each other fault.
     """
-    explained: list[_Fit] = []
-    candidates: list[tuple[int, ...]] = [()]
+    explained: list[Fit] = []
+    candidates: list[tuple[int, ...]] = [(i,) for i in tested]
     sufficient = False
-    for count in range(min(len(tested), MOST_FAULTS) + 1):
+    for _ in range(min(len(tested), MOST_FAULTS)):
         held = [tuple(i for i in tested if i not in present) for present in candidates]
         of_count = [
-            replace(fit, present=present)
-            for fit, present in zip(fits.fit(held), candidates, strict=True)
-            if fit is not None
+            fit and replace(fit, present=present) for fit, present in zip(fits.fit(held), candidates, strict=True)
         ]
-        explained += of_count
+        converged = [fit for fit in of_count if fit is not None]
+        explained += converged
         if sufficient:
             break
-        rest = len(tested) - count
-        sufficient = not rest or any(fits.p_value(fit, rest) > SUFFICIENT for fit in of_count)
-        likeliest = sorted(of_count, key=lambda fit: fit.cost)[:MOST_EXTENDED]
+        absent = zip(of_count, held, strict=True)
+        sufficient = any(not rest or fits.p_value(fit, rest) > SUFFICIENT for fit, rest in absent if fit is not None)
+        likeliest = sorted(converged, key=lambda fit: fit.cost)[:MOST_EXTENDED]
         extended = {tuple(sorted({*fit.present, i})) for fit in likeliest for i in tested if i not in fit.present}
         candidates = sorted(extended)
         if not candidates:

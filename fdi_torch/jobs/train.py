@@ -29,6 +29,7 @@ from fdi_torch.jobs.recording_check import thorough_findings
 from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, requested_space, simulated_truth
 from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
+from fdi_torch.plant.exact_constants import without_tolerance_sentence
 from fdi_torch.progress import Tell, rounded, silent
 from fdi_torch.recordings.check import doubts_about
 from fdi_torch.report.fit_figure import fit_figure
@@ -66,6 +67,12 @@ class TrainResult(Shown):
         """The diagnosis in one sentence; it begins with a warning if the model does not explain the recording."""
         warning = self.estimate.warning
         return f"{warning}. {self.result.diagnosis.headline}" if warning else self.result.diagnosis.headline
+
+    @property
+    def exact_constants(self) -> str:
+        """A sentence about the constants that count as exact for lack of a tolerance; empty if there are none."""
+        names = self.fitting.networks[0].constants.names
+        return without_tolerance_sentence(self.fitting.plant, self.fitting.space.names, names)
 
     @in_its_units
     def table(self) -> Table:
@@ -168,11 +175,12 @@ def estimate_logged(
     if run.config.recordings and not result.diagnosis.misfit.explained:
         tell(0.95, "examining the recordings")
         doubts = (*thorough_findings(run.plant, [r.to(torch.device("cpu")) for r in fitting.recordings]), *doubts)
+    doubts = (*result.diagnosis.misfit.remarks, *doubts)
     log_result(log, result, fitting.space, profiles, doubts)
     each = zip(fitting.recordings, result.predicted, result.noise, strict=True)
     for k, (recording, predicted, noise) in enumerate(each):
         log_prediction(log, recording, predicted, group_of(k, len(fitting.recordings)), noise)
-    return result, profiles, tuple(doubts)
+    return result, profiles, doubts
 
 
 class SearchLogger:

@@ -53,7 +53,8 @@ def unreliable_words(material: Material) -> str:
     warnings = [convergence_warning(result.get("status", "")) if material.kind == "train" else ""]
     if material.unexplained:
         ratio = result.get("unexplained_ratio", "null")
-        warnings.append(unreliable(math.inf if ratio == "null" else float(ratio)))
+        share = float(result.get("explained_share", 1.0))
+        warnings.append(unreliable(math.inf if ratio == "null" else float(ratio), share))
     return "".join(f"{warning}. " for warning in warnings if warning)
 
 

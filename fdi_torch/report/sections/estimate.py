@@ -15,7 +15,7 @@ from fdi_torch.amounts import end_words
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import NOT_ESTABLISHED, flow_words
 from fdi_torch.names import counted
-from fdi_torch.plant.exact_constants import exact_constants_sentence
+from fdi_torch.plant.exact_constants import exact_constants_sentence, without_tolerance_sentence
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects, rivals_of
 from fdi_torch.report.html import bullets, shown, table, tag
@@ -45,10 +45,12 @@ def estimate_section(material: Material) -> Section | None:
     notes = [] if material.unexplained else [s for rivals in rivals_of(material) for s in rivals.sentences]
     notes += [str(note) for note in final.get("unidentifiable") or ()]
     notes += [end_words(str(name), material.run.at_bounds.get(str(name), "")) for name in final.get("at_bound") or ()]
-    if material.truth and material.plant is not None:
+    if material.plant is not None:
         constants = build_network(material.plant).constants.names
-        remark = exact_constants_sentence(material.plant, names, constants)
-        notes += [remark] if remark else []
+        claims = any(f.present for f in diagnosed_effects(material)) or deviating or rivals_of(material)
+        exact = [exact_constants_sentence(material.plant, names, constants)] if material.truth else []
+        exact += [without_tolerance_sentence(material.plant, names, constants)] if claims else []
+        notes += [remark for remark in exact if remark]
     return Section("Estimate", [table(header, rows, left=3), *_water(material), *bullets(notes)], lead=True)
 
 
