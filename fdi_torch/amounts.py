@@ -89,6 +89,23 @@ def one_sided(value: float, std: float, end: str) -> str:
     return f"below {rounded(value + reach, std)}" if end == "low" else f"above {rounded(value - reach, std)}"
 
 
+def interval_words(value: float, std: float, low: float = -math.inf, high: float = math.inf, end: str = "") -> str:
+    """The 95 % interval as far as it lies within the range from low to high: '0.052 … 0.143'.
+
+    It has a limit on one side, 'below 0.051', if the other one is the end of the range, whether or not the estimate
+    lies there; where the readings set none, it is the range. end: as of `with_error`.
+    """
+    if not (math.isfinite(value) and math.isfinite(std)):
+        return "–"
+    from_low, to_high = (value - AT_95 * std > low and end != "low"), (value + AT_95 * std < high and end != "high")
+    if from_low and not to_high:
+        return f"above {rounded(value - AT_95 * std, std)}"
+    if to_high and not from_low:
+        return f"below {rounded(value + AT_95 * std, std)}"
+    limits = (value - AT_95 * std, value + AT_95 * std) if from_low else (low, high)
+    return " … ".join(rounded(limit, std) for limit in limits)
+
+
 def end_words(name: str, end: str) -> str:
     """The sentence about an estimate at the 'low' or 'high' end of its range."""
     return f"{name} lies at the {end} end of its range" if end else f"{name} lies at an end of its range"

@@ -5,7 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
+from scipy.optimize import minimize
 
 import fdi_torch
 from fdi_torch.cli.screen import Screen
@@ -26,6 +29,7 @@ BENCH: dict[str, Any] = {
     "sensors": {"hA": {"tank": "A"}, "hB": {"tank": "B"}},
     "tolerances": {"*.discharge_coefficient": "3 %"},
 }
+FINE = {"xatol": 1e-4, "fatol": 1e-6, "maxiter": 4000, "maxfev": 4000}
 SUSPECTED = ("A.leak", "B.leak", "link.plugging")
 
 
@@ -38,7 +42,7 @@ def trained(folder: Path, seed: int, leak: float, samples: int = 30) -> TrainRes
         "faults": {"A.leak": leak},
         "noise": {"std": {"hA": "1 mm", "hB": "1 mm"}},
     }
-    keys = {"parameters": [*SUSPECTED]}
+    keys = {"parameters": [*SUSPECTED], "calibrate": ["*.discharge_coefficient"]}
     job = {"plant": BENCH, "simulate": simulated, "estimate": keys, "seed": seed, "output": {"folder": str(folder)}}
     return fdi_torch.train(job)
 
@@ -53,7 +57,26 @@ def test_a_leak_that_collinear_faults_hide_is_no_absence_of_faults(tmp_path: Pat
     first = rivals.explanations[0]
     assert first.names == ("A.leak.size",) and first.probability > 0.5
     assert first.value[0] == pytest.approx(0.2, abs=3.5 * first.std[0]) and first.std[0] < 0.04
+    assert [each.names for each in rivals.explanations[1:]] == [("B.leak.size", "link.plugging.size")]
     assert sum(each.probability for each in rivals.explanations) == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_statistic_is_the_rise_of_the_misfit_without_the_faults(tmp_path: Path) -> None:
+    """Of a fit of the constants alone to the same readings, its noise being that of the fit with the faults."""
+    done = trained(tmp_path, 1, 0.2)
+    rivals, likelihood, space = done.result.diagnosis.rivals, done.result.likelihood, done.fitting.space
+    assert rivals is not None and {*rivals.names} == {f"{name}.size" for name in SUSPECTED}
+
+    def cost(faultless: np.ndarray) -> float:
+        theta = torch.cat([torch.zeros(3, dtype=torch.float64), torch.from_numpy(faultless)])
+        return float(likelihood.cost(theta[None, None], torch.zeros(1, dtype=torch.int64)))
+
+    scale = done.result.estimate.std[3:].numpy()
+    start = space.nominal()[3:].numpy()
+    best = minimize(lambda x: cost(start + scale * x), np.zeros(len(start)), method="Nelder-Mead", options=FINE)
+    assert best.success
+    full = float(likelihood.cost(done.result.estimate.value[None, None], torch.zeros(1, dtype=torch.int64)))
+    assert rivals.chi_square == pytest.approx(2.0 * (best.fun - full), rel=1e-3)
 
 
 def test_terminal_page_log_and_json_name_the_rivals_in_the_same_words(

@@ -11,8 +11,8 @@ range (Self and Liang 1987), so that the test is then conservative. Other parame
 count as degrees of freedom as well. The threshold also holds for each subset of R
 (Scheffe 1953, Biometrika 40:87).
 
-Each subset S of R but the empty one is then an explanation, in which the other faults of R are nominal. Its
-probability, given that at least one is present, follows from the evidence of `estimate.evidence`.
+Small subsets S of R are then explanations, in which the other faults of R are nominal. Their probabilities, given that
+at least one is present, follow from the evidence of `estimate.evidence`.
 """
 
 from __future__ import annotations
@@ -233,25 +233,22 @@ def _fit_of(best: Refined, row: int, free: Tensor) -> Fit:
 def _explanations(fits: Fits, tested: Sequence[int]) -> list[Fit]:
     """Fits with one tested fault, two ... of them, until one more fault than suffices.
 
-    Of each number, the likeliest ones are extended by each other fault.
+    Faults that suffice are not extended. The likeliest of the others are, by each other fault.
     """
-    explained: list[Fit] = []
+    explanations: list[Fit] = []
     candidates: list[tuple[int, ...]] = [(i,) for i in tested]
-    sufficient = False
+    sufficient: list[tuple[int, ...]] = []
     for _ in range(min(len(tested), MOST_FAULTS)):
-        held = [tuple(i for i in tested if i not in present) for present in candidates]
-        of_count = [
-            fit and replace(fit, present=present) for fit, present in zip(fits.fit(held), candidates, strict=True)
-        ]
-        converged = [fit for fit in of_count if fit is not None]
-        explained += converged
+        absent = [tuple(i for i in tested if i not in present) for present in candidates]
+        each = zip(fits.fit(absent), candidates, absent, strict=True)
+        fitted = [(replace(fit, present=present), rest) for fit, present, rest in each if fit is not None]
+        explanations += [fit for fit, _ in fitted]
         if sufficient:
             break
-        absent = zip(of_count, held, strict=True)
-        sufficient = any(not rest or fits.p_value(fit, rest) > SUFFICIENT for fit, rest in absent if fit is not None)
-        likeliest = sorted(converged, key=lambda fit: fit.cost)[:MOST_EXTENDED]
-        extended = {tuple(sorted({*fit.present, i})) for fit in likeliest for i in tested if i not in fit.present}
-        candidates = sorted(extended)
+        sufficient = [fit.present for fit, rest in fitted if not rest or fits.p_value(fit, rest) > SUFFICIENT]
+        lacking = sorted((fit for fit, _ in fitted if fit.present not in sufficient), key=lambda fit: fit.cost)
+        extended = {tuple(sorted({*f.present, i})) for f in lacking[:MOST_EXTENDED] for i in tested} - {*candidates}
+        candidates = sorted(e for e in extended if not any({*e}.issuperset(each) for each in sufficient))
         if not candidates:
             break
-    return explained
+    return explanations

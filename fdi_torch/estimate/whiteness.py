@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-MOST_LAGS, LAGS_PER_READING = 20, 0.2
-"""The number m of lags: 20, or a fifth of the readings."""
+MOST_LAGS, LAGS_PER_READING = 20, 0.05
+"""The number m of lags: 20, or a twentieth of the readings."""
 SIGNIFICANCE = 1e-3
 """Level of the test, of all sensors of all recordings together."""
 WINDOW = 5.0

@@ -91,7 +91,7 @@ class TrainResult(Shown):
         final, space = self.estimate, self.fitting.space
         exact = {"nominal": {p.name: p.nominal for p in space}} | ({"simulated": self.truth} if self.truth else {})
         columns = (final.names, final.units, final.value.tolist(), final.std.tolist())
-        return estimate_table("", *columns, ends=final.at_bounds, combinations=final.combinations, exact=exact)
+        return estimate_table("", *columns, combinations=final.combinations, exact=exact, **final.limits)
 
     @in_its_units
     def picture(self) -> str:

@@ -25,7 +25,8 @@ def exact_constants_sentence(plant: PlantDescription, estimated: Collection[str]
 def without_tolerance_sentence(plant: PlantDescription, estimated: Collection[str], constants: Collection[str]) -> str:
     """Say which constants count as exact because the plant file gives them no tolerance; '' if all have one.
 
-    These are the areas of the tanks, and the constants of each flow of which none has a tolerance or is estimated.
+    These are the areas of the tanks and, of each flow of which no constant has a tolerance or is estimated, the last
+    one, which is the factor of its law: the discharge coefficient of a pipe, the gain of a pump.
     """
     uncertain = {*plant.tolerances, *estimated}
     groups = [[f"{tank.name}.area"] for tank in plant.tanks]
@@ -33,7 +34,7 @@ def without_tolerance_sentence(plant: PlantDescription, estimated: Collection[st
         [f"{flow.name}.{name}" for name, _, role in flow.constants() if role == "estimated"]
         for flow in plant.flow_components()
     ]
-    patterns = _patterns([name for group in groups if not uncertain.intersection(group) for name in group], constants)
+    patterns = _patterns([group[-1] for group in groups if group and not uncertain.intersection(group)], constants)
     if not patterns:
         return ""
     more = [f"{len(patterns) - MOST_LISTED} more"] if len(patterns) > MOST_LISTED else []

@@ -36,7 +36,7 @@ def estimate_section(material: Material) -> Section | None:
     combinations = combinations_of(material, "combinations")
     truth = {"simulated": material.truth} if material.truth else {}
     numbers = (names, units, final["values"], final["std"])
-    estimates = estimate_table("", *numbers, ends=material.run.at_bounds, combinations=combinations, exact=truth)
+    estimates = estimate_table("", *numbers, **material.limits, combinations=combinations, exact=truth)
     deviating = () if material.unexplained else combinations_of(material, "not_isolated")
     findings = [_finding(material, name) for name in names]
     findings += [tag("span", "present", class_="bad") if c in deviating else "" for c in combinations]
