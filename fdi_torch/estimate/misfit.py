@@ -3,7 +3,8 @@
     ratio_c = rms(y_c - model_c) / sigma_c  <=  UNEXPLAINED_RATIO exp(AT_95 NOISE_ERROR / sqrt(N_c))
 
 The model is rejected if a channel c with N_c readings exceeds this: the exponential is what chance adds, because
-sigma_c is estimated from the same readings. train, refit and predict all judge and word it here.
+sigma_c is estimated from the same readings. train, refit and predict all judge and word it here. train also rejects a
+model that leaves correlated residuals beside faults that explain too little, see `estimate.lack_of_fit`.
 """
 
 from __future__ import annotations
