@@ -38,7 +38,7 @@ def intervals_section(material: Material) -> Section | None:
         unit, scale = display_unit(final["units"][i] if final.get("units") else "", name)
         value, std = (scale * float(final[key][i]) for key in ("values", "std"))
         low, high = (scale * limit for limit in ranges.get(name, UNLIMITED))
-        standard = interval_words(value, std, low, high, ends.get(name, ""))
+        standard = interval_words(value, std, low, high, ends.get(name, ""), number)
         rows.append([name, unit or "1", standard, *_limits(profiles.get(name), draws.get(name), scale)])
         pictures.append(_column(name, unit, scale, profiles.get(name), draws.get(name), len(pictures)))
     words = (
