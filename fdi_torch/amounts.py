@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 from fdi_torch.names import listed
 from fdi_torch.parameters import ParameterName
@@ -87,6 +88,32 @@ def one_sided(value: float, std: float, end: str) -> str:
     """
     reach = AT_95 * std
     return f"below {rounded(value + reach, std)}" if end == "low" else f"above {rounded(value - reach, std)}"
+
+
+def interval_words(
+    value: float,
+    std: float,
+    low: float = -math.inf,
+    high: float = math.inf,
+    end: str = "",
+    show: Callable[[float], str] | None = None,
+) -> str:
+    """The 95 % interval as far as it lies within the range from low to high: '0.052 … 0.143'.
+
+    It has a limit on one side, 'below 0.051', if the other one is the end of the range, whether or not the estimate
+    lies there; where the readings set none, it is the range. end: as of `with_error`. show: the text of a limit; by
+    default as many digits as the standard error has.
+    """
+    show = show or partial(rounded, std=std)
+    if not (math.isfinite(value) and math.isfinite(std)):
+        return "–"
+    from_low, to_high = (value - AT_95 * std > low and end != "low"), (value + AT_95 * std < high and end != "high")
+    if from_low and not to_high:
+        return f"above {show(value - AT_95 * std)}"
+    if to_high and not from_low:
+        return f"below {show(value + AT_95 * std)}"
+    limits = (value - AT_95 * std, value + AT_95 * std) if from_low else (low, high)
+    return " … ".join(map(show, limits))
 
 
 def end_words(name: str, end: str) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from fdi_torch import Plant, Pump, Sensor, Tank, Transfer
@@ -9,6 +11,7 @@ from fdi_torch.amounts import (
     end_words,
     estimate_words,
     faults_in_words,
+    interval_words,
     parameter_words,
     rounded,
     sized_words,
@@ -92,6 +95,7 @@ def test_an_estimate_at_an_end_of_its_range_has_a_limit_on_one_side() -> None:
     """Half of a normal distribution has 95 % of its probability within 1.96 standard deviations."""
     assert with_error(0.0, 0.026, "low") == "below 0.051" and with_error(1.0, 0.026, "high") == "above 0.949"
     assert with_error(0.0, float("inf"), "low") == "not determined" and with_error(0.0, 0.0, "low") == "0"
+    assert interval_words(0.0, 0.026, 0.0, 1.0, "low") == "below 0.051"
     assert end_words("B.leak.size", "low") == "B.leak.size lies at the low end of its range"
 
 
@@ -105,3 +109,20 @@ def test_numbers_of_a_table_have_the_digits_of_their_error() -> None:
 def test_probabilities_in_a_table_have_three_digits() -> None:
     shown = Table(("explanation", "probability"), [("leak at A", 0.697017)]).cells()
     assert shown == [["leak at A", "69.7 %"]]
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "low", "high", "text"),
+    [
+        (0.5, 0.1, 0.0, 1.0, "0.30 … 0.70"),
+        (0.1, 0.1, 0.0, 1.0, "below 0.30"),  # whether or not the estimate lies at the end
+        (0.9, 0.1, 0.0, 1.0, "above 0.70"),
+        (-0.3, 1.7, -1.0, 1.0, "-1.0 … 1.0"),  # the readings set no limit
+        (0.1, 0.1, -math.inf, math.inf, "-0.10 … 0.30"),
+        (0.1, math.inf, 0.0, 1.0, "–"),
+    ],
+)
+def test_an_interval_lies_within_the_range_of_its_parameter(
+    value: float, std: float, low: float, high: float, text: str
+) -> None:
+    assert interval_words(value, std, low, high) == text

@@ -22,6 +22,8 @@ from fdi_torch.jobs.study import run_study
 from fdi_torch.jobs.train import train
 from fdi_torch.logbook import LogError, Message, RunLog, read_run, replay
 from fdi_torch.logbook.export import FORMATS
+from fdi_torch.report.material import gather
+from fdi_torch.report.verdict import headline
 
 QUICK = [
     "simulate.duration=200 s",
@@ -305,7 +307,10 @@ def test_what_if_writes_a_new_log_with_its_parent(trained: Path, capsys: pytest.
     assert cli.main(["replay", str(trained), "--set", "seed=5", "--quiet"]) == cli.DONE
     child = read_run(trained.with_name(f"{trained.stem}.what_if.mcap"))
     assert child.metadata["fdi_torch.run"]["parent_run_id"] == read_run(trained).metadata["fdi_torch.run"]["run_id"]
-    assert "They differ in seed (" in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert "They differ in seed (" in text
+    verdict = headline(gather(child, None))
+    assert f"{trained.stem}.what_if: {verdict}.\n" in text and f"{trained.stem}: " in text
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from fdi_torch.estimate.evolution import EvolutionResult, distant_members
 from fdi_torch.estimate.refinement import starting_points
 from fdi_torch.jobs.study import TRIAL, StudyResult, progress, run_study
 from fdi_torch.logbook import read_run
-from fdi_torch.plant.exact_constants import exact_constants_sentence
+from fdi_torch.plant.exact_constants import exact_constants_sentence, without_tolerance_sentence
 from fdi_torch.quantities import displayed_in
 from fdi_torch.report.material import gather
 from fdi_torch.report.predictions import progress_of
@@ -349,5 +349,9 @@ def test_constants_that_count_as_exact_are_named_with_the_key_that_estimates_the
     assert len(of_first) == 1 and of_first[0] not in exact_constants_sentence(plant, of_first, constants)
     assert "*" not in exact_constants_sentence(plant, of_first, constants)
     assert exact_constants_sentence(plant, list(plant.tolerances), constants) == ""
+    without = without_tolerance_sentence(plant, ["T1.area"], constants)
+    assert "this fault: T2.area, T3.area, Q1.gain and Q2.gain; list" in without and "{T2.area: 5 %}" in without
+    exact = ["T1.area", "T2.area", "T3.area", "Q1.gain", "Q2.gain"]
+    assert without_tolerance_sentence(plant, exact, constants) == ""
     show(StudyResult((), None, {}, 0, 1.0, Path("study.mcap")), Screen(), sentence)
     assert f"{sentence}\n" in capsys.readouterr().out

@@ -238,6 +238,16 @@ def test_interval_of_an_estimate_at_a_bound_ends_there() -> None:
     torch.testing.assert_close(high, torch.tensor([reach, 1.0], dtype=DOUBLE))
 
 
+def test_an_interval_ends_with_the_range_of_its_parameter() -> None:
+    """Whether or not the estimate lies at the end of the range, 0 to 1."""
+    theta = torch.tensor([0.05, 0.95], dtype=DOUBLE)
+    estimate = make_estimate(space("a", "b"), theta, torch.diag(torch.tensor([100.0, 100.0], dtype=DOUBLE)))
+    low, high = estimate.interval()
+    reach = stats.norm.ppf(0.975) * 0.1
+    torch.testing.assert_close(low, torch.tensor([0.0, 0.95 - reach], dtype=DOUBLE))
+    torch.testing.assert_close(high, torch.tensor([0.05 + reach, 1.0], dtype=DOUBLE))
+
+
 def test_plain_form_is_strict_json_and_says_none_for_no_number() -> None:
     estimate = make_estimate(
         space("a", "b"),

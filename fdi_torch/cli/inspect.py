@@ -18,7 +18,7 @@ from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
 from fdi_torch.disk import named_errors, write_text
 from fdi_torch.logbook import Inspection, export, export_attachment, foxglove_layout, inspect_log, read_run
-from fdi_torch.logbook.reader import AT_BOUNDS
+from fdi_torch.logbook.reader import AT_BOUNDS, RANGES, ranges_of
 from fdi_torch.names import counted
 from fdi_torch.report.numbers import correlation_table, estimate_table
 from fdi_torch.tables import Table
@@ -89,7 +89,7 @@ def show(inspection: Inspection, screen: Screen) -> None:
     results = [
         (IN_SI.get(name, name), result_text(text))
         for name, text in result.items()
-        if not (tables and name in (*ESTIMATE, *DRAWS))
+        if not (tables and (name in (*ESTIMATE, *DRAWS) or name.startswith(RANGES)))
     ]
     results = [(name, text) for name, text in results if text]
     for name, text in results[:MOST_RESULTS]:
@@ -115,7 +115,7 @@ def estimate_tables(result: Mapping[str, str]) -> list[Table]:
         *estimates, covariance = (orjson.loads(result.get(key, "[]")) for key in ESTIMATE[:5])
         ends = {key.removeprefix(AT_BOUNDS): end for key, end in result.items() if key.startswith(AT_BOUNDS)}
         drawn = [orjson.loads(result.get(key, "[]")) for key in DRAWS]
-        tables = [estimate_table("estimates", *estimates, ends=ends)]
+        tables = [estimate_table("estimates", *estimates, ends=ends, ranges=ranges_of(result))]
         tables.append(estimate_table("draws: median and standard deviation", *drawn))
         matrix = np.array(covariance, dtype=float).reshape(len(estimates[0]), -1)
         if matrix.shape == (len(matrix),) * 2 and len(matrix) > 1:

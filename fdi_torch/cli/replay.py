@@ -51,9 +51,12 @@ def what_if(arguments: argparse.Namespace, screen: Screen) -> int:
         repeat_run(read_run(source), target, arguments.set, arguments.trial, advance)
         advance(1.0, "done")
     compared = compare([source, target])
+    for label, verdict in compared.verdicts.items():
+        screen.say(f"{label}: {verdict.removesuffix('.')}.")
     comparing.show(compared, screen)
     screen.say(f"log: {target}")
-    screen.result({"format": "fdi_torch.replay/1", "log": str(target), "comparison": compared.comparison})
+    words = {"verdicts": compared.verdicts, "comparison": compared.comparison}
+    screen.result({"format": "fdi_torch.replay/1", "log": str(target), **words})
     return DONE
 
 

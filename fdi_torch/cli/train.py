@@ -113,6 +113,10 @@ def in_words(done: TrainResult) -> list[str]:
         if fault.flow is not None:
             parts.append(flow_words(fault.flow, fault.hole, diagnosis.misfit.explained))
         lines.append(f"- {parameter_words(fault.name)}: " + ", ".join(parts))
+    if diagnosis.rivals and diagnosis.misfit.explained:
+        lines += [f"- {sentence}" for sentence in diagnosis.rivals.sentences]
+    if diagnosis.claims and (remark := done.exact_constants):
+        lines.append(f"- {remark}")
     lines += [f"- {end_words(*each)}" for each in final.at_bounds.items()]
     lines += [f"- {sentence}" for sentence in final.undetermined]
     return lines
@@ -144,6 +148,7 @@ def as_json(done: TrainResult) -> dict[str, object]:
             **result.diagnosis.misfit.to_dict(),
             "faults": result.diagnosis.faults,
             "not_isolated": result.diagnosis.not_isolated,
+            "rivals": result.diagnosis.rivals,
         },
         "correlation": result.correlation.tolist(),
         "search": {"reason": result.search.reasons()[0], "generations": int(result.search.generations[0])},

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.amounts import estimate_words, parameter_words, sized_words
 from fdi_torch.estimate.combinations import Combination
+from fdi_torch.estimate.linearisation import Linearise
 from fdi_torch.estimate.misfit import Misfit, fault_statement, kind_of
+from fdi_torch.estimate.rival_faults import RivalFaults, rival_faults
 from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace, common_name
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork
@@ -50,7 +51,8 @@ class Diagnosis:
     """Test results for all suspected faults, valid only if the model explains the recording.
 
     faults: all suspected faults, present or not. not_isolated: combinations of fault sizes, none of them determined
-    alone, that deviate significantly from nominal, so that at least one of their faults is present.
+    alone, that deviate significantly from nominal, so that at least one of their faults is present. rivals: other
+    faults, none of them significant alone, of which at least one is present.
     confidence: joint confidence of all statements (Bonferroni correction).
     """
 
@@ -58,23 +60,34 @@ class Diagnosis:
     confidence: float
     misfit: Misfit
     not_isolated: tuple[Combination, ...] = ()
+    rivals: RivalFaults | None = None
+
+    @property
+    def groups(self) -> tuple[Combination | RivalFaults, ...]:
+        """The groups of faults of which at least one is present, not isolated from each other."""
+        return (*self.not_isolated, *([self.rivals] if self.rivals else []))
 
     @property
     def present(self) -> tuple[Fault, ...]:
         return tuple(f for f in self.faults if f.present)
 
     @property
+    def claims(self) -> bool:
+        """Whether at least one fault differs significantly from nominal, alone or together with others."""
+        return bool(self.present or self.groups)
+
+    @property
     def kind(self) -> str:
         """'no fault', 'single fault', 'fault not isolated' or 'multiple faults'; 'not established' if the model does
         not explain the recording, because every test of a fault size assumes that it does.
         """
-        return kind_of(len(self.present), len(self.not_isolated), self.misfit.explained)
+        return kind_of(len(self.present), len(self.groups), self.misfit.explained)
 
     @property
     def statement(self) -> str:
         """Kind and names of the faults present: 'multiple faults: leak at T1, leak at T2 or plugging at OUT2'."""
         names = [parameter_words(f.name) for f in self.present]
-        return fault_statement(names, [c.rivals for c in self.not_isolated], self.misfit.explained)
+        return fault_statement(names, [g.rivals for g in self.groups], self.misfit.explained)
 
     @property
     def headline(self) -> str:
@@ -83,7 +96,7 @@ class Diagnosis:
         It begins with a warning if the model does not explain the recording.
         """
         sizes = [sized_words(f.name, [estimate_words(f.name, f.unit, f.value, f.std)]) for f in self.present]
-        not_isolated = [c.sized_rivals for c in self.not_isolated]
+        not_isolated = [g.sized_rivals for g in self.groups]
         return self.misfit.headline(fault_statement(sizes, not_isolated, self.misfit.explained))
 
 
@@ -97,16 +110,18 @@ def diagnose(
     misfit: Misfit,
     confidence: float = 0.95,
     combinations: Sequence[Combination] = (),
+    linearise: Linearise | None = None,
 ) -> Diagnosis:
-    """Test each fault size for a significant deviation from nominal.
+    """Test each fault size for a significant deviation from nominal, then the remaining ones together.
 
     A fault is present if |value - nominal| / std is significant at `confidence`, two-sided and Bonferroni-corrected for
-    the number of faults. A fault with an infinite standard error is never present; combinations: what is determined of
-    such faults, tested in the same way.
+    the number of tests: one of each fault and, of several faults, a joint one. A fault with an infinite standard error
+    is never present; combinations: what is determined of such faults, tested in the same way.
+    linearise: of the negative log-likelihood, for the joint test; None omits it.
     value, std (P,): estimates and standard errors. mean_levels (tanks,), m; mean_channels (channels,): actuator inputs.
     """
     fault_sizes = [i for i, p in enumerate(space) if is_fault_size(network, p)]
-    level = 1.0 - (1.0 - confidence) / max(len(fault_sizes), 1)
+    level = 1.0 - (1.0 - confidence) / (len(fault_sizes) + (len(fault_sizes) > 1))
     faults = []
     for i in fault_sizes:
         p = space.parameters[i]
@@ -123,7 +138,10 @@ def diagnose(
         for c in combinations
         if sizes.issuperset(c.parameters) and probability_of_deviation(c.value, c.std, c.nominal) > level
     )
-    return Diagnosis(tuple(faults), confidence, misfit, not_isolated)
+    decided = {f.name for f in faults if f.present} | {name for c in not_isolated for name in c.parameters}
+    undecided = [i for i in fault_sizes if space.names[i] not in decided]
+    rivals = rival_faults(linearise, space, value, undecided, level) if linearise and len(undecided) > 1 else None
+    return Diagnosis(tuple(faults), confidence, misfit, not_isolated, rivals)
 
 
 def probability_of_deviation(value: float, std: float, nominal: float) -> float:
@@ -191,17 +209,3 @@ def _inflows(
     commands, _ = network.commands(inputs, network.steady_command_memory(inputs, clock, values), clock, values)
     point = network.operating_point(levels.unbind(), commands, clock, values)
     return network.less_overflow(point, network.net_inflows(point, network.flows(point)))
-
-
-def correlation_inflation(residual: Float[Tensor, "S C"], weight: Float[Tensor, "S C"]) -> Float[Tensor, " C"]:
-    """Variance inflation of each channel due to correlated residuals, (C,): (1 + a) / (1 - a), a: lag-1 correlation.
-
-    This is the ratio of an AR(1) spectrum at frequency zero to white noise of the same variance (Box & Jenkins 1970). A
-    correlation that is negative or within three standard errors of zero counts as zero. residual, weight: (S, C).
-    """
-    pairs = weight[1:] * weight[:-1]
-    square = (weight * residual**2).sum(0) / weight.sum(0).clamp(min=1.0)
-    count = pairs.sum(0).clamp(min=1.0)
-    a = (pairs * residual[1:] * residual[:-1]).sum(0) / count / square.clamp(min=1e-300)
-    a = torch.where(a > 3.0 / torch.sqrt(count), a, torch.zeros_like(a)).clamp(max=1.0 - 20.0 / (count + 20.0))
-    return (1.0 + a) / (1.0 - a)

@@ -7,16 +7,17 @@ refinement halves it until estimates and standard errors no longer depend on it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.device import on_its_device
-from fdi_torch.estimate.diagnosis import Diagnosis, correlation_inflation, diagnose
+from fdi_torch.estimate.diagnosis import Diagnosis, diagnose
 from fdi_torch.estimate.evolution import EvolutionResult, Search, evolve
 from fdi_torch.estimate.fitting import Fitting
+from fdi_torch.estimate.lack_of_fit import explained_share, residuals_of
 from fdi_torch.estimate.levenberg_marquardt import Progress
 from fdi_torch.estimate.linearisation import Refined
 from fdi_torch.estimate.misfit import channel_misfit, worst
@@ -157,23 +158,21 @@ def conclude(
 ) -> HybridResult:
     """Compute estimate, diagnosis and goodness of fit at the refined optimum.
 
-    Standard errors use each channel's noise level times sqrt((1 + a) / (1 - a)), with a the lag-1 correlation of the
-    residuals of each step, because correlated residuals carry less information than independent ones (see
-    `correlation_inflation`).
+    Standard errors use each channel's noise level times the square root of `whiteness.correlation_inflation` of the
+    residuals of each step, because correlated residuals carry less information than independent ones.
     """
     theta = refinement.theta
     lanes = torch.zeros(1, dtype=torch.int64)
     problem = fitting.problem(steps[1], "likelihood", settings.adaptive)
     raw = fitting.problem(steps[1], "likelihood", settings.adaptive, averaged=False)
-    predicted, misfits, inflated_noise = [], [], []
+    predicted, misfits, inflated_noise, residuals = [], [], [], []
     noise = [level[0] for level in raw.noise(theta, lanes)]
     for term, noise_level in zip(raw.terms, noise, strict=True):
         predicted.append(term.engine.readings(term.theta(theta))[0])
         misfits.append(channel_misfit(noise_level, term.data.known, term.data.weight))
     for term, noise_level in zip(problem.terms, problem.noise(theta, lanes), strict=True):
-        residuals = term.data.known - term.engine.readings(term.theta(theta))[0]
-        inflation = correlation_inflation(residuals, (term.data.weight > 0).to(residuals))
-        inflated_noise.append(noise_level[0] * torch.sqrt(inflation))
+        residuals.append(residuals_of(term, theta, len(problem.terms) * len(fitting.plant.sensors)))
+        inflated_noise.append(noise_level[0] * torch.sqrt(residuals[-1].inflation))
     likelihood = problem.at_noise(inflated_noise)
     curvature = likelihood.linearise(theta, lanes).curvature[0]
     samples = torch.stack([term.data.degrees for term in raw.terms])
@@ -190,6 +189,8 @@ def conclude(
     levels = first.engine.levels(first.theta(theta))[0].mean(dim=0)
     channels = fitting.recordings[0].input_columns(fitting.plant.channels())
     means = fitting.recordings[0].inputs[:, channels].mean(dim=0)
+    flags = torch.stack([part.correlated for part in residuals]).any(0).tolist()
+    correlated = tuple(s.name for s, flag in zip(fitting.plant.sensors, flags, strict=True) if flag)
     diagnosis = diagnose(
         fitting.networks[0],
         fitting.space,
@@ -197,10 +198,15 @@ def conclude(
         estimate.std,
         levels,
         means,
-        worst(misfits),
+        replace(worst(misfits), correlated=correlated),
         settings.confidence,
         estimate.combinations,
+        likelihood.linearise,
     )
+    if correlated and diagnosis.claims and diagnosis.misfit.explained:
+        faults = [fitting.space.names.index(fault.name) for fault in diagnosis.faults]
+        share = explained_share(likelihood, fitting.space, theta[0], faults, residuals)
+        diagnosis = replace(diagnosis, misfit=replace(diagnosis.misfit, share=share))
     return HybridResult(
         estimate=estimate,
         diagnosis=diagnosis,

@@ -32,8 +32,8 @@ class Estimate(Shown):
 
     std (P,): standard errors, which include the tolerances of plant constants through their priors; infinite for
     undetermined parameters. covariance (P, P): computed without regard to bounds; infinite or NaN in the rows and
-    columns of undetermined parameters. at_bounds: 'low' or 'high' by name. undetermined: one sentence per group.
-    combinations: what is determined of the undetermined parameters.
+    columns of undetermined parameters. ranges: lowest and highest value by name. at_bounds: 'low' or 'high' by name.
+    undetermined: one sentence per group. combinations: what is determined of the undetermined parameters.
     noise_std (C,): noise level of each channel over all recordings, known or estimated, in its unit. reached: how the
     estimate was computed, as plain values. draws: from the posterior, if some were asked for.
     """
@@ -44,6 +44,7 @@ class Estimate(Shown):
     std: torch.Tensor
     covariance: torch.Tensor
     status: str = ""
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     at_bounds: Mapping[str, str] = field(default_factory=dict)
     undetermined: tuple[str, ...] = ()
     combinations: tuple[Combination, ...] = ()
@@ -74,6 +75,12 @@ class Estimate(Shown):
         return convergence_warning(self.status)
 
     @property
+    def limits(self) -> dict[str, Mapping[str, Any]]:
+        """The ranges of the parameters, and the ends at which estimates lie, as `report.numbers.estimate_table` takes
+        them."""
+        return {"ends": self.at_bounds, "ranges": self.ranges}
+
+    @property
     def correlation(self) -> torch.Tensor:
         """Correlation matrix (P, P); NaN in rows and columns of undetermined parameters."""
         return self.covariance / (self.std[:, None] * self.std[None, :])
@@ -81,12 +88,15 @@ class Estimate(Shown):
     def interval(self, confidence: float = 0.95) -> tuple[torch.Tensor, torch.Tensor]:
         """Lower and upper limits (P,) of each parameter's confidence interval, from the normal distribution.
 
-        An estimate at an end of its range is that limit of its interval.
+        They lie within the parameter's range; an estimate at an end of it is that limit of its interval.
         """
         half_width = NormalDist().inv_cdf(0.5 + 0.5 * confidence) * self.std
         ends = [self.at_bounds.get(name) for name in self.names]
         low, high = (torch.tensor([end == side for end in ends], device=self.std.device) for side in ("low", "high"))
-        return self.value - half_width.where(~low, 0.0), self.value + half_width.where(~high, 0.0)
+        ranges = [self.ranges.get(name, (-math.inf, math.inf)) for name in self.names]
+        least, most = self.value.new_tensor(ranges).reshape(-1, 2).unbind(-1)
+        lower, upper = self.value - half_width.where(~low, 0.0), self.value + half_width.where(~high, 0.0)
+        return lower.clamp(min=least), upper.clamp(max=most)
 
     def to_arviz(self) -> Any:
         """The draws as an xarray.DataTree by ArviZ (extra `draws`), see `Draws.to_arviz`.
@@ -153,6 +163,7 @@ def make_estimate(
         std=uncertainty.std,
         covariance=uncertainty.covariance,
         status=status,
+        ranges={p.name: (p.low, p.high) for p in space},
         at_bounds=parameters_at_bounds(space, theta),
         undetermined=(*(group.sentence for group in groups), *wider_than_range(space, uncertainty.std)),
         combinations=tuple(combination for group in groups for combination in group.combinations),

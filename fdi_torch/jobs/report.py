@@ -146,6 +146,11 @@ class ComparisonResult(Shown):
             rows.append((each.name, *in_display_unit(each.name, each.unit, *numbers), each.p_value, each.agree))
         return Table(("parameter", "unit", *sum(errors, ()), "p", "agree"), rows)
 
+    @property
+    def verdicts(self) -> dict[str, str]:
+        """The verdict of each run in one sentence."""
+        return {label: headline(run) for label, run in zip(self.comparison.labels, self.runs, strict=True)}
+
     def settings(self) -> Table:
         """One row per setting that differs, in words; what parts that not every run has differ in is left out."""
         return setting_table(self.comparison, self.runs)

@@ -29,6 +29,7 @@ from fdi_torch.jobs.recording_check import thorough_findings
 from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, requested_space, simulated_truth
 from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace
+from fdi_torch.plant.exact_constants import without_tolerance_sentence
 from fdi_torch.progress import Tell, rounded, silent
 from fdi_torch.recordings.check import doubts_about
 from fdi_torch.report.fit_figure import fit_figure
@@ -67,6 +68,12 @@ class TrainResult(Shown):
         warning = self.estimate.warning
         return f"{warning}. {self.result.diagnosis.headline}" if warning else self.result.diagnosis.headline
 
+    @property
+    def exact_constants(self) -> str:
+        """A sentence about the constants that count as exact for lack of a tolerance; empty if there are none."""
+        names = self.fitting.networks[0].constants.names
+        return without_tolerance_sentence(self.fitting.plant, self.fitting.space.names, names)
+
     @in_its_units
     def table(self) -> Table:
         """One row per parameter, in its unit for display."""
@@ -84,7 +91,7 @@ class TrainResult(Shown):
         final, space = self.estimate, self.fitting.space
         exact = {"nominal": {p.name: p.nominal for p in space}} | ({"simulated": self.truth} if self.truth else {})
         columns = (final.names, final.units, final.value.tolist(), final.std.tolist())
-        return estimate_table("", *columns, ends=final.at_bounds, combinations=final.combinations, exact=exact)
+        return estimate_table("", *columns, combinations=final.combinations, exact=exact, **final.limits)
 
     @in_its_units
     def picture(self) -> str:
@@ -168,11 +175,12 @@ def estimate_logged(
     if run.config.recordings and not result.diagnosis.misfit.explained:
         tell(0.95, "examining the recordings")
         doubts = (*thorough_findings(run.plant, [r.to(torch.device("cpu")) for r in fitting.recordings]), *doubts)
+    doubts = (*result.diagnosis.misfit.remarks, *doubts)
     log_result(log, result, fitting.space, profiles, doubts)
     each = zip(fitting.recordings, result.predicted, result.noise, strict=True)
     for k, (recording, predicted, noise) in enumerate(each):
         log_prediction(log, recording, predicted, group_of(k, len(fitting.recordings)), noise)
-    return result, profiles, tuple(doubts)
+    return result, profiles, doubts
 
 
 class SearchLogger:
@@ -263,6 +271,7 @@ def log_result(
         more["draws"] = final.draws.to_dict()
     diagnosis = result.diagnosis
     more["not_isolated"] = [combination.to_dict() for combination in diagnosis.not_isolated]
+    more["rivals"] = [diagnosis.rivals.to_dict()] if diagnosis.rivals else []
     log.result(final.to_dict() | {"kind": diagnosis.kind} | diagnosis.misfit.to_dict() | more)
     if final.status != "converged":
         log.set_status("not_converged", final.status)

@@ -6,14 +6,17 @@ middle raises LogError when it is reached, unless `salvage` is set.
 
 from __future__ import annotations
 
+import math
 import mmap
 import struct
 import zlib
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import orjson
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment as AttachmentRecord
@@ -29,7 +32,7 @@ from fdi_torch.logbook.sink import EPOCH_NS
 from fdi_torch.logbook.topic_definitions import Channel
 from fdi_torch.untrusted_input import MOST_EXPANSION, MOST_UNPACKED
 
-AT_BOUNDS = "at_bounds."  # before the parameters in the result
+AT_BOUNDS, RANGES = "at_bounds.", "ranges."  # before the parameters in the result
 
 # Outside chunks these records have no CRC. Logs of this program have none there; one found there is a damaged record.
 _LOOSE = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
@@ -113,6 +116,11 @@ class Run:
         """The end of its range, 'low' or 'high', of each parameter whose estimate lies there."""
         ends = self.about("result").items()
         return {key.removeprefix(AT_BOUNDS): end for key, end in ends if key.startswith(AT_BOUNDS)}
+
+    @property
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """Lowest and highest value of each parameter, SI; an older log has none."""
+        return ranges_of(self.about("result"))
 
     @property
     def ours(self) -> bool:
@@ -276,3 +284,15 @@ def map_file(path: Path) -> Any:
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         except ValueError:
             raise LogError(f"{path}: the file is empty; the run was killed before it wrote anything") from None
+
+
+def ranges_of(result: Mapping[str, str]) -> dict[str, tuple[float, float]]:
+    """The range of each parameter in a result; a missing or unreadable end is infinite."""
+    ranges = {}
+    for key, text in result.items():
+        if key.startswith(RANGES):
+            with suppress(ValueError, TypeError):
+                low, high = orjson.loads(text)
+                ends = (-math.inf if low is None else float(low), math.inf if high is None else float(high))
+                ranges[key.removeprefix(RANGES)] = ends
+    return ranges

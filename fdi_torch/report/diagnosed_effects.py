@@ -10,6 +10,7 @@ from typing import Any
 from fdi_torch.amounts import amount_words, with_error
 from fdi_torch.effects import effect
 from fdi_torch.estimate.combinations import Combination
+from fdi_torch.estimate.rival_faults import RivalFaults
 from fdi_torch.gap.verdict_words import apart_from_rounding, cause_words, equivalents_words
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
@@ -84,6 +85,15 @@ def combinations_of(material: Material, result: str) -> list[Combination]:
         return [Combination.from_dict(plain) for plain in material.listed(result)]
     except (KeyError, TypeError, ValueError) as error:
         material.problems.append(f"the result's {result.replace('_', ' ')} are unreadable: {error}")
+        return []
+
+
+def rivals_of(material: Material) -> list[RivalFaults]:
+    """The rival faults in the run's result, if there are any."""
+    try:
+        return [RivalFaults.from_dict(plain) for plain in material.listed("rivals")]
+    except (KeyError, TypeError, ValueError) as error:
+        material.problems.append(f"the result's rivals are unreadable: {error}")
         return []
 
 

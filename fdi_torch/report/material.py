@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -53,6 +53,11 @@ class Material:
         except ValueError:
             return []
         return value if isinstance(value, list) else []
+
+    @property
+    def limits(self) -> dict[str, Mapping[str, Any]]:
+        """The ranges of the parameters and the ends at which estimates lie, as `estimate_table` takes them."""
+        return {"ends": self.run.at_bounds, "ranges": self.run.ranges}
 
     @property
     def unexplained(self) -> bool:

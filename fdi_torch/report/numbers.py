@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.amounts import AT_95, RAISED, rounded, with_error
+from fdi_torch.amounts import RAISED, interval_words, rounded, with_error
 from fdi_torch.clock import clock_unit
 from fdi_torch.estimate.combinations import Combination
 from fdi_torch.parameters import ParameterName
@@ -52,21 +52,22 @@ def as_vector(values: Any) -> np.ndarray:
 
 
 NONE: Mapping[str, Any] = {}
+UNLIMITED = (-math.inf, math.inf)
 HEADER = ("unit", "estimate", "95 % interval")
 
 
-def estimate_cells(name: str, si_unit: str, value: Any, std: Any, end: str = "") -> list[str]:
+def estimate_cells(
+    name: str, si_unit: str, value: Any, std: Any, end: str = "", limits: tuple[float, float] = UNLIMITED
+) -> list[str]:
     """The cells below HEADER of an SI value, in its unit for display; without a finite std it is not determined. end:
-    'low' or 'high' for an estimate at an end of its range, see `amounts.with_error`.
+    'low' or 'high' for an estimate at an end of its range, the SI `limits`; see `amounts.interval_words`.
     """
     numbers = (math.nan if value is None else float(value), math.inf if std is None else float(std))
-    unit, value, std = in_display_unit(name, si_unit, *numbers)
+    unit, value, std, low, high = in_display_unit(name, si_unit, *numbers, *limits)
     known = math.isfinite(value) and math.isfinite(std)
     unit = clock_unit(unit, ParameterName.parse(name).field, value) if known else unit
-    if end and known and std > 0.0:
-        return [unit, rounded(value, std), with_error(value, std, end)]
-    limits = (value - AT_95 * std, value + AT_95 * std)
-    return [unit, with_error(value, std), " … ".join(rounded(x, std) for x in limits) if known else "–"]
+    estimate = rounded(value, std) if end and known and std > 0.0 else with_error(value, std)
+    return [unit, estimate, interval_words(value, std, low, high, end)]
 
 
 def estimate_table(
@@ -77,16 +78,20 @@ def estimate_table(
     std: Any,
     *,
     ends: Mapping[str, str] = NONE,
+    ranges: Mapping[str, tuple[float, float]] = NONE,
     combinations: Sequence[Combination] = (),
     exact: Mapping[str, Mapping[str, float]] = NONE,
 ) -> Table:
     """The estimates (P,) of parameters, SI, then their determined combinations.
 
-    ends: 'low' or 'high' by the name of a parameter. exact: further columns by their title, with exact values by
-    parameter, SI.
+    ends: 'low' or 'high' by the name of a parameter. ranges: their lowest and highest values, SI. exact: further
+    columns by their title, with exact values by parameter, SI.
     """
     columns = zip(names, units, values, std, strict=True)
-    listed: list[Any] = [(n, (n,), (1.0,), str(unit), value, s, ends.get(n, "")) for n, unit, value, s in columns]
+    listed: list[Any] = [
+        (n, (n,), (1.0,), str(unit), value, s, ends.get(n, ""), ranges.get(n, UNLIMITED))
+        for n, unit, value, s in columns
+    ]
     listed += [(c.formula, c.parameters, c.coefficients, c.unit, c.value, c.std) for c in combinations]
     rows = []
     for name, parameters, coefficients, unit, *numbers in listed:

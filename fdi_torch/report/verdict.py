@@ -13,7 +13,7 @@ from fdi_torch.estimate.misfit import fault_statement, unreliable
 from fdi_torch.estimate.uncertainty import convergence_warning
 from fdi_torch.gap.verdict_words import verdict_sentence
 from fdi_torch.names import counted, listed
-from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
+from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects, rivals_of
 from fdi_torch.report.material import Material
 from fdi_torch.report.numbers import as_float, number
 from fdi_torch.report.sections.monitor import rehearsal_tables
@@ -53,7 +53,8 @@ def unreliable_words(material: Material) -> str:
     warnings = [convergence_warning(result.get("status", "")) if material.kind == "train" else ""]
     if material.unexplained:
         ratio = result.get("unexplained_ratio", "null")
-        warnings.append(unreliable(math.inf if ratio == "null" else float(ratio)))
+        share = float(result.get("explained_share", 1.0))
+        warnings.append(unreliable(math.inf if ratio == "null" else float(ratio), share))
     return "".join(f"{warning}. " for warning in warnings if warning)
 
 
@@ -64,6 +65,7 @@ def fault_words(material: Material) -> str:
         return ""
     present = [f.sized for f in effects if f.present]
     not_isolated = [combination.sized_rivals for combination in combinations_of(material, "not_isolated")]
+    not_isolated += [rivals.sized_rivals for rivals in rivals_of(material)]
     words = fault_statement(present, not_isolated, not material.unexplained)
     return words[:1].upper() + words[1:]
 

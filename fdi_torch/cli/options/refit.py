@@ -19,7 +19,7 @@ examples:
 ARGUMENTS = {
     **shared("--plant", "--recording", required=True),
     **shared("--holdout", help="other recordings of the same rig, whose error before and after the fit is shown"),
-    **shared("--leave-out"),
+    **shared("--leave-out", help="effects of the plant file that the fit leaves out, at all of their places"),
     **shared("--step", help="integration step (default: half the sampling interval)"),
     "--hold": {"metavar": "NAME,...", "type": names, "default": (), "help": "do not fit these (* matches any name)"},
     **shared("--vary", help="values that may differ by recording; their variation is reported (* matches any name)"),

@@ -15,9 +15,9 @@ from fdi_torch.amounts import end_words
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import NOT_ESTABLISHED, flow_words
 from fdi_torch.names import counted
-from fdi_torch.plant.exact_constants import exact_constants_sentence
+from fdi_torch.plant.exact_constants import exact_constants_sentence, without_tolerance_sentence
 from fdi_torch.report.chart import Chart, Line
-from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
+from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects, rivals_of
 from fdi_torch.report.html import bullets, shown, table, tag
 from fdi_torch.report.material import Material, Payload
 from fdi_torch.report.numbers import correlation_table, estimate_table, shown_unit, signed
@@ -36,18 +36,21 @@ def estimate_section(material: Material) -> Section | None:
     combinations = combinations_of(material, "combinations")
     truth = {"simulated": material.truth} if material.truth else {}
     numbers = (names, units, final["values"], final["std"])
-    estimates = estimate_table("", *numbers, ends=material.run.at_bounds, combinations=combinations, exact=truth)
+    estimates = estimate_table("", *numbers, **material.limits, combinations=combinations, exact=truth)
     deviating = () if material.unexplained else combinations_of(material, "not_isolated")
     findings = [_finding(material, name) for name in names]
     findings += [tag("span", "present", class_="bad") if c in deviating else "" for c in combinations]
     rows = [[name, finding, *row] for finding, (name, *row) in zip(findings, estimates.rows, strict=True)]
     header = ("parameter", "finding", *estimates.header[1:])
-    notes = [str(note) for note in final.get("unidentifiable") or ()]
+    notes = [] if material.unexplained else [s for rivals in rivals_of(material) for s in rivals.sentences]
+    notes += [str(note) for note in final.get("unidentifiable") or ()]
     notes += [end_words(str(name), material.run.at_bounds.get(str(name), "")) for name in final.get("at_bound") or ()]
-    if material.truth and material.plant is not None:
+    if material.plant is not None:
         constants = build_network(material.plant).constants.names
-        remark = exact_constants_sentence(material.plant, names, constants)
-        notes += [remark] if remark else []
+        claims = any(f.present for f in diagnosed_effects(material)) or deviating or rivals_of(material)
+        exact = [exact_constants_sentence(material.plant, names, constants)] if material.truth else []
+        exact += [without_tolerance_sentence(material.plant, names, constants)] if claims else []
+        notes += [remark for remark in exact if remark]
     return Section("Estimate", [table(header, rows, left=3), *_water(material), *bullets(notes)], lead=True)
 
 
@@ -92,6 +95,7 @@ def _finding(material: Material, name: str) -> Any:
             if finding.present:
                 return tag("span", "present", class_="bad")
             not_isolated = any(name in c.parameters for c in combinations_of(material, "not_isolated"))
+            not_isolated |= any(name in rivals.names for rivals in rivals_of(material))
             return tag("span", "not isolated", class_="bad") if not_isolated else "not found"
     return ""
 

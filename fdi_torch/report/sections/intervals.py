@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.amounts import AT_95, with_error
+from fdi_torch.amounts import interval_words
 from fdi_torch.estimate.uncertainty import chi_square_quantile
 from fdi_torch.quantities import display_unit
 from fdi_torch.report.chart import Chart, Line
 from fdi_torch.report.html import bullets, table
-from fdi_torch.report.material import Material, Payload
-from fdi_torch.report.numbers import as_float, as_vector, axis, number
+from fdi_torch.report.material import Material
+from fdi_torch.report.numbers import UNLIMITED, as_float, as_vector, axis, number
 from fdi_torch.report.section import Column, Picture, Section, signals
 from fdi_torch.report.sections.estimate import last_estimate
 from fdi_torch.report.style import MODEL, OTHER
@@ -29,19 +29,17 @@ def intervals_section(material: Material) -> Section | None:
     final, draws = last_estimate(material), _draws(material)
     if final is None or not (profiles or draws):
         return None
+    ranges, ends = material.run.ranges, material.run.at_bounds
     rows: list[list[str]] = []
     pictures: list[Column] = []
     for i, name in enumerate(map(str, final["names"])):
         if name not in profiles and name not in draws:
             continue
         unit, scale = display_unit(final["units"][i] if final.get("units") else "", name)
-        rows.append(
-            [
-                name,
-                unit or "1",
-                *_limits(final, i, material.run.at_bounds.get(name, ""), profiles.get(name), draws.get(name), scale),
-            ]
-        )
+        value, std = (scale * float(final[key][i]) for key in ("values", "std"))
+        low, high = (scale * limit for limit in ranges.get(name, UNLIMITED))
+        standard = interval_words(value, std, low, high, ends.get(name, ""), number)
+        rows.append([name, unit or "1", standard, *_limits(profiles.get(name), draws.get(name), scale)])
         pictures.append(_column(name, unit, scale, profiles.get(name), draws.get(name), len(pictures)))
     words = (
         "Standard errors assume a likelihood that is quadratic about the estimate. The profile is the likelihood ratio "
@@ -65,18 +63,15 @@ def _draws(material: Material) -> dict[str, np.ndarray]:
     return {str(name): flat[np.isfinite(flat[:, i]), i] for i, name in enumerate(final["names"])}
 
 
-def _limits(
-    final: Payload, i: int, end: str, profile: Mapping[str, Any] | None, draws: np.ndarray | None, scale: float
-) -> list[str]:
-    value, std = scale * float(final["values"][i]), scale * float(final["std"][i])
-    two_sided = _interval(value - AT_95 * std, value + AT_95 * std)
-    cells = [with_error(value, std, end) if end else two_sided, "", "", ""]
+def _limits(profile: Mapping[str, Any] | None, draws: np.ndarray | None, scale: float) -> list[str]:
+    """The interval of the profile, that of the draws, and a remark."""
+    cells = ["", "", ""]
     if profile is not None:
         level = f" ({100.0 * as_float(profile.get('confidence')):g} %)"
-        cells[1] = _interval(*(scale * as_float(profile.get(end)) for end in ("low", "high"))) + level
-        cells[3] = "; ".join(f"the {end} end is the end of its range" for end in profile.get("ends") or ())
+        cells[0] = _interval(*(scale * as_float(profile.get(end)) for end in ("low", "high"))) + level
+        cells[2] = "; ".join(f"the {end} end is the end of its range" for end in profile.get("ends") or ())
     if draws is not None and len(draws):
-        cells[2] = _interval(*(scale * np.quantile(draws, (TAIL, 1.0 - TAIL))))
+        cells[1] = _interval(*(scale * np.quantile(draws, (TAIL, 1.0 - TAIL))))
     return cells
 
 

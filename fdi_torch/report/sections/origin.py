@@ -13,7 +13,7 @@ from fdi_torch.estimate.misfit import NOT_ESTABLISHED
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.quantities import quantity_text
-from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects
+from fdi_torch.report.diagnosed_effects import combinations_of, diagnosed_effects, rivals_of
 from fdi_torch.report.html import bullets, escape, folded, pairs, shown, tag, typeset
 from fdi_torch.report.material import Material
 from fdi_torch.report.schematic import Overlay, schematic
@@ -73,8 +73,9 @@ def marks_of(material: Material) -> dict[str, list[str]]:
             marks.setdefault(finding.location, []).append(
                 typeset(f"{kind_words(finding.effect, finding.location)}{size}")
             )
-    for combination in combinations_of(material, "not_isolated"):
-        for fault in map(ParameterName.of_effect, combination.parameters):
+    groups = [c.parameters for c in combinations_of(material, "not_isolated")]
+    for names in [*groups, *(rivals.names for rivals in rivals_of(material))]:
+        for fault in map(ParameterName.of_effect, names):
             marks.setdefault(fault.place, []).append(f"{kind_words(fault.effect, fault.place)}, not isolated")
     return marks
 
