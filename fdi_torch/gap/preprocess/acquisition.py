@@ -236,7 +236,7 @@ def _level_inside_range(
     mean_square = float((samples * means**2).sum() / samples.sum())
     gains = torch.tensor([s.gain for s in plant.sensors], dtype=torch.float64)
     model_error = float(((fitted.variance / gains**2)[fitted.means > 0]).max()) * stuck.sensor.gain**2
-    count = blocked.blocks * float(stuck_now.double().mean())
+    count = blocked.errors * float(stuck_now.double().mean())
     return 0.5 * count * math.log(max(mean_square, model_error) / model_error) > SURE
 
 

@@ -1,6 +1,6 @@
 """Faults of a recording, as opposed to faults of the plant: each is a hypothesis that can be tested.
 
-    wrong unit        y = 10^k y'               k = -3 ... 3, of one sensor or one input
+    wrong unit        y = 10^k y'               k = -3 ... 3, of one sensor or one input, if y' is possible
     swapped channels  y_a = y'_b, y_b = y'_a    two sensors of one calibration, or two inputs of one unit
     clock offset      `clock_offset.py`
     silent sensor     y = mean + scatter, whatever the level
@@ -27,6 +27,7 @@ from fdi_torch.gap.preprocess.clock_offset import clock_offsets
 from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Correction
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, stuck, swapped, unrelated, wrong_unit
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.plant_units import exceeds_limits
 
 DECADES = (-3, -2, -1, 1, 2, 3)
 """Powers of ten by which a unit can be wrong; millimetres instead of metres at most."""
@@ -45,19 +46,31 @@ def suspected(fits: CorrectedFits, constant: Collection[str], thorough: bool) ->
 
 
 def _units(fits: CorrectedFits) -> Iterator[list[Correction]]:
-    """The wrong units of each sensor, and of each input."""
-    r = fits.thinned
-    for i, sensor in enumerate(fits.plant.sensors):
-        outputs = {k: _scaled(r.outputs, fits.column(i), k) for k in DECADES}
+    """The wrong units of each sensor, and of each input, in which its values would be possible."""
+    r, plant = fits.thinned, fits.plant
+    for i, sensor in enumerate(plant.sensors):
+        decades = [
+            k for k in DECADES if not exceeds_limits(plant, sensor.column, r.valid_readings(sensor.column) / 10.0**k)
+        ]
         # Jacobian of the change of unit: an error of the level is 10^k times as large in the recorded numbers.
         cost = float(fits.as_is.means[i]) * math.log(10.0)
         yield [
-            Correction(wrong_unit(sensor.column, k), replace(r, outputs=x), k * cost, _scaled(fits.noise, i, k))
-            for k, x in outputs.items()
+            Correction(
+                wrong_unit(sensor.column, k),
+                replace(r, outputs=_scaled(r.outputs, fits.column(i), k)),
+                k * cost,
+                _scaled(fits.noise, i, k),
+            )
+            for k in decades
         ]
-    for channel in fits.plant.channels():
+    for channel in plant.channels():
         column = r.input_names.index(channel)
-        yield [Correction(wrong_unit(channel, k), replace(r, inputs=_scaled(r.inputs, column, k))) for k in DECADES]
+        inputs = {k: _scaled(r.inputs, column, k) for k in DECADES}
+        yield [
+            Correction(wrong_unit(channel, k), replace(r, inputs=x))
+            for k, x in inputs.items()
+            if not exceeds_limits(plant, channel, x[:, column])
+        ]
 
 
 def _scaled(values: Tensor, column: int, decade: int) -> Tensor:
