@@ -113,10 +113,10 @@ def _unit_above_rim(plant: PlantDescription, recording: Recording, columns: set[
 def usable(plant: PlantDescription, recording: Recording, effects: bool = False) -> CheckedRecording:
     """Check a recording. Raises ValueError if it has a recording fault.
 
-    effects: whether the caller considers effects of sensors; one that lags or leads is then accepted, and so are
-    readings above a rim, which the caller must take as unknown (`with_rims_unknown`).
+    effects: whether the caller considers effects; a sensor that lags or leads is then accepted, and so are a fault that
+    shows beside an effect only, and readings above a rim, which the caller must take as unknown (`with_rims_unknown`).
     """
-    checked = examined(plant, recording)
+    checked = examined(plant, recording, thorough=effects)
     if checked.fault and not (effects and checked.fault.physical):
         raise ValueError(refusal(recording, checked.fault.text))
     return checked

@@ -12,8 +12,8 @@ from fdi_torch.plant.description import Sensor
 class RecordingFault:
     """A fault of the recording: its channels, and a sentence that says what to do.
 
-    silent: the channels are sensors whose readings do not depend on their levels. physical: the sensor
-    itself, such as one that lags or leads, would look the same, so that the gap diagnosis must accept the recording.
+    silent: the channels are sensors whose readings do not depend on their levels. physical: the rig itself, such as a
+    sensor that lags, may look the same, so that the gap diagnosis must accept the recording.
     """
 
     channels: tuple[str, ...]

@@ -21,6 +21,7 @@ from dataclasses import replace
 from itertools import chain, combinations
 from operator import itemgetter
 
+import torch
 from torch import Tensor
 
 from fdi_torch.gap.preprocess.clock_offset import clock_offsets
@@ -46,31 +47,21 @@ def suspected(fits: CorrectedFits, constant: Collection[str], thorough: bool) ->
 
 
 def _units(fits: CorrectedFits) -> Iterator[list[Correction]]:
-    """The wrong units of each sensor, and of each input, in which its values would be possible."""
+    """The wrong units of each sensor, and of each input, in which its values would be possible and not the same."""
     r, plant = fits.thinned, fits.plant
     for i, sensor in enumerate(plant.sensors):
-        decades = [
-            k for k in DECADES if not exceeds_limits(plant, sensor.column, r.valid_readings(sensor.column) / 10.0**k)
-        ]
+        readings, of_sensor = r.valid_readings(sensor.column), []
         # Jacobian of the change of unit: an error of the level is 10^k times as large in the recorded numbers.
         cost = float(fits.as_is.means[i]) * math.log(10.0)
-        yield [
-            Correction(
-                wrong_unit(sensor.column, k),
-                replace(r, outputs=_scaled(r.outputs, fits.column(i), k)),
-                k * cost,
-                _scaled(fits.noise, i, k),
-            )
-            for k in decades
-        ]
+        for k in (k for k in DECADES if not exceeds_limits(plant, sensor.column, readings / 10.0**k)):
+            corrected, noise = replace(r, outputs=_scaled(r.outputs, fits.column(i), k)), _scaled(fits.noise, i, k)
+            of_sensor.append(Correction(wrong_unit(sensor.column, k), corrected, k * cost, noise))
+        yield of_sensor
     for channel in plant.channels():
         column = r.input_names.index(channel)
-        inputs = {k: _scaled(r.inputs, column, k) for k in DECADES}
-        yield [
-            Correction(wrong_unit(channel, k), replace(r, inputs=x))
-            for k, x in inputs.items()
-            if not exceeds_limits(plant, channel, x[:, column])
-        ]
+        values = r.inputs[:, column]
+        possible = [k for k in DECADES if bool(values.any()) and not exceeds_limits(plant, channel, values / 10.0**k)]
+        yield [Correction(wrong_unit(channel, k), replace(r, inputs=_scaled(r.inputs, column, k))) for k in possible]
 
 
 def _scaled(values: Tensor, column: int, decade: int) -> Tensor:
@@ -87,7 +78,8 @@ def _swaps(fits: CorrectedFits) -> Iterator[list[Correction]]:
     noise = {p: fits.noise[[columns.index(name) for name in _exchanged(columns, p)]] for p in alike}
     sensors = {p: replace(r, output_names=_exchanged(r.output_names, p)) for p in alike}
     yield [Correction(swapped(*p), sensors[p], noise=noise[p]) for p in alike]
-    inputs = _alike(fits.plant.channel_units())
+    values = dict(zip(r.input_names, r.inputs.T, strict=True))
+    inputs = [(a, b) for a, b in _alike(fits.plant.channel_units()) if not torch.equal(values[a], values[b])]
     yield [Correction(swapped(*p), replace(r, input_names=_exchanged(r.input_names, p))) for p in inputs]
 
 
