@@ -8,7 +8,7 @@ level lies beyond that end. The commands check, gap, train and monitor all use t
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
@@ -98,6 +98,12 @@ def examined(plant: PlantDescription, recording: Recording, thorough: bool = Fal
     return CheckedRecording(_with_notes(remaining, stuck), tuple(stuck), fault)
 
 
+def thorough_findings(plant: PlantDescription, recordings: Iterable[Recording]) -> tuple[str, ...]:
+    """What is probably wrong with recordings beside an effect of the plant, as `fdi check` says it."""
+    faults = [examined(plant, recording, thorough=True).fault for recording in recordings]
+    return tuple(dict.fromkeys(fault.text for fault in faults if fault))
+
+
 def _unit_above_rim(plant: PlantDescription, recording: Recording, columns: set[str]) -> RecordingFault | None:
     """The wrong unit of a sensor that reads above its rim (one of the columns), by the volume balance.
 
@@ -113,10 +119,10 @@ def _unit_above_rim(plant: PlantDescription, recording: Recording, columns: set[
 def usable(plant: PlantDescription, recording: Recording, effects: bool = False) -> CheckedRecording:
     """Check a recording. Raises ValueError if it has a recording fault.
 
-    effects: whether the caller considers effects; a sensor that lags or leads is then accepted, and so are a fault that
-    shows beside an effect only, and readings above a rim, which the caller must take as unknown (`with_rims_unknown`).
+    effects: whether the caller considers effects of sensors; one that lags or leads is then accepted, and so are
+    readings above a rim, which the caller must take as unknown (`with_rims_unknown`).
     """
-    checked = examined(plant, recording, thorough=effects)
+    checked = examined(plant, recording)
     if checked.fault and not (effects and checked.fault.physical):
         raise ValueError(refusal(recording, checked.fault.text))
     return checked

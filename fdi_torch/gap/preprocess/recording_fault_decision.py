@@ -5,17 +5,16 @@
 The unchanged recording is explained without an effect and with one or two effects of the library, so that an unusual
 plant is not mistaken for a wrong recording (two pumps that lag alike look like a late clock). Single effects are fitted
 first, because in most recordings one of them explains the gap so well that no fault need be tried. A thorough
-examination explains the recording with the likeliest fault undone by a single effect as well, because channels can be
-swapped where a pipe is plugged; the gap diagnosis, which considers many more effects, says such a fault as a doubt. A
-fault is reported if P(fault) exceeds 95 %.
+examination explains the recording with the likeliest fault undone, and with the likeliest swaps undone, by a single
+effect as well, because channels can be swapped where a pipe is plugged. A fault is reported if P(fault) exceeds 95 %.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from itertools import chain, islice
+from operator import itemgetter
 
 import torch
 
@@ -72,17 +71,19 @@ def recording_fault(
         if most < rival:
             return None
     faults = [fits.weighed(correction) for _, correction in corrections]
-    weights = [fault.weight for fault in faults]
-    best = faults[weights.index(max(weights))]
-    if thorough and _log_odds(weights, rivals) <= SURE < best.most - max(rivals):
-        beside = _weights_with_effects(best.fitted, silent, max(rivals) + SURE - best.prior)
-        weights += [best.prior + weight for weight in islice(beside, RIVALS)]
-        best = replace(best, fault=replace(best.fault, physical=True))
+    found = [(each.weight, each.fault) for each in faults]
+    best = max(faults, key=lambda each: each.weight)
+    if thorough and _log_odds([weight for weight, _ in found], rivals) <= SURE:
+        for each in (f for f in faults if f is best or f.fault.swapped):
+            if each.most - max(rivals) > SURE:
+                beside = _weights_with_effects(each.fitted, silent, max(rivals) + SURE - each.prior)
+                found += [(each.prior + weight, each.fault) for weight in islice(beside, RIVALS)]
+    weights = [weight for weight, _ in found]
     for rival in chain([-math.inf], others):
         rivals.append(rival)
         if _log_odds(weights, rivals) <= SURE:
             return None
-    return best.fault
+    return max(found, key=itemgetter(0))[1]
 
 
 def _log_odds(weights: list[float], rivals: list[float]) -> float:

@@ -37,13 +37,14 @@ DECADES = (-3, -2, -1, 1, 2, 3)
 def suspected(fits: CorrectedFits, constant: Collection[str], thorough: bool) -> list[tuple[float, Correction]]:
     """All corrections that are worth a fit, with their gain in log posterior weight to first order, the largest first.
 
-    constant: columns of sensors that never move. thorough: the likeliest is worth a fit even without a gain, because
-    the plant may have an effect as well.
+    constant: columns of sensors that never move. thorough: the likeliest, and the likeliest swaps, are worth a fit even
+    without a gain, because the plant may have an effect as well.
     """
     alternatives = chain(_units(fits), _swaps(fits), clock_offsets(fits), _silent_sensors(fits, constant))
     likeliest = [max(((fits.first_order_gain(c), c) for c in each), key=itemgetter(0)) for each in alternatives if each]
     ranked = sorted(likeliest, key=itemgetter(0), reverse=True)
-    return [item for item in ranked if item[0] > 0.0] or (ranked[:1] if thorough else [])
+    worth = [thorough and (k == 0 or each.fault.swapped) for k, (_, each) in enumerate(ranked)]
+    return [item for item, though_no_gain in zip(ranked, worth, strict=True) if item[0] > 0.0 or though_no_gain]
 
 
 def _units(fits: CorrectedFits) -> Iterator[list[Correction]]:
