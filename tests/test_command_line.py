@@ -223,14 +223,15 @@ def test_a_file_with_a_title_and_no_header_is_refused_with_lines_that_number_its
     assert cli.main(["check", str(path), "--plant", "three_tank"]) == cli.MISUSE
     lines = capsys.readouterr().err
     numbered = "by number, 1 to 6; first row: 0 | 50,5 | 40 | 30,1 | 20 | 20"
-    assert f"    header: false\n    columns:    # {numbered}\n      t: {{column: 1, unit: s}}\n      Q1: {{" in lines
+    clock = "{column: 1, unit: ...}    # it increases as a clock does"
+    assert f"    header: false\n    columns:    # {numbered}\n      t: {clock}\n      Q1: {{" in lines
 
 
 @pytest.mark.parametrize(
     ("row", "clock"),
     [
-        ("{k} 40 20 20 20 20", "{column: 1, unit: s}"),
-        ("{a} {k} 20 20 20 20", "{column: 2, unit: s}"),
+        ("{k} 40 20 20 20 20", "{column: 1, unit: ...}    # it increases as a clock does"),
+        ("{a} {k} 20 20 20 20", "{column: 2, unit: ...}    # it increases as a clock does"),
         ("2026-11-20T08:30:{k:02d} {a} 20 20 20 20", "{column: 1}"),
         ("{a} {b} 20 20 20 20", "{period: ...}    # no column increases as a clock does; "),
     ],

@@ -46,13 +46,15 @@ def recalibrated(plant: PlantDescription, recording: Recording) -> tuple[Fitter,
     return fitter, null
 
 
-def recorded(plant: PlantDescription, blank: Recording, values: dict[str, float], seed: int) -> Recording:
-    """What sensors with 1 mm of noise read, by another engine than the fits'. values: constants by name, SI."""
+def recorded(
+    plant: PlantDescription, blank: Recording, values: dict[str, float], seed: int, noise: float = 1e-3
+) -> Recording:
+    """What sensors read, by another engine than the fits'. values: constants by name, SI. noise: of the levels, m."""
     fitting = set_up(plant, [blank], list(values), start="equilibrium")
     theta = fitting.space.vector(values)
     readings = fitting.engines(step=0.25)[0].readings(theta.unsqueeze(0))[0]
-    noise = 1e-3 * torch.randn(readings.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    return replace(blank, outputs=readings + noise, mask=None)  # type: ignore[arg-type]
+    scatter = noise * torch.randn(readings.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return replace(blank, outputs=readings + scatter, mask=None)  # type: ignore[arg-type]
 
 
 def plugging_fits(fitter: Fitter, null: Fit, sizes: list[float]) -> list[Fit]:

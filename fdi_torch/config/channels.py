@@ -232,7 +232,7 @@ def _clock(path: Path) -> str:
     if clock is None:
         return "{period: ...}    # no column increases as a clock does; the time between rows, such as 1 s"
     column, stamps = clock
-    return f"{{column: {column}}}" if stamps else f"{{column: {column}, unit: s}}"
+    return f"{{column: {column}}}" if stamps else f"{{column: {column}, unit: ...}}    # it increases as a clock does"
 
 
 def _missing(path: Path, plant: PlantDescription, also_known: Collection[str]) -> list[str]:

@@ -22,6 +22,7 @@ from fdi_torch.gap.free_form import fitted_free_form
 from fdi_torch.gap.library import possible_places
 from fdi_torch.gap.marginal_likelihood import with_disturbances
 from fdi_torch.gap.posterior import Posterior, posterior_of
+from fdi_torch.gap.preprocess.acquisition import thorough_findings
 from fdi_torch.gap.preprocess.outliers import sensor_with_outliers
 from fdi_torch.gap.preprocess.sensor_limits import noise_before_clipping, with_noise_limits
 from fdi_torch.gap.problem import PLAIN, DiagnosisProblem, Settings, problem_of
@@ -91,7 +92,11 @@ def solve_problem(problem: DiagnosisProblem, progress: Tell = silent) -> Answer:
         problem.outliers,
     )
     answer = build_answer(diagnosis, problem.holdouts)
-    return replace(answer, remarks=[*dict.fromkeys(problem.remarks), *answer.remarks])
+    remarks = dict.fromkeys(problem.remarks)
+    if verdict in ("ambiguous", "unknown"):
+        progress(0.95, "examining the recordings")
+        remarks |= dict.fromkeys(thorough_findings(plant, problem.recordings))
+    return replace(answer, remarks=[*remarks, *answer.remarks])
 
 
 def is_sure(posterior: Posterior) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,12 +59,6 @@ def _is_empty(whole: Recording, column: str, config: RecordingConfig) -> bool:
     if column not in whole.output_names or (column in config.columns and not config.columns[column].recorded):
         return False
     return not bool(torch.isfinite(whole.outputs[:, whole.output_names.index(column)]).any())
-
-
-def thorough_findings(plant: PlantDescription, recordings: Iterable[Recording]) -> tuple[str, ...]:
-    """What is probably wrong with recordings beside an effect of the plant, as `fdi check` says it."""
-    faults = [examined(plant, recording, thorough=True).fault for recording in recordings]
-    return tuple(dict.fromkeys(fault.text for fault in faults if fault))
 
 
 def usable_spans(recording: Recording, config: RecordingConfig, plant: PlantDescription) -> str:

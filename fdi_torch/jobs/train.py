@@ -22,10 +22,10 @@ from fdi_torch.estimate.posterior_draws import Draws
 from fdi_torch.estimate.profile import Profile
 from fdi_torch.estimate.refinement import HybridSettings
 from fdi_torch.estimate.uncertainty import Estimate
+from fdi_torch.gap.preprocess.acquisition import thorough_findings
 from fdi_torch.jobs.estimate_uncertainty import profiled_names, profiles_of, with_draws
 from fdi_torch.jobs.log_paths import RESUMES, log_to_write, unfinished_search
 from fdi_torch.jobs.logged_recordings import log_prediction, log_recording
-from fdi_torch.jobs.recording_check import thorough_findings
 from fdi_torch.jobs.run_setup import fitting_of, hybrid_settings, recordings_of, requested_space, simulated_truth
 from fdi_torch.logbook import Listener, RunLog, as_array
 from fdi_torch.parameters import ParameterName, ParameterSpace

@@ -21,6 +21,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from fdi_torch.plant.description import PlantDescription, Sensor
 from fdi_torch.quantities import display_unit, quantity_text, unit_factor
@@ -223,20 +224,25 @@ def _with_readings(
         replace(s, gain=ratio * s.gain, offset=ratio * s.offset) if s.column in columns else s for s in plant.sensors
     )
     corrected = replace(plant, sensors=tuple(sensors))
-    if not _fits_into_tanks(corrected, recording):
+    if any(exceeds_limits(corrected, column, recording.valid_readings(column)) for column in columns):
         return None
     first = {s.tank: s.column for s in reversed(plant.sensors) if s.column in recording.output_names}  # gives the level
     units = {tank: 1.0 / ratio for tank, column in first.items() if column in columns}
     return balance_along(corrected, recording, units)
 
 
-def _fits_into_tanks(plant: PlantDescription, recording: Recording) -> bool:
-    """Whether no reading shows a level above the rim of its tank, whose height may deviate as other constants do."""
-    for sensor in (s for s in plant.sensors if s.column in recording.output_names):
-        levels = (recording.valid_readings(sensor.column) - sensor.offset) / sensor.gain
-        if bool((levels > (1.0 + DEVIATION) * plant.tank(sensor.tank).height).any()):
-            return False
-    return True
+def exceeds_limits(plant: PlantDescription, channel: str, values: Tensor) -> bool:
+    """Whether more than one of the values (T,) of a channel is impossible: a level above the rim, whose height may
+    deviate as other constants do, a flow of EXCESSIVE times its pump's maximum, or a valve that is more than open.
+    """
+    shares = [
+        (values - s.offset) / s.gain / plant.tank(s.tank).height / (1.0 + DEVIATION)
+        for s in plant.sensors
+        if s.column == channel
+    ]
+    shares += [values * p.gain / p.max_flow / EXCESSIVE for p in plant.metered_flows() if p.channel == channel]
+    shares += [values / (1.0 + DEVIATION) for pipe in plant.pipes if pipe.valve == channel]
+    return any(int((share > 1.0).sum()) > 1 for share in shares)
 
 
 def _other_units(kind: str, written: str) -> list[tuple[str, float]]:

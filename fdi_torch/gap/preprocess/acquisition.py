@@ -8,7 +8,7 @@ level lies beyond that end. The commands check, gap, train and monitor all use t
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
@@ -96,6 +96,12 @@ def examined(plant: PlantDescription, recording: Recording, thorough: bool = Fal
         columns = tuple(rim.sensor.column for rim in rims)
         fault = RecordingFault(columns, "; ".join(rim.text for rim in rims), physical=True)
     return CheckedRecording(_with_notes(remaining, stuck), tuple(stuck), fault)
+
+
+def thorough_findings(plant: PlantDescription, recordings: Iterable[Recording]) -> tuple[str, ...]:
+    """What is probably wrong with recordings beside an effect of the plant, as `fdi check` says it."""
+    faults = [examined(plant, recording, thorough=True).fault for recording in recordings]
+    return tuple(dict.fromkeys(fault.text for fault in faults if fault))
 
 
 def _unit_above_rim(plant: PlantDescription, recording: Recording, columns: set[str]) -> RecordingFault | None:
@@ -236,7 +242,7 @@ def _level_inside_range(
     mean_square = float((samples * means**2).sum() / samples.sum())
     gains = torch.tensor([s.gain for s in plant.sensors], dtype=torch.float64)
     model_error = float(((fitted.variance / gains**2)[fitted.means > 0]).max()) * stuck.sensor.gain**2
-    count = blocked.blocks * float(stuck_now.double().mean())
+    count = blocked.errors * float(stuck_now.double().mean())
     return 0.5 * count * math.log(max(mean_square, model_error) / model_error) > SURE
 
 

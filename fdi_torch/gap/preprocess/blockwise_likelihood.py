@@ -2,10 +2,10 @@
 
     log p(y | D) = -1/2 sum_c n_c log v_c - chi^2(tolerances) / 2 + log prior
 
-- v_c: mean square of the residual of channel c, averaged over blocks of two time constants tau of the plant; at least
-  the variance of the sensor noise in such a mean.
-- n_c = T / (2 tau): number of blocks, which is the number of independent values of a model error that decays with tau
-  (Bartlett, 1946). The size of the error is integrated out under Jeffreys' prior.
+- v_c: mean square of the residual of channel c, averaged over blocks of two time constants tau of the plant, or over
+  FEWEST_BLOCKS shorter ones; at least the variance of the sensor noise in such a mean.
+- n_c = T / (2 tau), at least 1: number of independent values of a model error that decays with tau (Bartlett, 1946).
+  The size of the error is integrated out under Jeffreys' prior.
 
 Each channel is weighted by its own v_c, so that one wrong channel does not bias the fit of the others: sensors that
 agree through the plant's equations outvote it (generalised observers: Frank, 1990, Automatica 26, 459-474).
@@ -39,6 +39,9 @@ ROUNDS = 3
 """Alternations between the fit and the variances of its residuals."""
 BROAD = 0.1
 """Standard deviation of a residual before the first fit, as a share of the sensor's span."""
+FEWEST_BLOCKS = 8
+"""The free initial level makes the mean residual of a short recording zero, whatever the model: its blocks are so short
+that this hides little of the error."""
 EXACT = 1e-5
 """Error of the simulation in steps of thinned samples, as a share of the sensor's span."""
 
@@ -47,7 +50,8 @@ EXACT = 1e-5
 class BlockedRecording:
     """A thinned recording of a plant, divided into blocks of time.
 
-    noise (C,): smallest v_c, in the sensors' units squared. blocks: T / (2 tau).
+    noise (C,): smallest v_c, in the sensors' units squared. blocks: their number. errors: independent values of a model
+    error in them, T / (2 tau).
     """
 
     plant: PlantDescription
@@ -55,6 +59,7 @@ class BlockedRecording:
     data: DataSet
     noise: Tensor
     blocks: float
+    errors: float
 
     @cached_property
     def block(self) -> Tensor:
@@ -119,10 +124,11 @@ def blocked_recording(plant: PlantDescription, recording: Recording, noise: Tens
     thinned = recording.every(max(1, len(recording) // SAMPLES))
     nominal_effects = effects_of(plant)
     data = data_set_of(plant, nominal_effects, thinned, float(torch.median(torch.diff(thinned.time))))
-    blocks = max(float(thinned.time[-1] - thinned.time[0]) / (2.0 * slowest(plant)), 1.0)
+    errors = max(float(thinned.time[-1] - thinned.time[0]) / (2.0 * slowest(plant)), 1.0)
+    blocks = max(errors, FEWEST_BLOCKS)
     spans = torch.tensor([reading_span(plant, s) for s in plant.sensors], dtype=torch.float64)
     least = noise**2 * blocks / len(thinned) + (EXACT * spans) ** 2
-    return BlockedRecording(plant, thinned, data, least, blocks)
+    return BlockedRecording(plant, thinned, data, least, blocks, errors)
 
 
 def noise_of(plant: PlantDescription, recording: Recording) -> Tensor:
@@ -148,7 +154,7 @@ def blockwise_fit(
     variance = (BROAD * spans) ** 2 if base is None else base.variance
     fit = base.fit if base else None
     _, samples = blocked.means(data.readings, data.mask)
-    means = (samples > 0).sum(dim=0).to(torch.float64) * blocked.blocks / (int(blocked.block[-1]) + 1)
+    means = (samples > 0).sum(dim=0).to(torch.float64) * blocked.errors / (int(blocked.block[-1]) + 1)
     before = base.log_likelihood if base else -math.inf
     for _ in range(ROUNDS):
         fitter = _fitter(data, variance, means)

@@ -5,8 +5,8 @@
 The unchanged recording is explained without an effect and with one or two effects of the library, so that an unusual
 plant is not mistaken for a wrong recording (two pumps that lag alike look like a late clock). Single effects are fitted
 first, because in most recordings one of them explains the gap so well that no fault need be tried. A thorough
-examination explains the recording with the likeliest fault undone by a single effect as well, because channels can be
-swapped where a pipe is plugged. A fault is reported if P(fault) exceeds 95 %.
+examination explains the recording with the likeliest fault undone, and with the likeliest swaps undone, by a single
+effect as well, because channels can be swapped where a pipe is plugged. A fault is reported if P(fault) exceeds 95 %.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import chain, islice
+from operator import itemgetter
 
 import torch
 
@@ -70,16 +71,19 @@ def recording_fault(
         if most < rival:
             return None
     faults = [fits.weighed(correction) for _, correction in corrections]
-    weights = [fault.weight for fault in faults]
-    best = faults[weights.index(max(weights))]
-    if thorough and _log_odds(weights, rivals) <= SURE < best.most - max(rivals):
-        beside = _weights_with_effects(best.fitted, silent, max(rivals) + SURE - best.prior)
-        weights += [best.prior + weight for weight in islice(beside, RIVALS)]
+    found = [(each.weight, each.fault) for each in faults]
+    best = max(faults, key=lambda each: each.weight)
+    if thorough and _log_odds([weight for weight, _ in found], rivals) <= SURE:
+        for each in (f for f in faults if f is best or f.fault.swapped):
+            if each.most - max(rivals) > SURE:
+                beside = _weights_with_effects(each.fitted, silent, max(rivals) + SURE - each.prior)
+                found += [(each.prior + weight, each.fault) for weight in islice(beside, RIVALS)]
+    weights = [weight for weight, _ in found]
     for rival in chain([-math.inf], others):
         rivals.append(rival)
         if _log_odds(weights, rivals) <= SURE:
             return None
-    return best.fault
+    return max(found, key=itemgetter(0))[1]
 
 
 def _log_odds(weights: list[float], rivals: list[float]) -> float:
@@ -110,11 +114,15 @@ def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str], target: float
             start = fit.effect_values | dict(option.start)
             candidate = Candidate((*fit.candidate.placements, option.placement), (start,))
             fits.append(blockwise_fit(blocked, candidate, as_is, EVALUATIONS, target))
-            yield _log_weight(fits[-1], len(library))
+            yield _log_weight(fits[-1], as_is, len(library))
         parent = max(fits, key=lambda each: each.log_likelihood, default=as_is)
 
 
-def _log_weight(fitted: BlockwiseFit, choices: int) -> float:
-    """Log posterior weight: log-likelihood, half a log n per effect parameter (BIC), and the log prior."""
-    shape = 0.5 * len(fitted.fit.effect_values) * math.log(float(fitted.means.sum()))
+def _log_weight(fitted: BlockwiseFit, as_is: BlockwiseFit, choices: int) -> float:
+    """Log posterior weight: log-likelihood, half a log n per further effect parameter (BIC), and the log prior.
+
+    as_is: fit with the effects of the plant file only, whose parameters all hypotheses share.
+    """
+    further = len(fitted.fit.effect_values) - len(as_is.fit.effect_values)
+    shape = 0.5 * further * math.log(float(fitted.means.sum()))
     return fitted.log_likelihood - shape + log_prior(fitted.fit.key, choices)

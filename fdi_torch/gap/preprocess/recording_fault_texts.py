@@ -14,12 +14,14 @@ class RecordingFault:
 
     silent: the channels are sensors whose readings do not depend on their levels. physical: the sensor
     itself, such as one that lags or leads, would look the same, so that the gap diagnosis must accept the recording.
+    swapped: the channels have each other's values.
     """
 
     channels: tuple[str, ...]
     text: str
     silent: bool = False
     physical: bool = False
+    swapped: bool = False
 
 
 def wrong_unit(channel: str, decade: int) -> RecordingFault:
@@ -33,7 +35,7 @@ def wrong_unit(channel: str, decade: int) -> RecordingFault:
 def swapped(a: str, b: str) -> RecordingFault:
     """Two channels have each other's values."""
     fix = f"columns: {{{a}: {{column: {b}}}, {b}: {{column: {a}}}}}"
-    return RecordingFault((a, b), f"{a} and {b} seem to be swapped; assign the columns, as in {fix}")
+    return RecordingFault((a, b), f"{a} and {b} seem to be swapped; assign the columns, as in {fix}", swapped=True)
 
 
 def clock_offset(columns: tuple[str, ...], delay: float, everything: bool) -> RecordingFault:

@@ -1,6 +1,6 @@
 """Faults of a recording, as opposed to faults of the plant: each is a hypothesis that can be tested.
 
-    wrong unit        y = 10^k y'               k = -3 ... 3, of one sensor or one input
+    wrong unit        y = 10^k y'               k = -3 ... 3, of one sensor or one input, if y' is possible
     swapped channels  y_a = y'_b, y_b = y'_a    two sensors of one calibration, or two inputs of one unit
     clock offset      `clock_offset.py`
     silent sensor     y = mean + scatter, whatever the level
@@ -21,12 +21,14 @@ from dataclasses import replace
 from itertools import chain, combinations
 from operator import itemgetter
 
+import torch
 from torch import Tensor
 
 from fdi_torch.gap.preprocess.clock_offset import clock_offsets
 from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Correction
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, stuck, swapped, unrelated, wrong_unit
 from fdi_torch.recording import Recording
+from fdi_torch.recordings.plant_units import exceeds_limits
 
 DECADES = (-3, -2, -1, 1, 2, 3)
 """Powers of ten by which a unit can be wrong; millimetres instead of metres at most."""
@@ -35,29 +37,32 @@ DECADES = (-3, -2, -1, 1, 2, 3)
 def suspected(fits: CorrectedFits, constant: Collection[str], thorough: bool) -> list[tuple[float, Correction]]:
     """All corrections that are worth a fit, with their gain in log posterior weight to first order, the largest first.
 
-    constant: columns of sensors that never move. thorough: the likeliest is worth a fit even without a gain, because
-    the plant may have an effect as well.
+    constant: columns of sensors that never move. thorough: the likeliest, and the likeliest swaps, are worth a fit even
+    without a gain, because the plant may have an effect as well.
     """
     alternatives = chain(_units(fits), _swaps(fits), clock_offsets(fits), _silent_sensors(fits, constant))
     likeliest = [max(((fits.first_order_gain(c), c) for c in each), key=itemgetter(0)) for each in alternatives if each]
     ranked = sorted(likeliest, key=itemgetter(0), reverse=True)
-    return [item for item in ranked if item[0] > 0.0] or (ranked[:1] if thorough else [])
+    worth = [thorough and (k == 0 or each.fault.swapped) for k, (_, each) in enumerate(ranked)]
+    return [item for item, though_no_gain in zip(ranked, worth, strict=True) if item[0] > 0.0 or though_no_gain]
 
 
 def _units(fits: CorrectedFits) -> Iterator[list[Correction]]:
-    """The wrong units of each sensor, and of each input."""
-    r = fits.thinned
-    for i, sensor in enumerate(fits.plant.sensors):
-        outputs = {k: _scaled(r.outputs, fits.column(i), k) for k in DECADES}
+    """The wrong units of each sensor, and of each input, in which its values would be possible and not the same."""
+    r, plant = fits.thinned, fits.plant
+    for i, sensor in enumerate(plant.sensors):
+        readings, of_sensor = r.valid_readings(sensor.column), []
         # Jacobian of the change of unit: an error of the level is 10^k times as large in the recorded numbers.
         cost = float(fits.as_is.means[i]) * math.log(10.0)
-        yield [
-            Correction(wrong_unit(sensor.column, k), replace(r, outputs=x), k * cost, _scaled(fits.noise, i, k))
-            for k, x in outputs.items()
-        ]
-    for channel in fits.plant.channels():
+        for k in (k for k in DECADES if not exceeds_limits(plant, sensor.column, readings / 10.0**k)):
+            corrected, noise = replace(r, outputs=_scaled(r.outputs, fits.column(i), k)), _scaled(fits.noise, i, k)
+            of_sensor.append(Correction(wrong_unit(sensor.column, k), corrected, k * cost, noise))
+        yield of_sensor
+    for channel in plant.channels():
         column = r.input_names.index(channel)
-        yield [Correction(wrong_unit(channel, k), replace(r, inputs=_scaled(r.inputs, column, k))) for k in DECADES]
+        values = r.inputs[:, column]
+        possible = [k for k in DECADES if bool(values.any()) and not exceeds_limits(plant, channel, values / 10.0**k)]
+        yield [Correction(wrong_unit(channel, k), replace(r, inputs=_scaled(r.inputs, column, k))) for k in possible]
 
 
 def _scaled(values: Tensor, column: int, decade: int) -> Tensor:
@@ -74,7 +79,8 @@ def _swaps(fits: CorrectedFits) -> Iterator[list[Correction]]:
     noise = {p: fits.noise[[columns.index(name) for name in _exchanged(columns, p)]] for p in alike}
     sensors = {p: replace(r, output_names=_exchanged(r.output_names, p)) for p in alike}
     yield [Correction(swapped(*p), sensors[p], noise=noise[p]) for p in alike]
-    inputs = _alike(fits.plant.channel_units())
+    values = dict(zip(r.input_names, r.inputs.T, strict=True))
+    inputs = [(a, b) for a, b in _alike(fits.plant.channel_units()) if not torch.equal(values[a], values[b])]
     yield [Correction(swapped(*p), replace(r, input_names=_exchanged(r.input_names, p))) for p in inputs]
 
 
