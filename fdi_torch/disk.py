@@ -49,22 +49,14 @@ def named_errors(place: Path | str, kind: type[OSError] = DiskError) -> Iterator
         raise kind(sentence(place, error)) from None
 
 
-def make_folder(path: Path) -> None:
-    """Create the folder of a file, if it is missing, in a folder that exists: others are misspelt more often than new.
-
-    Raises FileNotFoundError.
-    """
-    path.parent.mkdir(exist_ok=True)
-
-
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A context that yields a temporary path for a new version of a file, which replaces the file if no error occurs.
 
-    A missing folder is created. A device, such as /dev/stdout, is written directly. Raises DiskError.
+    Missing folders are created. A device, such as /dev/stdout, is written directly. Raises DiskError.
     """
     with named_errors(path):
-        make_folder(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists() and not path.is_file():
             yield path
             return
@@ -78,9 +70,9 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def expect_writable(path: Path) -> None:
-    """Raises DiskError if no file can be written at that path, before long work for it; creates a missing folder."""
+    """Raises DiskError if no file can be written at that path, before long work for it; creates missing folders."""
     with named_errors(path):
-        make_folder(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         TemporaryFile(dir=path.parent).close()

@@ -16,7 +16,7 @@ import orjson
 
 from fdi_torch.cli import DONE
 from fdi_torch.cli.screen import Screen
-from fdi_torch.disk import make_folder, named_errors, write_text
+from fdi_torch.disk import named_errors, write_text
 from fdi_torch.logbook import Inspection, export, export_attachment, foxglove_layout, inspect_log, read_run
 from fdi_torch.logbook.reader import AT_BOUNDS, RANGES, ranges_of
 from fdi_torch.names import counted
@@ -55,7 +55,7 @@ def write_topic(arguments: argparse.Namespace, screen: Screen) -> None:
     else:
         path = Path(arguments.out)
         with named_errors(path):
-            make_folder(path)
+            path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("xb") as file:
                 try:
                     count = export(log, arguments.topic, arguments.format, file)

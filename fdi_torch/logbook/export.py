@@ -20,7 +20,7 @@ import orjson
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex, Statistics
 
-from fdi_torch.disk import make_folder, named_errors
+from fdi_torch.disk import named_errors
 from fdi_torch.logbook.compare import AXES
 from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.reader import Attachment, Message, Run, read_run
@@ -52,7 +52,7 @@ def export_attachment(run: Run, name: str, folder: str | Path) -> Path:
     content = run.attachment(name)
     target = Path(folder) / safe_name(name)
     with named_errors(target, LogError):
-        make_folder(target)
+        target.parent.mkdir(parents=True, exist_ok=True)
         if target.exists():
             raise LogError(f"{target}: exists already; choose another folder, or delete it")
         with target.open("xb") as file:

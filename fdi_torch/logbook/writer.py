@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import orjson
 
-from fdi_torch.disk import make_folder, named_errors
+from fdi_torch.disk import named_errors
 from fdi_torch.interruption import UNDISTURBED, Terminated
 from fdi_torch.logbook.errors import LogError
 from fdi_torch.logbook.payload import as_array, plain
@@ -208,7 +208,7 @@ def _expect_free(path: Path) -> None:
     if path.suffix != ".mcap":
         raise ValueError(f"{path}: expected a log name that ends in .mcap; rename it")
     with named_errors(path, LogError):
-        make_folder(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists():
             raise LogError(f"{path}: exists already; choose another name, or delete it")
 
