@@ -74,7 +74,7 @@ def shipped() -> list[Any]:
     return [pytest.param(file, id=file.stem) for file in files if not read_extended(file).keys().isdisjoint(ENTRIES)]
 
 
-@pytest.mark.slow
+@pytest.mark.longest
 @pytest.mark.parametrize("file", shipped())
 def test_no_recording_of_a_shipped_run_file_is_refused_by_the_check(data: Path, file: Path) -> None:
     raw = read_extended(file)

@@ -143,8 +143,6 @@ def test_the_gap_diagnosis_says_a_swap_that_leaves_it_without_a_sure_cause() -> 
     answer = diagnose(plant, swapped, settings=Settings(EFFECTS))
     assert answer.verdict in ("ambiguous", "unknown")
     assert swap_of("hA", "hB") in answer.remarks
-    right = diagnose(plant, sound, settings=Settings(EFFECTS))
-    assert not [remark for remark in right.remarks if "swapped" in remark]
 
 
 def swap_of(a: str, b: str) -> str:
