@@ -509,10 +509,10 @@ def test_a_recording_without_a_header_is_mapped_by_numbers(here: Path, capsys: p
     fdi("new", "monitor", *words, "--out", "watch.yaml")
     assert "run.yaml; next: complete the columns, then fdi train" in capsys.readouterr().out
     assert cli.main(["train", "--config", "run.yaml"]) == cli.MISUSE
-    assert "got ... for Q, hA, hB; replace each ...\n" in capsys.readouterr().err
+    assert "got ... for t, Q, hA, hB; replace each ...\n" in capsys.readouterr().err
     numbers = {"Q": (2, "l/min"), "hA": (3, "cm"), "hB": (4, "cm")}
     for path in (Path("run.yaml"), Path("watch.yaml")):
-        text = path.read_text()
+        text = path.read_text().replace("t: {column: 1, unit: ...}", "t: {column: 1, unit: s}")
         for name, (column, unit) in numbers.items():
             text = text.replace(f"{name}: {{column: ..., unit: ...}}", f"{name}: {{column: {column}, unit: {unit}}}")
         path.write_text(text)

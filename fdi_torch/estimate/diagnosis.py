@@ -12,9 +12,10 @@ from torch import Tensor
 
 from fdi_torch.amounts import estimate_words, parameter_words, sized_words
 from fdi_torch.estimate.combinations import Combination
+from fdi_torch.estimate.joint_fault_test import rival_faults
 from fdi_torch.estimate.linearisation import Linearise
 from fdi_torch.estimate.misfit import Misfit, fault_statement, kind_of
-from fdi_torch.estimate.rival_faults import RivalFaults, rival_faults
+from fdi_torch.estimate.rival_faults import RivalFaults
 from fdi_torch.parameters import Parameter, ParameterName, ParameterSpace, common_name
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork
@@ -121,7 +122,8 @@ def diagnose(
     value, std (P,): estimates and standard errors. mean_levels (tanks,), m; mean_channels (channels,): actuator inputs.
     """
     fault_sizes = [i for i, p in enumerate(space) if is_fault_size(network, p)]
-    level = 1.0 - (1.0 - confidence) / (len(fault_sizes) + (len(fault_sizes) > 1))
+    tests = len(fault_sizes) + (len(fault_sizes) > 1)
+    level = 1.0 - (1.0 - confidence) / max(tests, 1)
     faults = []
     for i in fault_sizes:
         p = space.parameters[i]

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from fdi_torch.estimate.joint_fault_test import Fits
 from fdi_torch.estimate.misfit import UNEXPLAINED_RATIO, least_noise
 from fdi_torch.estimate.objectives import Problem, Term
-from fdi_torch.estimate.rival_faults import Fits
 from fdi_torch.estimate.whiteness import SIGNIFICANCE, correlated_share, correlation_inflation, ljung_box
 from fdi_torch.parameters import ParameterSpace
 
