@@ -220,6 +220,8 @@ def test_an_unknown_is_nothing_to_adopt() -> None:
     assert [p.effect for p in adopted(nominal_plant(), BOTH).effects] == ["leak"]
     assert not any("--adopt FILE writes" in step for step in next_steps(alone, True, None, None, None))
     assert any("--adopt FILE writes" in step for step in next_steps(BOTH, True, None, None, None))
+    unsure = replace(BOTH, verdict="ambiguous")
+    assert not any("--adopt FILE writes" in step for step in next_steps(unsure, True, None, None, None))
     refused = "nothing adopted: the fit of the likeliest explanation has not converged"
     told = next_steps(BOTH, True, None, None, None, refused=refused)
     assert refused in told and not any("--adopt FILE writes" in step for step in told)

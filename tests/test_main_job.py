@@ -262,6 +262,13 @@ def test_a_sensor_that_stands_still_is_named(own_recording: list[str], tmp_path:
         train_on([header, *stuck], tmp_path)
 
 
+def test_a_sensor_without_readings_is_named(own_recording: list[str], tmp_path: Path) -> None:
+    header, *rows = own_recording
+    blank = [",".join([*row.split(",")[:-1], ""]) for row in rows]
+    with pytest.raises(ValueError, match=r"default.csv: h3: expected valid readings, got none; leave the sensor out"):
+        train_on([header, *blank], tmp_path)
+
+
 def test_two_samples_are_fewer_than_faults_and_start_levels(own_recording: list[str], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="expected more readings than parameters, got 6 readings for 8 parameters"):
         train_on(own_recording[:3], tmp_path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -292,3 +293,12 @@ def test_another_fault_does_not_tell_when_a_drain_ended_in_a_dry_tank(tmp_path: 
     assert track.column == drain
     ends = possible_ends(watch.observer, state, replace(change, ended=(track,)), 60.0)[drain]
     assert ends is not None and ends[0] < 450.0 and 510.0 < ends[1] < 520.0
+
+
+def test_a_growing_fault_has_grown_since_its_latest_estimate() -> None:
+    track = FaultTrack(0, 1, 0.0, 1.0, (100.0, 1.0, 0.03), (200.0, 2.0, 0.04), 1.0, 200.0)
+    size, std = track.at(300.0)
+    assert size == pytest.approx(3.0)
+    assert std == pytest.approx(math.hypot(0.04, 0.05))
+    assert track.at(200.0) == (2.0, 0.04)
+    assert replace(track, last=(200.0, 1.01, 0.04)).at(300.0) == (1.01, 0.04), "no significant growth"

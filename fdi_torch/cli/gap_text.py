@@ -85,8 +85,10 @@ def next_steps(
         )
     elif not rim_denied and any(c.effect != UNKNOWN and not rounds(c.effect) for c in answer.causes):
         benefit = "train and monitor no longer take the gap for a fault"
-        written = f"with {adopted} as their plant, {benefit}" if adopted else refused
-        steps.append(written or f"--adopt FILE writes the plant file with the causes; with it {benefit}")
+        if adopted or refused:
+            steps.append(f"with {adopted} as their plant, {benefit}" if adopted else refused)
+        elif answer.verdict != "ambiguous":
+            steps.append(f"--adopt FILE writes the plant file with the causes; with it {benefit}")
     if not has_holdout and answer.verdict != "no_gap":
         steps.append("--holdout FILE, another recording of the same rig, measures how far the gap closes")
     return steps

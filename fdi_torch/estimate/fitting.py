@@ -267,15 +267,17 @@ def levels_shown_first(plant: PlantDescription, network: TankNetwork, recording:
 
 
 def _expect_variation(recording: Recording, plant: PlantDescription) -> None:
-    """Raise ValueError if the valid readings of a sensor are constant: their correlation is undefined."""
+    """Raise ValueError if a sensor has no valid readings, or constant ones: their correlation is undefined."""
     for sensor in plant.sensors:
         readings = recording.valid_readings(sensor.column)
-        if len(readings) and bool((readings == readings[0]).all()):
+        without = f"leave the sensor out: columns: {{{sensor.column}: {{recorded: false}}}}"
+        if not len(readings):
+            raise ValueError(f"{recording.source}: {sensor.column}: expected valid readings, got none; {without}")
+        if bool((readings == readings[0]).all()):
             value = quantity_text(float(readings[0]), sensor.unit, 6, sensor.column)
             raise ValueError(
                 f"{recording.source}: {sensor.column}: expected readings that vary, got {value} "
-                "throughout, whose correlation is undefined; set estimate.objective.search to likelihood, or leave "
-                f"the sensor out: columns: {{{sensor.column}: {{recorded: false}}}}"
+                f"throughout, whose correlation is undefined; set estimate.objective.search to likelihood, or {without}"
             )
 
 

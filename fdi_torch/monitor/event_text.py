@@ -216,9 +216,15 @@ class EventWriter:
 
     def _tracks_explanation(self, state: MonitorState, tracks: Sequence[FaultTrack], mass: float = 1.0) -> Explanation:
         """The present sizes of known faults as one explanation, with the onset of the first."""
-        sizes = tuple(self._size(state, t.column, *t.last[1:], t.rate) for t in tracks)
+        sizes = tuple(self._size(state, t.column, *self._present(t, state.now), t.rate) for t in tracks)
         first = min(tracks, key=lambda t: t.onset)
         return Explanation(mass, sizes, first.onset, first.onset_std, any(s.rate is not None for s in sizes))
+
+    def _present(self, track: FaultTrack, now: float) -> tuple[float, float]:
+        """The size of a known fault now, within its range, and its standard deviation."""
+        size, std = track.at(now)
+        p = self.space.parameters[track.column]
+        return min(max(size, p.low), p.high), std
 
     def _tracks_text(self, explanations: Sequence[Explanation], tracks: Sequence[FaultTrack]) -> str:
         """The explanations, the likeliest of which consists of known faults, with the onset and growth of these."""

@@ -40,6 +40,14 @@ class FaultTrack:
         significant = t1 > t0 and abs(size1 - size0) > 3.0 * math.hypot(std0, std1)
         return (size1 - size0) / (t1 - t0) if significant else None
 
+    def at(self, time: float) -> tuple[float, float]:
+        """Size and standard deviation at a time, s: those of the latest estimate, grown since at the same rate."""
+        (t0, _, std0), (t1, size, std) = self.first, self.last
+        if self.rate is None:
+            return size, std
+        ahead = time - t1
+        return size + self.rate * ahead, math.hypot(std, ahead / (t1 - t0) * math.hypot(std0, std))
+
 
 @dataclass(frozen=True)
 class HiddenFault:

@@ -41,7 +41,7 @@ def closure_section(material: Material) -> Section | None:
     names = list(stages.values())
     values = [float(closure[name]) for name in stages]
     texts = [f"{number(v, 3)} {unit}".rstrip() for v in values]
-    label = axis("free-run error on hold-outs (rms)", unit)
+    label = axis("error on hold-outs (rms)", unit)
     figure = bar_panel("", label, names, values, texts, [name == "augmented" for name in stages])
     return Section("How far it closes", [closed_sentence(closure), [Picture("gap_closure", figure)]], lead=True)
 
@@ -115,8 +115,8 @@ def curves_section(material: Material) -> Section | None:
     if any("effect" in curve for curve in curves):
         words += (
             "Blue: a free function with two standard errors, estimated without the library; orange: the named cause. "
-            "Where both agree, the cause's equation is right. A free function has no memory and hardly shows lags or "
-            "delays."
+            "Where both agree, the readings do not contradict the cause's equation. A free function has no memory and "
+            "hardly shows lags or delays."
         )
     else:
         words += "The free function, with two standard errors, shows what an unnamed cause would have to do."
