@@ -143,9 +143,7 @@ def fitted_free_form(
     """Fit free functions for an unknown discrepancy together with some effects of a fit."""
     plant = fitter.data.plant
     placements = [
-        p
-        for p in free_form(unknown.location, plant, reach, unknown.periods)
-        if ("area" if p.effect.changes_area else "flow") in unknown.quantities
+        p for p in free_form(unknown.location, plant, reach, unknown.periods) if p.effect.quantity in unknown.quantities
     ]
     start = {p.full_name(c.name): 0.0 for p in placements for c in p.effect.parameters(p.location, plant)}
     start |= fit.values_of(effects)

@@ -75,8 +75,8 @@ class HypothesisSearch:
         """Explanations without a discrepancy, linearised about the levels that they predict, where discrepancies are:
         their gains shall not contain that of another point.
 
-        explanations: the likeliest first. One that would be irrelevant even if it gained as much by that as the
-        likeliest ones keeps the evidence about its own trajectory.
+        explanations: the likeliest first. If an explanation would remain irrelevant with the largest gain so far, that
+        linearisation is not computed, and its evidence about its own trajectory is used.
         """
         hypotheses, best, largest = list[CauseHypothesis](), -math.inf, 0.0
         for k, e in enumerate(explanations):

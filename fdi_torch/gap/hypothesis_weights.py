@@ -53,7 +53,7 @@ class HypothesisWeights:
         # A random flow into a tank may stand for the error of any flow there.
         flow = at.noise.apart is not None
         beside = [c for c in causes if c[1] == at.location or (flow and at.location in tanks_of(c[1], self.plant))]
-        effects = [c for c in beside if quantity(c) in at.quantities]
+        effects = [c for c in beside if effect(c[0]).quantity in at.quantities]
         weight = explanation.log_weight + at.gain
         if not effects:
             odds = self.log_odds + (math.log(ODDS.same_place) if beside else 0.0)
@@ -115,7 +115,7 @@ class HypothesisWeights:
         explained: list[CauseHypothesis] = []
         fitter, fit = self.pool.fitter, h.explanation.fit
         for cause in h.causes:
-            at_place = [c for c in h.causes if c[1] == cause[1] and quantity(c) == quantity(cause)]
+            at_place = [c for c in h.causes if c[1] == cause[1] and effect(c[0]).quantity == effect(cause[0]).quantity]
             if len(at_place) > 1:
                 error = relative_size(fitter, fit, influence(fitter, fit, [cause]), at_place)
                 reduced = self.pool.without(h.explanation, cause)
@@ -158,14 +158,9 @@ class HypothesisWeights:
         return [variant for variant, _, _ in variants[1:]]
 
 
-def quantity(cause: CauseName) -> str:
-    """What an effect changes, in the terms of `LocalizedDiscrepancy.quantities`."""
-    return "area" if effect(cause[0]).changes_area else "flow"
-
-
 def _may_be(unknown: LocalizedDiscrepancy, effects: Collection[CauseName]) -> bool:
     """Whether the effects change what an unknown changes."""
-    return unknown.quantities <= {quantity(c) for c in effects}
+    return unknown.quantities <= {effect(c[0]).quantity for c in effects}
 
 
 def _shares(log_odds: Sequence[float]) -> list[float]:

@@ -76,9 +76,9 @@ class Effect:
     mistaken_for: ClassVar[tuple[str, ...]] = ()
 
     @property
-    def changes_area(self) -> bool:
-        """Whether it changes the cross-section of a tank, as opposed to a flow or a reading."""
-        return self.stage is Stage.STORAGE
+    def quantity(self) -> str:
+        """What it changes: 'area', the cross-section of a tank, or else 'flow', which stands for a reading too."""
+        return "area" if self.stage is Stage.STORAGE else "flow"
 
     def parameters(self, place: str, plant: PlantDescription) -> tuple[Parameter, ...]:
         """Its parameters at that place, size first, under their short names; ranges may depend on the component."""
