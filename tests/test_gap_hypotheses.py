@@ -20,7 +20,7 @@ from fdi_torch.gap.diagnose import recalibrate
 from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.hypothesis_weights import HypothesisWeights
 from fdi_torch.gap.localization.localized_discrepancy import Estimate, LocalizedDiscrepancy
-from fdi_torch.gap.marginal_likelihood import log_evidence, occam
+from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, occam
 from fdi_torch.gap.problem import PLAIN, problem_of
 from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.screening import options_of
@@ -92,6 +92,24 @@ def test_parameters_of_which_the_readings_show_nothing_cost_nothing(sound: tuple
     space = fitter.engine(Candidate((GAIN,)), ["h1.sensor_gain.factor"]).space
     nothing = fitter.data.readings.new_zeros(*fitter.data.readings.shape, len(space))
     assert occam(fitter, space, space.nominal(), nothing) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("inflow", [0.0, 1e-7])
+def test_the_evidence_of_an_effect_at_the_end_of_its_range_is_an_integral_over_that_range(inflow: float) -> None:
+    """A leak cannot be negative: where water comes in, its size stays at zero."""
+    blank, size = random_steps(THREE_TANK, 600.0), "T1.leak.size"
+    recording = recorded(THREE_TANK, blank, {"T1.unmetered_flow.flow": inflow}, seed=1)
+    fitter, null, _ = recalibrate(problem_of(THREE_TANK, [recording], [], PLAIN).data)
+    leak = Placement(effect("leak"), "T1")
+    fit = fitter.fit(Candidate((leak,), ({size: 0.0},)), null)
+    assert fit.effect_values[size] == 0.0
+    sizes = torch.linspace(0.0, 0.005, 41, dtype=torch.float64)
+    fits = [fitter.fit(Candidate((leak,), ({size: x},)), null, held=(size,)) for x in sizes.tolist()]
+    likelihood = torch.tensor([math.exp(-0.5 * (f.cost - null.cost)) for f in fits], dtype=torch.float64)
+    mean = float(torch.trapezoid(likelihood, sizes))  # over a range of width one
+    prior = log_prior(fit.key, CHOICES) - log_prior((), CHOICES)
+    gain = log_evidence(fitter, fit, CHOICES) - log_evidence(fitter, null, CHOICES)
+    assert gain == pytest.approx(math.log(mean) + prior, abs=0.02)
 
 
 @pytest.mark.parametrize("mean", [0.4, -2.0, 5.0])

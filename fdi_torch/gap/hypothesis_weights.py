@@ -103,7 +103,8 @@ class HypothesisWeights:
 
     def _log_likelihood(self, explanation: RankedExplanation) -> float:
         fitter, fit = explanation.fitter, explanation.fit
-        volume = occam(fitter, fit.space, fit.theta, fitter.whiten(fit.linearised.jacobian[0]))
+        residual, jacobian = (x[0] for x in fitter.white(fit.linearised))
+        volume = occam(fitter, fit.space, fit.theta, jacobian, residual)
         return explanation.log_weight - log_prior(fit.key, self.pool.choices) - volume
 
     def with_inexact_laws(self, h: CauseHypothesis) -> list[CauseHypothesis]:

@@ -19,6 +19,7 @@ from torch import Tensor
 from fdi_torch.estimate.evidence import log_prior as prior_of_set
 from fdi_torch.estimate.evidence import log_volume
 from fdi_torch.estimate.kalman import KalmanFilter, KalmanWhitening, Propagation
+from fdi_torch.estimate.linearisation import held_back
 from fdi_torch.estimate.noise_model import SensorNoise, StateNoise
 from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
 from fdi_torch.gap.answer import CauseName
@@ -136,11 +137,11 @@ def log_evidence(fitter: Fitter, fit: Fit, choices: int) -> float:
 
     Minus infinity for a fit whose likelihood is not finite.
     """
-    jacobian = fitter.whiten(fit.linearised.jacobian)[0]
+    residual, jacobian = (x[0] for x in fitter.white(fit.linearised))
     likelihood = -0.5 * fit.cost - 0.5 * fitter.log_det
     if not (math.isfinite(likelihood) and bool(jacobian.isfinite().all())):
         return -math.inf
-    return likelihood + occam(fitter, fit.space, fit.theta, jacobian) + log_prior(fit.key, choices)
+    return likelihood + occam(fitter, fit.space, fit.theta, jacobian, residual) + log_prior(fit.key, choices)
 
 
 def evidence_under(fitter: Fitter, fit: Fit, choices: int) -> float:
@@ -163,11 +164,22 @@ def with_likeliest_parameters(fitter: Fitter, fit: Fit, starts: Sequence[Mapping
     return likeliest
 
 
-def occam(fitter: Fitter, space: ParameterSpace, theta: Tensor, jacobian: Tensor) -> float:
-    """Log of the volume of the posterior over that of the prior (Occam factor). jacobian (S, C, P): whitened."""
+def occam(
+    fitter: Fitter, space: ParameterSpace, theta: Tensor, jacobian: Tensor, residual: Tensor | None = None
+) -> float:
+    """Log of the volume of the posterior over that of the prior (Occam factor).
+
+    jacobian (S, C, P): whitened. residual (S, C): whitened, if the bounds of the parameters are counted: the posterior
+    of a parameter that its bound holds back lies between the bound and the inside of its range only.
+    """
     j, widths = jacobian.flatten(0, 1), [math.exp(log_width(fitter, space, i)) for i in range(len(space))]
-    precision = torch.nan_to_num(space.std(theta) ** -2.0, posinf=0.0)
-    return log_volume(j.T @ j + torch.diag(precision), torch.tensor(widths, dtype=torch.float64))
+    weight, slope = 1.0 / space.std(theta), None
+    if residual is not None:
+        gradient = (theta - space.nominal(theta)) * weight**2 - j.T @ residual.flatten()
+        low, high, _ = fitter.box(space)
+        held = held_back(theta[None], gradient[None], low[None], high[None])[0]
+        slope = torch.where(held, gradient.abs(), 0.0)
+    return log_volume(j.T @ j + torch.diag(weight**2), torch.tensor(widths, dtype=torch.float64), slope)
 
 
 def log_prior(causes: Iterable[CauseName], choices: int) -> float:
