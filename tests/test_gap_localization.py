@@ -466,8 +466,17 @@ def test_a_spectral_line_is_found_despite_a_slow_misfit() -> None:
     times = torch.arange(3000, dtype=torch.float64)
     slow = 0.01 * torch.sin(times / 200.0).unsqueeze(1) + noise(3000, 0.0, 0.002, 3)
     line = slow + 0.002 * torch.sin(2 * torch.pi * times / 47.3).unsqueeze(1)
-    frequency = dominant_frequency(line, 1.0)
+    frequency = dominant_frequency(line, [slice(0, 3000)], 1.0)
     assert frequency == pytest.approx(1.0 / 47.3, rel=2e-3)
+
+
+def test_a_spectral_line_is_found_in_recordings_of_opposite_phases() -> None:
+    """In one spectrum of all recordings in sequence, the phases cancel at the frequency itself."""
+    times = torch.arange(1500, dtype=torch.float64)
+    line = 0.002 * torch.sin(2 * torch.pi * times / 50.0).unsqueeze(1)
+    white = torch.cat([line, line.new_zeros(1, 1), -line]) + noise(3001, 0.0, 0.002, 3)
+    frequency = dominant_frequency(white, [slice(0, 1500), slice(1501, 3001)], 1.0)
+    assert frequency == pytest.approx(1.0 / 50.0, rel=2e-3)
 
 
 def test_the_frequency_of_a_pulsating_pump_is_estimated_to_its_phase() -> None:

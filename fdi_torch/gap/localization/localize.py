@@ -88,8 +88,8 @@ def localize(
     hopeless = _perfect_evidence(fitter, fit, replace(noise, scale=scale)) - base < needed
     if hopeless and not places:
         return Localization((), 0.0)
-    white = fitter.residual(fit.linearised.readings)[0]
-    frequencies = likely_frequencies(white, fitter.data.row_spacing, fitter.data.longest_duration)
+    data, white = fitter.data, fitter.residual(fit.linearised.readings)[0]
+    frequencies = likely_frequencies(white, data.rows, data.row_spacing, data.longest_duration)
     evidence, likely, regression = _about_predicted(fitter, fit, noise, base, frequencies)
     if not math.isfinite(base + evidence):
         return Localization((), 0.0)
@@ -116,7 +116,7 @@ def localize(
         largest = float(best.explained.square().mean(dim=0).max().sqrt())
         if selected and not is_rounding_error(fitter, place, largest):
             needed, evaluated[place] = max(needed, best.gain + math.log(RARE)), best.localized(fitter)
-    if others := _without_the_period(evaluated.values(), fitter.data.longest_duration):
+    if others := _without_the_period(evaluated.values(), data.longest_duration):
         period = max(evaluated.values(), key=gain_of).periods[0]
         periodic = DiscrepancyRegression(fitter, fit, [1.0 / period], regression.level_filter)
     for at in others:

@@ -212,27 +212,30 @@ ZERO_PADDING = 4  # factor by which the spectrum is interpolated
 SURROUNDINGS = 15  # frequencies of the recording to each side, for the median
 
 
-def likely_frequencies(white: Tensor, spacing: float, duration: float) -> list[float]:
+def likely_frequencies(white: Tensor, rows: Sequence[slice], spacing: float, duration: float) -> list[float]:
     """Frequencies (Hz) of sinusoids and pulses that a whitened residual (S, C) may contain.
 
     These are the frequency of the highest line of its spectrum, whole fractions of it (the line may be a harmonic), and
     lower frequencies, whose lines random flows may hide.
 
-    spacing: of the samples, s. duration: of the longest recording, s.
+    rows: of each recording. spacing: of the samples, s. duration: of the longest recording, s.
     """
-    dominant = dominant_frequency(white, spacing)
+    dominant = dominant_frequency(white, rows, spacing)
     lines = [] if dominant is None else [dominant / harmonic for harmonic in range(1, HARMONICS + 1)]
     return [*lines, *(cycles / duration for cycles in SLOW_CYCLES)]
 
 
-def dominant_frequency(white: Tensor, spacing: float) -> float | None:
+def dominant_frequency(white: Tensor, rows: Sequence[slice], spacing: float) -> float | None:
     """Frequency (Hz) of the strongest line in the spectrum of a whitened residual (S, C), or None.
 
-    A line is measured against the median of its surroundings in the tapered periodogram, summed over the channels.
+    A line is measured against the median of its surroundings in the tapered periodogram, summed over the channels and
+    the recordings, whose phases are independent.
     """
-    samples = len(white)
-    taper = torch.hann_window(samples, periodic=False, dtype=white.dtype).unsqueeze(-1)
-    power = (torch.fft.rfft(white * taper, n=ZERO_PADDING * samples, dim=0).abs() ** 2).sum(dim=-1)
+    samples = max(r.stop - r.start for r in rows)
+    power = white.new_zeros(ZERO_PADDING * samples // 2 + 1)
+    for x in (white[r] for r in rows):
+        tapered = x * torch.hann_window(len(x), periodic=False, dtype=white.dtype).unsqueeze(-1)
+        power += (torch.fft.rfft(tapered, n=ZERO_PADDING * samples, dim=0).abs() ** 2).sum(dim=-1)
     if len(power) < 2 * SURROUNDINGS * ZERO_PADDING:
         return None
     width = 2 * SURROUNDINGS * ZERO_PADDING + 1
