@@ -16,17 +16,22 @@ from fdi_torch.cli.gap_text import next_steps
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.gap.answer import Answer
-from fdi_torch.gap.cause_hypothesis import CauseHypothesis
-from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.gap.cause_hypothesis import CauseHypothesis, likeliest
+from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
 from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.hypothesis_search import HypothesisSearch
+from fdi_torch.gap.localization.regressors import backlash
+from fdi_torch.gap.problem import PLAIN, problem_of
+from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.stage_progress import StageProgress
 from fdi_torch.gap.trajectory_problem import first_lowest
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.operating_range import operating_range_of
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.collocation import Collocation
 from fdi_torch.simulate.experiment import lay_out
-from tests.rigs import blank_recording
+from tests.rigs import blank_recording, random_steps
+from tests.test_gap_convergence import recorded as recorded_by_reference
 
 PLANT = load_plant(Path(__file__).parents[1] / "configs" / "real" / "cascaded_tanks_nominal.yaml")
 LIBRARY = ("overflow", "sensor_curvature", "plugging", "flow_exponent", "area_taper", "internal_body", "leak")
@@ -152,6 +157,27 @@ def test_a_discrepancy_is_tried_at_other_places_beside_the_effect_that_names_it(
     monkeypatch.setattr(HypothesisSearch, "_fit_effects_at", lambda self, h, unknown: None)
     monkeypatch.setattr(HypothesisSearch, "_with_discrepancies", with_discrepancies)
     assert moved in search._climbed(best)
+
+
+@pytest.mark.slow
+def test_an_effect_that_random_flows_have_absorbed_is_found_beside_a_discrepancy() -> None:
+    """A slack pump, which is not in the library, and an outlet that lies 6 mm lower."""
+    plant = load_plant("three_tank")
+    blank = random_steps(plant, 1200.0, seed=2)
+    slack = blank.inputs.clone()
+    slack[:, 0] = backlash(blank.inputs[:, 0], torch.tensor([[3e-6]], dtype=torch.float64))[0]
+    recording = recorded_by_reference(plant, replace(blank, inputs=slack), {"OUT2.outlet_drop.drop": 0.006}, seed=0)
+    problem = problem_of(plant, [replace(recording, inputs=blank.inputs)], [], PLAIN)
+    fitter, null, _ = recalibrate(problem.data)
+    placements = [p for p in problem.library if not p.effect.quantizes]
+    options = options_of(placements, fitter, operating_range_of(recording, plant))
+    pool = ExplanationPool(fitter, null, len(problem.library))
+    search = HypothesisSearch(pool, options, ("Q1",))
+    pump = likeliest(search._with_discrepancies(pool.evaluate(null), ["Q1"]))
+    assert pump.all_causes == (("unknown", "Q1"),)
+    assert pump.noise.intensity[1] > 3.0 * pump.noise.intensity[2], "a random flow in place of the outlet's"
+    at_outlet = [h for h in search._with_more_effects(pump) if any(place == "OUT2" for _, place in h.causes)]
+    assert likeliest(at_outlet).weight > pump.weight - 3.0
 
 
 def test_of_descents_that_end_at_the_same_cost_the_first_is_taken() -> None:
