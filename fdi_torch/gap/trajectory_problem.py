@@ -20,7 +20,8 @@ from fdi_torch.simulate.linearised import Linearised
 # that is more. Parameters are then within a tenth of a standard error, misfit included.
 DECREMENT = 0.01
 CAP = 200  # evaluations, a guard against descents without an end
-# A start is given up if it is so many chi-square units behind and gains less than a quarter of that in a step.
+# A start is given up if its chi-square exceeds that of the best other fit by BEHIND, and one step reduces this deficit
+# by less than SHARE of it.
 BEHIND, SHARE = 30.0, 0.25
 
 
@@ -58,7 +59,7 @@ class Objective(Protocol):
 
 @dataclass(frozen=True)
 class FittedTrajectory:
-    """A linearised trajectory with its whitened Jacobian (L, S, C, P)."""
+    """Linearised trajectories of L lanes, with their whitened Jacobians (L, S, C, P)."""
 
     linearised: Linearised
     jacobian: Tensor
@@ -178,8 +179,12 @@ def descend(
     decrement: float = DECREMENT,
     box: tuple[Tensor, Tensor] | None = None,
 ) -> DescentResult:
-    """Least squares from theta (L, P). readings: number of valid ones. target: cost of a competitor, see BEHIND.
-    cap: maximum number of evaluations. decrement: as DECREMENT. box: bounds of each lane, low and high (L, P)."""
+    """Minimise chi-square from each of the starts theta (L, P).
+
+    readings: number of valid readings. target: chi-square of the best other fit, by which starts are given up (BEHIND).
+    cap: maximum number of evaluations. decrement: Newton decrement at which a descent ends, by default DECREMENT. box:
+    lower and upper bounds of each start (L, P), by default those of the problem.
+    """
     # The optimiser's cost is a negative log-likelihood, half of chi-square.
     competition = Competition(0.5 * BEHIND, SHARE, 0.5 * target)
     share = decrement / max(readings, 1)
