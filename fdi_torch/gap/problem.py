@@ -42,10 +42,10 @@ RELIABLE_BITS = 30
 
 @dataclass(frozen=True)
 class Settings:
-    """library, leave_out: as in `library_of`. step: of the simulation, s; None: as in `checked_data_set`.
+    """library, leave_out: as in `library_of`. step: of the simulation, s; None chooses it (`checked_data_set`).
 
     most: effects in one explanation. named_only: report the best set of named effects, however much it leaves
-    unexplained; an intermediate step if many causes act together. trusted: as in `Recording`, for all of them.
+    unexplained, as an intermediate step if many causes act together. trusted: as in `Recording`, for all of them.
     """
 
     library: tuple[str, ...] | None = None
@@ -85,7 +85,7 @@ class DiagnosisProblem:
 def problem_of(
     plant: PlantDescription, recordings: Sequence[Recording], holdouts: Sequence[Recording], settings: Settings
 ) -> DiagnosisProblem:
-    """Check the recordings and lay them out.
+    """Check the recordings and put their readings on the time grid of the simulation.
 
     Raises ValueError for unknown effects or places, missing sensors or inputs, too few readings, and a hold-out that is
     one of the recordings.
@@ -245,8 +245,9 @@ def checked_data_set(
 ) -> DataSet:
     """Lay the recordings out on the grid of their simulation, with the mean of the readings in each step.
 
-    step: s; None for the shortest sampling interval of a recording, or the multiple or fraction of it that lies between
-    SHORTEST_STEP and LONGEST_STEP, for about MANY_STEPS at most, in parts where that is not accurate enough.
+    step: length of the simulation's steps, s. None chooses it: the shortest sampling interval of the recordings, or a
+    whole multiple or fraction of it, between SHORTEST_STEP and LONGEST_STEP and with about MANY_STEPS steps at most.
+    Where such a step is not accurate enough, it is divided further.
     """
     data = _laid_out(plant, nominal_effects, recordings, step)
     for sensor, count in zip(plant.sensors, data.mask.sum(dim=0).tolist(), strict=True):
