@@ -20,7 +20,7 @@ from fdi_torch.gap.identifiability import (
     exact_areas_like,
     identifiability,
     simulated_confusions,
-    unsearched_twins,
+    unsearched_equivalents,
 )
 from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.gap.screening import Option, Pairs, options_of, screen
@@ -128,7 +128,7 @@ def test_a_dead_zone_below_all_commands_has_an_offset_as_twin(
     fit = fitter.fit(Candidate((placed,), ({name: dead_zone},)))
     offsets = [Placement(effect("pump_offset"), pump) for pump in ("Q1", "Q2")]
     reach = operating_range_of(fitter.data.recording, nominal_plant())
-    assert unsearched_twins(fitter, fit, placed, options_of(offsets, fitter, reach), 0.95) == twins
+    assert unsearched_equivalents(fitter, fit, placed, options_of(offsets, fitter, reach), 0.95) == twins
 
 
 def test_a_cross_section_that_counts_as_exact_explains_what_a_taper_does() -> None:

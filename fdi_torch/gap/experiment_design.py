@@ -23,7 +23,7 @@ from fdi_torch.recording import Recording
 
 DESIGNS, SEED = 6, 0
 DURATION, HOLDS = 1500.0, (60.0, 120.0, 250.0)  # in units of the plant's time scale
-PARTED = 20.0  # chi-square units: odds of 20000 to 1
+SEPARABLE = 20.0  # chi-square units: odds of 20000 to 1
 HIGH, FULL = 0.8, 0.95  # highest share of a pump's limit, and of a tank's height
 TINY = 1e-10
 
@@ -88,7 +88,7 @@ def _separation(fitter: Fitter, first: Fit, second: Fit, recording: Recording) -
         return None
     difference, slopes = (fitter.noise.whiten(x, planned.mask) for x in (predicted - rival, slopes))
     separation = _cumulative_separation(difference, slopes, _prior_information(fitter, first))
-    sufficient = (separation > PARTED).nonzero().flatten()
+    sufficient = (separation > SEPARABLE).nonzero().flatten()
     return float(separation[-1]), float(recording.time[sufficient[0]]) if len(sufficient) else None
 
 

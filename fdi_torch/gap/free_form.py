@@ -50,7 +50,7 @@ class _Free(Effect):
         names += [f"{wave}_{j}" for j in range(len(self.periods)) for wave in ("cosine", "sine")]
         return tuple(Parameter(name, "1", 0.0, std=self.prior) for name in names)
 
-    def starts(self, place: str, plant: PlantDescription, reach: OperatingRange) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         """One start for each coefficient, all of one form, so that they make one batch."""
         names = [p.name for p in self.parameters(place, plant)]
         return [{name: UNIT if name == one else 0.0 for name in names} for one in names]
@@ -131,19 +131,25 @@ def is_free_coefficient(name: str) -> bool:
 
 
 def free_form(
-    place: str, plant: PlantDescription, reach: OperatingRange, periods: Sequence[float] = ()
+    place: str, plant: PlantDescription, operating_range: OperatingRange, periods: Sequence[float] = ()
 ) -> tuple[Placement, ...]:
     """The free discrepancy of a place. periods: of its sinusoids, s."""
-    return tuple(Placement(e, place) for e in _free_at(place, plant, reach, periods))
+    return tuple(Placement(e, place) for e in _free_at(place, plant, operating_range, periods))
 
 
 def fitted_free_form(
-    fitter: Fitter, fit: Fit, effects: Sequence[Placement], unknown: LocalizedDiscrepancy, reach: OperatingRange
+    fitter: Fitter,
+    fit: Fit,
+    effects: Sequence[Placement],
+    unknown: LocalizedDiscrepancy,
+    operating_range: OperatingRange,
 ) -> Fit:
     """Fit free functions for an unknown discrepancy together with some effects of a fit."""
     plant = fitter.data.plant
     placements = [
-        p for p in free_form(unknown.location, plant, reach, unknown.periods) if p.effect.quantity in unknown.quantities
+        p
+        for p in free_form(unknown.location, plant, operating_range, unknown.periods)
+        if p.effect.quantity in unknown.quantities
     ]
     start = {p.full_name(c.name): 0.0 for p in placements for c in p.effect.parameters(p.location, plant)}
     start |= fit.values_of(effects)
@@ -169,27 +175,33 @@ def discrepancy_tables(fit: Fit) -> dict[str, object]:
     return {"location": free[0].location, "tables": tables}
 
 
-def _free_at(place: str, plant: PlantDescription, reach: OperatingRange, periods: Sequence[float]) -> list[Effect]:
+def _free_at(
+    place: str, plant: PlantDescription, operating_range: OperatingRange, periods: Sequence[float]
+) -> list[Effect]:
     kind, length = place_kind(plant, place), length_scale(plant)
-    time = _grid((0.0, reach.duration), TIME_NODES, time_scale(plant))
+    time = _grid((0.0, operating_range.duration), TIME_NODES, time_scale(plant))
     if kind == "tank_pair":
         first, second = plant.tanks_at(place)
-        ends = reach.levels[first], reach.levels[second]
+        ends = operating_range.levels[first], operating_range.levels[second]
         grid = _root_grid((ends[0][0] - ends[1][1], ends[0][1] - ends[1][0]), HEAD_NODES, length)
         return [FreeInflow({"difference": grid, "time": time}, 0.3 * flow_scale(plant, first), periods)]
     if kind == "tank":
-        levels, flow = _grid(reach.levels[place], LOCAL_NODES, length), 0.3 * flow_scale(plant, place)
+        levels, flow = _grid(operating_range.levels[place], LOCAL_NODES, length), 0.3 * flow_scale(plant, place)
         return [FreeInflow({"level": levels, "time": time}, flow, periods), FreeArea({"level": levels}, 1.0)]
     component = plant.component(place)
     if isinstance(component, Sensor):
-        readings = _grid(reach.readings[place], LOCAL_NODES, length if component.unit == "m" else 1.0)
+        readings = _grid(operating_range.readings[place], LOCAL_NODES, length if component.unit == "m" else 1.0)
         return [FreeReading({"reading": readings, "time": time}, 0.2 * reading_span(plant, component), periods)]
     if isinstance(component, MeteredFlow):
-        command = _grid(reach.commands[component.channel], LOCAL_NODES, component.max_flow / component.gain)
-        nodes = {"command": command, "level": _grid(reach.levels[component.near_tank], 5, length), "time": time}
+        command = _grid(operating_range.commands[component.channel], LOCAL_NODES, component.max_flow / component.gain)
+        nodes = {
+            "command": command,
+            "level": _grid(operating_range.levels[component.near_tank], 5, length),
+            "time": time,
+        }
         return [FreeFlow(nodes, component.gain * max(abs(command[0]), abs(command[-1])), periods)]
     assert isinstance(component, FlowComponent)
-    (low, high), *far = (reach.levels[tank] for tank in component.depends_on)
+    (low, high), *far = (operating_range.levels[tank] for tank in component.depends_on)
     far_low, far_high = far[0] if far else (component.datum, component.datum)
     heads = (low - far_high, high - far_low)
     flow = 0.5 * flow_scale(plant, component.source)

@@ -41,7 +41,7 @@ def coefficients_of(
     fitter: Fitter,
     fit: Fit,
     free: Sequence[Placement],
-    reach: OperatingRange,
+    operating_range: OperatingRange,
     returned: Sequence[Placement] = (),
 ) -> Coefficients:
     """Coefficients of free forms, fitted to the residual of a fit.
@@ -49,7 +49,7 @@ def coefficients_of(
     returned: causes of the fit whose influence the free forms shall describe instead; it is added to the residual. The
     amplitude of the coefficients' normal prior maximises the evidence.
     """
-    options = options_of(free, fitter, reach)
+    options = options_of(free, fitter, operating_range)
     names = tuple(next(n for n, v in o.start.items() if v != 0.0) for o in options)
     columns = fitter.whiten(effect_columns(fitter, fit, options)) / UNIT
     residual = fitter.residual(fit.linearised.readings)[0]
