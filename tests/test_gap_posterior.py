@@ -17,7 +17,7 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.cause_hypothesis import CauseHypothesis, influence
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
-from fdi_torch.gap.diagnose import Settings, diagnose, is_conclusive, verdict_of
+from fdi_torch.gap.diagnose import Settings, diagnose, is_sure, verdict_of
 from fdi_torch.gap.localization.regressors import lagged
 from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior
 from fdi_torch.gap.posterior import Posterior
@@ -92,9 +92,9 @@ def test_causes_are_named_only_by_a_fit_that_has_converged() -> None:
     for converged in (True, False):
         explanation: Any = SimpleNamespace(fit=SimpleNamespace(converged=converged))
         leak, nothing = (CauseHypothesis(explanation, causes, 0.0) for causes in ((("leak", "T1"),), ()))
-        assert is_conclusive(Posterior((leak,), (0.96,), 0.04, ())) is converged
-        assert is_conclusive(Posterior((nothing,), (0.96,), 0.04, ())), "nothing is named"
-        assert not is_conclusive(Posterior((leak, nothing), (0.94, 0.06), 0.0, ()))
+        assert is_sure(Posterior((leak,), (0.96,), 0.04, ())) is converged
+        assert is_sure(Posterior((nothing,), (0.96,), 0.04, ())), "nothing is named"
+        assert not is_sure(Posterior((leak, nothing), (0.94, 0.06), 0.0, ()))
 
 
 @pytest.mark.slow

@@ -79,7 +79,7 @@ def solve_problem(problem: DiagnosisProblem, progress: Tell = silent) -> Answer:
     if not problem.settings.named_only and (sensor := sensor_with_outliers(problem.outliers[0])):
         from_readings.append((UNKNOWN, sensor))
     free_form_fit = _free_form(posterior, operating_range)
-    verdict = verdict_of(credible_set, is_conclusive(posterior), from_readings)
+    verdict = verdict_of(credible_set, is_sure(posterior), from_readings)
     progress(0.8, "hold-out")
     diagnosis = DiagnosisResult(
         fitter,
@@ -103,7 +103,7 @@ def solve_problem(problem: DiagnosisProblem, progress: Tell = silent) -> Answer:
     return replace(answer, remarks=[*remarks, *answer.remarks])
 
 
-def is_conclusive(posterior: Posterior) -> bool:
+def is_sure(posterior: Posterior) -> bool:
     """Whether the likeliest hypothesis has 95 % and, if it names causes, its fit has converged.
 
     Laplace's approximation holds at a maximum. Away from it, the evidence and the sizes depend on where the fit ended.
@@ -113,18 +113,18 @@ def is_conclusive(posterior: Posterior) -> bool:
 
 
 def verdict_of(
-    credible_set: Sequence[CauseHypothesis], conclusive: bool, from_readings: Sequence[CauseName]
+    credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: Sequence[CauseName]
 ) -> Verdict:
     """The verdict of a credible set of hypotheses.
 
-    conclusive: as `is_conclusive`. from_readings: causes that the readings show without a model.
+    sure: as `is_sure`. from_readings: causes that the readings show without a model.
     """
     best = credible_set[0]
     if not best.causes and not best.unknown and not from_readings:
-        return "no_gap" if conclusive else "ambiguous"
+        return "no_gap" if sure else "ambiguous"
     if all(h.unknown for h in credible_set) or any(effect == UNKNOWN for effect, _ in from_readings):
         return "unknown"
-    return "named" if conclusive else "ambiguous"
+    return "named" if sure else "ambiguous"
 
 
 def _free_form(posterior: Posterior, operating_range: OperatingRange) -> Fit | None:

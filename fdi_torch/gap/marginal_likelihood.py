@@ -102,7 +102,7 @@ def propagation_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> Propagat
 
 def pieces_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:
     """For each recording, its collocation, its parameters (1, P) and its part of a trajectory."""
-    return fitter.engine(fit.candidate, list(fit.effect_values)).by_recording(fit.theta.unsqueeze(0), linearised)
+    return fitter.engine(fit.candidate, list(fit.effect_values)).apart(fit.theta.unsqueeze(0), linearised)
 
 
 def _between_samples(engine: Collocation, theta: Tensor, linearised: Linearised, areas: Tensor) -> Sequence[Tensor]:
@@ -119,7 +119,7 @@ def _between_samples(engine: Collocation, theta: Tensor, linearised: Linearised,
         a, b = linearised.transition[0].index_select(0, step), linearised.gain[0].index_select(0, step) / areas
         transition[rows], forcing[rows] = a @ transition[rows], a @ forcing[rows] + b
     paths = identity.reshape(1, n, n, 1).expand(1, n, n, len(experiment.nodes)).contiguous()
-    output = engine.linearised_outputs(linearised.levels, theta).along(paths, [-1] * n)[0]
+    output = engine.look(linearised.levels, theta).along(paths, [-1] * n)[0]
     return transition, forcing, output.permute(2, 0, 1)
 
 

@@ -214,7 +214,7 @@ class _ProjectedRegression:
 def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tensor:
     """Changes of the readings (S, C, M), in their unit, for each start."""
     engine = fitter.engine(fit.candidate, list(fit.effect_values))
-    pieces = engine.by_recording(fit.theta.unsqueeze(0), fit.linearised)
+    pieces = engine.apart(fit.theta.unsqueeze(0), fit.linearised)
     return with_blanks([_columns(fitter, fit, options, *piece) for piece in pieces], dim=0)
 
 
@@ -254,7 +254,7 @@ def _columns(
         gain, transition = linearised.gain.permute(0, 2, 3, 1), linearised.transition.permute(0, 2, 3, 1)
         initial = forcing.new_zeros(1, forcing.shape[1], len(moving))
         paths = scan_in_time(transition, forcing, initial, gain)
-        columns[:, moving] = engine.linearised_outputs(linearised.levels, theta).along(paths, [-1] * len(moving))[0]
+        columns[:, moving] = engine.look(linearised.levels, theta).along(paths, [-1] * len(moving))[0]
     return columns.permute(2, 0, 1)
 
 

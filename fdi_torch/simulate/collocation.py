@@ -80,7 +80,7 @@ class Collocation:
         corrected, slopes, transition, gain, defect = newton_step(
             self.experiment.steps, path, rates, by_level, by_theta, *self._start(theta, values)
         )
-        look = self._output_map.linearised(corrected, values, self._columns(theta))
+        look = self._output_map.look(corrected, values, self._columns(theta))
         moves = [self._moving.index(column) if column in self._moving else -1 for column in range(len(self.by))]
         return Linearised(
             corrected.movedim(2, 1),
@@ -163,12 +163,12 @@ class Collocation:
         path = levels.expand(len(theta), *levels.shape[1:]).movedim(1, 2)
         return self._output_map.read(path, self.network.bind(self.space, theta.unsqueeze(-2))).movedim(1, 2)
 
-    def linearised_outputs(self, levels: Float[Tensor, "L nodes n"], theta: Float[Tensor, "L P"]) -> LinearisedOutputs:
+    def look(self, levels: Float[Tensor, "L nodes n"], theta: Float[Tensor, "L P"]) -> LinearisedOutputs:
         """The sensors linearised at given levels, m."""
         values = self.network.bind(self.space, theta.unsqueeze(-2))
-        return self._output_map.linearised(levels.movedim(1, 2), values, self._columns(theta))
+        return self._output_map.look(levels.movedim(1, 2), values, self._columns(theta))
 
-    def by_recording(self, theta: Tensor, near: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:
+    def apart(self, theta: Tensor, near: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:
         """As `JointCollocation`, for one recording."""
         return [(self, theta, near)]
 

@@ -79,7 +79,7 @@ class JointCollocation:
         pieces = zip(self.parts, self._split(levels), self._own(theta), strict=True)
         return with_blanks([part.read(piece, columns) for part, piece, columns in pieces])
 
-    def by_recording(self, theta: Tensor, near: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:
+    def apart(self, theta: Tensor, near: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:
         """For each recording, its collocation, its parameters and its part of a joint trajectory, without slopes."""
         steps = (torch.split(_with_last(x), self._nodes, dim=1) for x in (near.transition, near.gain))
         transition, gain = ([piece[:, :-1] for piece in pieces] for pieces in steps)

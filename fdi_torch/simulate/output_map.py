@@ -94,9 +94,7 @@ class OutputMap:
         readings = stage.step(measured, tuple(memory), [])[0]
         return torch.stack([r.expand(shape) for r in readings], dim=1)
 
-    def linearised(
-        self, path: Float[Tensor, "L tanks nodes"], values: PlaceValues, theta: Signals
-    ) -> LinearisedOutputs:
+    def look(self, path: Float[Tensor, "L tanks nodes"], values: PlaceValues, theta: Signals) -> LinearisedOutputs:
         """The readings and their linearisation; theta: each named parameter (L, 1)."""
         shape, tanks = (len(path), len(self.times)), self.network.sensor_tanks()
         measured = [self.samples.of(path[:, tank]) for tank in tanks]

@@ -176,7 +176,7 @@ class DiscrepancyRegression:
         return self.pieces[recording].to_readings(rates)
 
     def _pieces(self, linearised: Linearised) -> list[RecordingLinearisation]:
-        parts, pieces = self.engine.by_recording(self.theta, linearised), []
+        parts, pieces = self.engine.apart(self.theta, linearised), []
         for rows, (engine, theta, linearised_part) in zip(self.fitter.data.rows, parts, strict=True):
             values = engine.network.bind(engine.space, theta.unsqueeze(-2))
             present = [p.prefix for p in engine.network.placements]

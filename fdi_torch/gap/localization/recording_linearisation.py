@@ -33,7 +33,7 @@ class RecordingLinearisation:
     @cached_property
     def outputs(self) -> LinearisedOutputs:
         """The sensors linearised at the levels."""
-        return self.engine.linearised_outputs(self.linearised.levels, self.theta)
+        return self.engine.look(self.linearised.levels, self.theta)
 
     def to_readings(self, rates: Tensor) -> Tensor:
         """Map changes of the rates (n, M, K) to changes of the readings (S, C, M)."""

@@ -52,7 +52,7 @@ class SingleRegressorGain(NamedTuple):
 
 
 class SingleRegressorGains:
-    """Gain in log evidence of the best single regressor of each place, under one noise model.
+    """Gain in log evidence of the best single regressor of a place, for one noise model.
 
     under: fitter with the disturbance noise.
     """
@@ -171,7 +171,7 @@ def parameter_basis(
 
 
 def adjoints_of(regression: DiscrepancyRegression, under: Fitter, columns: Tensor, basis: Tensor) -> Adjoints:
-    """Adjoints of columns (S C + P, .), from which the part that the basis spans is removed first."""
+    """Columns (S C + P, .) without what the basis explains, mapped back."""
     readings = _whitened_adjoint(under, columns, basis)
     inflows, rates = [], []
     for piece in regression.pieces:
