@@ -112,9 +112,7 @@ def is_sure(posterior: Posterior) -> bool:
     return posterior.probabilities[0] >= CREDIBLE_LEVEL and (not best.causes or best.fit.converged)
 
 
-def verdict_of(
-    credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: Sequence[CauseName]
-) -> Verdict:
+def verdict_of(credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: Sequence[CauseName]) -> Verdict:
     """The verdict of a credible set of hypotheses.
 
     sure: as `is_sure`. from_readings: causes that the readings show without a model.
