@@ -28,8 +28,8 @@ class PlantOde(nn.Module):
     The state holds the tanks' levels and then the states of effects, such as the flow of a pipe with inertia.
 
     network: the plant. space, theta (*batch, P): constants and effects that differ from their nominal values. inputs:
-    SI, one per input channel of the plant, in its order. Gradients flow to theta and x through every call; a new theta needs a new PlantOde. The device is that of
-    theta, else that of the inputs.
+    SI, one per input channel of the plant, in its order. Gradients flow to theta and x through every call; a new theta
+    needs a new PlantOde. The device is that of theta, else that of the inputs.
 
     Raises ValueError for an actuator with memory or dead time, whose output is not a function of t alone.
     """
