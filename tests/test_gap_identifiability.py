@@ -14,7 +14,7 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.experiment_design import HIGH, discriminating_input, planned_recording
+from fdi_torch.gap.experiment_design import LARGEST_COMMAND, discriminating_input, planned_recording
 from fdi_torch.gap.identifiability import (
     DRAWS,
     exact_areas_like,
@@ -111,7 +111,7 @@ def test_the_designed_input_separates_what_the_recording_cannot(rivals: Fitter) 
     wanted = planned_recording(found["input"], nominal_plant())
     assert wanted.input_names == ("Q1", "Q2") and len(wanted) == 1500
     full = torch.tensor([p.max_flow for p in nominal_plant().pumps], dtype=torch.float64)
-    assert bool((wanted.inputs > 0.0).all()) and bool((wanted.inputs <= HIGH * full).all())
+    assert bool((wanted.inputs > 0.0).all()) and bool((wanted.inputs <= LARGEST_COMMAND * full).all())
     held = torch.diff(wanted.inputs[:, 0]).abs()
     assert int((held > 0).sum()) == len(found["input"]["Q1"]["at"]) - 1
 

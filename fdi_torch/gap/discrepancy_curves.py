@@ -17,7 +17,7 @@ from torch import Tensor
 
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.free_form import UNIT, free_form, is_free_coefficient
+from fdi_torch.gap.free_form import TRIAL_SIZE, free_form, is_free_coefficient
 from fdi_torch.gap.free_form_coefficients import Coefficients, coefficients_of, fitted_coefficients
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor, Tank
@@ -75,7 +75,10 @@ def _curves(
     place, prefixes = free[0].location, {p.prefix for p in free}
     own = [i for i, name in enumerate(coefficients.names) if ParameterName.parse(name).prefix in prefixes]
     names, covariance = [coefficients.names[i] for i in own], coefficients.covariance[own][:, own]
-    units = _local(fitter, fit, place, free, [{n: UNIT if n == one else 0.0 for n in names} for one in names]) / UNIT
+    units = (
+        _local(fitter, fit, place, free, [{n: TRIAL_SIZE if n == one else 0.0 for n in names} for one in names])
+        / TRIAL_SIZE
+    )
     quantity, quantity_unit = _quantity(fitter, free, place)
     curves = []
     for variable, unit, x in (*_phases(fitter, free, place), *_variables(fitter, fit, place)):
