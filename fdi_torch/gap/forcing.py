@@ -35,8 +35,8 @@ class Forcing:
     plant's constants, bound to one lane.
 
     Attributes at the middle of each step: levels (1, K) m of each tank; commands of each actuator; flows (m^3/s) and
-    heads (m): of each flow component by its name; unforced: level rates without the effect that is tried, m/s. The n rates
-    are those of the levels and then of the fitted effects' states.
+    heads (m): of each flow component by its name; unforced: level rates without the effect that is tried, m/s. The
+    n rates are those of the levels and then of the fitted effects' states.
     """
 
     def __init__(

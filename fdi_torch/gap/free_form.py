@@ -35,7 +35,10 @@ TRIAL_SIZE = 0.01  # size of a coefficient at which its influence on the reading
 
 
 class _FreeFunctions(Effect):
-    """Base of the free discrepancies. nodes: grid of each variable. The coefficient 'head_3' belongs to the fourth node of the head's grid."""
+    """Base of the free discrepancies.
+
+    nodes: grid of each variable. The coefficient 'head_3' belongs to the fourth node of the head's grid.
+    """
 
     nodes: dict[str, list[float]]
     scale: float
