@@ -60,7 +60,7 @@ __all__ = sorted(_HOME_OF)
 
 
 class _CallableModule(ModuleType):
-    # A subpackage that can be called like the public function of the same name.
+    # A subpackage that can be called like the public function of the same name. A docstring would hide `__doc__` below.
 
     @property
     def __doc__(self) -> str | None:  # type: ignore[override]
@@ -78,7 +78,7 @@ class _CallableModule(ModuleType):
 
 
 class _Package(ModuleType):
-    """This package: a subpackage with the name of a public function becomes callable when it is imported."""
+    """Type of the module `fdi_torch`: makes a subpackage callable if a public function has its name."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if name in _HOME_OF and type(value) is ModuleType:

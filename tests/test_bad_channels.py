@@ -27,8 +27,8 @@ from fdi_torch.gap.preprocess.blockwise_likelihood import (
     noise_of,
 )
 from fdi_torch.gap.preprocess.corrected_fit import first_order_log_likelihood
-from fdi_torch.gap.problem import PLAIN, problem_of
-from fdi_torch.gap.trajectory_problem import BEHIND
+from fdi_torch.gap.problem import DEFAULT_SETTINGS, problem_of
+from fdi_torch.gap.trajectory_problem import GIVE_UP_DEFICIT
 from fdi_torch.jobs.logged_monitor import usable_part
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.csv_writing import write_csv
@@ -175,7 +175,7 @@ def late(run: Recording, seconds: int) -> Recording:
 @pytest.mark.parametrize("seconds", [40, -20, pytest.param(-200, marks=pytest.mark.slow)])
 def test_clock_offsets_are_refused(seconds: int) -> None:
     when = "late" if seconds > 0 else "early"
-    with pytest.raises(ValueError, match=rf"the readings: stamped {abs(seconds)}(\.\d)? s too {when},"):
+    with pytest.raises(ValueError, match=rf"the readings: time stamps are {abs(seconds)}(\.\d)? s too {when} "):
         usable(nominal_plant(), late(sound(), seconds))
 
 
@@ -201,9 +201,9 @@ def test_the_correction_that_is_named_mends_the_clock(late_by: int, tmp_path: Pa
 @pytest.mark.parametrize(("late_by", "when"), [(-60, "early"), (60, "late")])
 def test_only_the_gap_diagnosis_accepts_a_sensor_that_leads_or_lags_the_others(late_by: int, when: str) -> None:
     moved = second_sensor_late(sound(), late_by)
-    with pytest.raises(ValueError, match=rf"h2: stamped \S+ s too {when}, by the times of the other channels"):
+    with pytest.raises(ValueError, match=rf"h2: time stamps are \S+ s too {when} compared with the other channels"):
         usable(nominal_plant(), moved)
-    remarks = problem_of(nominal_plant(), [moved], [], PLAIN).remarks
+    remarks = problem_of(nominal_plant(), [moved], [], DEFAULT_SETTINGS).remarks
     assert [f"too {when}" in remark for remark in remarks] == [True]
 
 
@@ -284,5 +284,5 @@ def test_a_rival_that_lags_far_behind_is_given_up(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(Fitter, "fit", counted)
     base = blockwise_fit(blocked)
     assert fits == ROUNDS
-    blockwise_fit(blocked, base=base, target=base.log_likelihood + BEHIND)
+    blockwise_fit(blocked, base=base, target=base.log_likelihood + GIVE_UP_DEFICIT)
     assert fits == ROUNDS + 1

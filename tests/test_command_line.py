@@ -91,10 +91,10 @@ def test_what_help_says_by_itself_is_what_the_jobs_do() -> None:
     from fdi_torch.cli.challenge import CASES
     from fdi_torch.cli.options import challenge, gap
     from fdi_torch.gap.free_runs.prediction import START_SAMPLES
-    from fdi_torch.gap.structure_search import DEEPEST
+    from fdi_torch.gap.structure_search import MAX_EFFECTS
     from fdi_torch.jobs.blind_results import LOG
 
-    assert (gap.MOST_CAUSES, options.START_SAMPLES) == (DEEPEST, START_SAMPLES)
+    assert (gap.MOST_CAUSES, options.START_SAMPLES) == (MAX_EFFECTS, START_SAMPLES)
     assert sorted(RIGS) == sorted(challenge.RIGS)
     parser = argparse.ArgumentParser()
     options.add_arguments(parser, "challenge")

@@ -363,7 +363,9 @@ BALANCED = [
 
 @pytest.mark.parametrize(("plant", "placement"), BALANCED)
 def test_what_a_tank_loses_arrives_in_others_or_leaves_the_plant(plant: PlantDescription, placement: Placement) -> None:
-    """At each of its starts, and with all other parameters at their upper bound."""
+    """At each of its starts, and with all other parameters at their upper bound; its own states below the steady ones,
+    in which a chamber beside a tank exchanges nothing.
+    """
     network = build_network(plant, (placement,))
     levels = {t.name: (0.5 * t.height, 0.95 * t.height) for t in plant.tanks}
     starts = placement.effect.starts(placement.location, plant, OperatingRange(1000.0, {}, {}, levels))
@@ -375,7 +377,9 @@ def test_what_a_tank_loses_arrives_in_others_or_leaves_the_plant(plant: PlantDes
     end = theta.new_tensor(500.0)
     clock, values = Clock(end - 1.0, end, end / end), network.bind(space, theta)
     commands = [theta.new_zeros(len(theta)) for _ in network.actuators()]
-    point = network.operating_point(levels_now, commands, clock, values)
+    steady = network.with_steady_states(levels_now, commands, clock, values)
+    state = [*levels_now, *(0.5 * own for own in steady[len(levels_now) :])]
+    point = network.operating_point(state, commands, clock, values)
     net = torch.stack(network.less_overflow(point, network.net_inflows(point, network.flows(point))))
     change = dict(zip((t.name for t in plant.tanks), net - net[:, :1], strict=True))
     first, *_ = plant.tanks_at(placement.location)

@@ -18,7 +18,7 @@ from fdi_torch.gap.candidate_fit import Fitter, standard_errors
 from fdi_torch.gap.diagnose import recalibrate
 from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.marginal_likelihood import log_evidence
-from fdi_torch.gap.problem import PLAIN, problem_of
+from fdi_torch.gap.problem import DEFAULT_SETTINGS, problem_of
 from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.plant.description import Pipe, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Placement
@@ -42,7 +42,7 @@ SIZE = "P32.plugging.size"
 
 
 def recalibrated(plant: PlantDescription, recording: Recording) -> tuple[Fitter, Fit]:
-    fitter, null, _ = recalibrate(problem_of(plant, [recording], [], PLAIN).data)
+    fitter, null, _ = recalibrate(problem_of(plant, [recording], [], DEFAULT_SETTINGS).data)
     return fitter, null
 
 

@@ -21,7 +21,7 @@ from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.hypothesis_weights import HypothesisWeights
 from fdi_torch.gap.localization.localized_discrepancy import Estimate, LocalizedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import log_evidence, log_prior, occam
-from fdi_torch.gap.problem import PLAIN, problem_of
+from fdi_torch.gap.problem import DEFAULT_SETTINGS, problem_of
 from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.screening import options_of
 from fdi_torch.plant.effect import Placement
@@ -52,7 +52,7 @@ def hypothesis_of(fitter: Fitter, fit: Fit) -> CauseHypothesis:
 @pytest.fixture(scope="module")
 def sound() -> tuple[Fitter, Fit]:
     recording = recorded(THREE_TANK, random_steps(THREE_TANK, 600.0), {}, seed=0)
-    return recalibrate(problem_of(THREE_TANK, [recording], [], PLAIN).data)[:2]
+    return recalibrate(problem_of(THREE_TANK, [recording], [], DEFAULT_SETTINGS).data)[:2]
 
 
 def test_the_density_ratio_at_zero_is_the_ratio_of_evidences(sound: tuple[Fitter, Fit]) -> None:
@@ -74,7 +74,7 @@ def test_sizes_of_which_only_the_sum_is_known_cannot_both_be_zero() -> None:
     """A gain and a bias of one sensor: either alone may be nothing, both together are not."""
     offset = Placement(effect("sensor_bias"), "h1")
     recording = recorded(THREE_TANK, random_steps(THREE_TANK, 600.0), {"h1.sensor_gain.factor": 1.005}, seed=0)
-    fitter, null, _ = recalibrate(problem_of(THREE_TANK, [recording], [], PLAIN).data)
+    fitter, null, _ = recalibrate(problem_of(THREE_TANK, [recording], [], DEFAULT_SETTINGS).data)
     start = {"h1.sensor_gain.factor": 1.005, "h1.sensor_bias.bias": 1e-3}
     both = fitter.fit(Candidate((GAIN, offset), (start,)), null)
     pool = cast(ExplanationPool, SimpleNamespace(fitter=fitter, choices=CHOICES))
@@ -99,7 +99,7 @@ def test_the_evidence_of_an_effect_at_the_end_of_its_range_is_an_integral_over_t
     """A leak cannot be negative: where water comes in, its size stays at zero."""
     blank, size = random_steps(THREE_TANK, 600.0), "T1.leak.size"
     recording = recorded(THREE_TANK, blank, {"T1.unmetered_flow.flow": inflow}, seed=1)
-    fitter, null, _ = recalibrate(problem_of(THREE_TANK, [recording], [], PLAIN).data)
+    fitter, null, _ = recalibrate(problem_of(THREE_TANK, [recording], [], DEFAULT_SETTINGS).data)
     leak = Placement(effect("leak"), "T1")
     fit = fitter.fit(Candidate((leak,), ({size: 0.0},)), null)
     assert fit.effect_values[size] == 0.0
@@ -137,7 +137,7 @@ def test_an_estimate_without_information_is_uniform_between_its_bounds() -> None
 
 def test_an_effect_that_the_readings_need_is_not_left_out() -> None:
     recording = recorded(THREE_TANK, random_steps(THREE_TANK, 600.0), {"h1.sensor_gain.factor": 1.05}, seed=0)
-    fitter, null, _ = recalibrate(problem_of(THREE_TANK, [recording], [], PLAIN).data)
+    fitter, null, _ = recalibrate(problem_of(THREE_TANK, [recording], [], DEFAULT_SETTINGS).data)
     h = hypothesis_of(fitter, fitter.fit(Candidate((GAIN,), ({"h1.sensor_gain.factor": 1.01},)), null))
     pool = cast(ExplanationPool, SimpleNamespace(fitter=fitter, choices=CHOICES))
     assert all(r.weight < h.weight - 20.0 for r in HypothesisWeights(pool, (), 1).without_small_effects(h))
@@ -184,7 +184,7 @@ def test_the_order_in_which_effects_are_removed_does_not_depend_on_hashes() -> N
     removed: list[CauseName] = []
 
     class Pool(ExplanationPool):
-        def without(self, explanation: RankedExplanation, cause: CauseName) -> RankedExplanation:
+        def refitted_without(self, explanation: RankedExplanation, cause: CauseName) -> RankedExplanation:
             removed.append(cause)
             return explanation
 

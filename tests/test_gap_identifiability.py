@@ -14,13 +14,13 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import data_set_of
 from fdi_torch.gap.diagnose import Settings, diagnose
-from fdi_torch.gap.experiment_design import HIGH, discriminating_input, planned_recording
+from fdi_torch.gap.experiment_design import LARGEST_COMMAND, discriminating_input, planned_recording
 from fdi_torch.gap.identifiability import (
     DRAWS,
     exact_areas_like,
     identifiability,
     simulated_confusions,
-    unsearched_twins,
+    unsearched_equivalents,
 )
 from fdi_torch.gap.problem import checked_data_set
 from fdi_torch.gap.screening import Option, Pairs, options_of, screen
@@ -111,7 +111,7 @@ def test_the_designed_input_separates_what_the_recording_cannot(rivals: Fitter) 
     wanted = planned_recording(found["input"], nominal_plant())
     assert wanted.input_names == ("Q1", "Q2") and len(wanted) == 1500
     full = torch.tensor([p.max_flow for p in nominal_plant().pumps], dtype=torch.float64)
-    assert bool((wanted.inputs > 0.0).all()) and bool((wanted.inputs <= HIGH * full).all())
+    assert bool((wanted.inputs > 0.0).all()) and bool((wanted.inputs <= LARGEST_COMMAND * full).all())
     held = torch.diff(wanted.inputs[:, 0]).abs()
     assert int((held > 0).sum()) == len(found["input"]["Q1"]["at"]) - 1
 
@@ -128,7 +128,7 @@ def test_a_dead_zone_below_all_commands_has_an_offset_as_twin(
     fit = fitter.fit(Candidate((placed,), ({name: dead_zone},)))
     offsets = [Placement(effect("pump_offset"), pump) for pump in ("Q1", "Q2")]
     reach = operating_range_of(fitter.data.recording, nominal_plant())
-    assert unsearched_twins(fitter, fit, placed, options_of(offsets, fitter, reach), 0.95) == twins
+    assert unsearched_equivalents(fitter, fit, placed, options_of(offsets, fitter, reach), 0.95) == twins
 
 
 def test_a_cross_section_that_counts_as_exact_explains_what_a_taper_does() -> None:

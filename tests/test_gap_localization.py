@@ -19,7 +19,7 @@ from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
-from fdi_torch.gap.localization.discrepancy_ascent import Ascent
+from fdi_torch.gap.localization.discrepancy_ascent import DiscrepancyAscent
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.fine_positions import Positions
 from fdi_torch.gap.localization.localize import localize
@@ -399,9 +399,9 @@ def test_a_law_with_many_changes_is_found_although_random_flows_explain_each_of_
     less = torch.rand(20, generator=generator, dtype=torch.float64).repeat_interleave(125) < 0.5
     fitter, fit, noise = delivering(command, command * torch.where(less, 0.8, 1.0), 5)
     regression = DiscrepancyRegression(fitter, fit, (), LevelFilter(noise))
-    ascent = Ascent(fitter, LevelFilter(noise), 0.0)
+    ascent = DiscrepancyAscent(fitter, LevelFilter(noise), 0.0)
     under_all = ascent.with_finer_positions(ascent.evaluate(regression, regression.of("Q1"), "Q1", noise))
-    assert ascent.under_less_and_less_noise(regression, "Q1", noise).gain > under_all.gain + 100.0
+    assert ascent.with_decreasing_noise(regression, "Q1", noise).gain > under_all.gain + 100.0
     found = localize(fitter, fit, noise, ("Q1", "T1", "P13")).discrepancies
     assert found[0].location == "Q1" and found[0].gain > found[1].gain + 50.0
 
@@ -411,7 +411,7 @@ def test_the_regressors_of_a_selection_are_the_same_about_the_same_levels(
 ) -> None:
     fitter, fit, noise = sticking
     regression = DiscrepancyRegression(fitter, fit, (), LevelFilter(noise))
-    found = Ascent(fitter, LevelFilter(noise), 0.0).under_less_and_less_noise(regression, "Q1", noise)
+    found = DiscrepancyAscent(fitter, LevelFilter(noise), 0.0).with_decreasing_noise(regression, "Q1", noise)
     used, selection = found.regressed.used, found.selection
     assert len(selection.positions) > 0
     again = regression.of("Q1", selection.positions)

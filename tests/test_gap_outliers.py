@@ -63,7 +63,7 @@ def with_spikes(recording: Recording, channel: int, every: int) -> Recording:
 def test_outliers_are_masked_in_their_channel_only() -> None:
     recording = with_spikes(recorded({"T1.leak.size": 0.1}, 51), 1, 90)
     (found,) = outliers_of(recording, lambda r: checked_data_set(nominal_plant(), (), r, None))
-    assert found.sensor == nominal_plant().sensors[1].name and found.clear
+    assert found.sensor == nominal_plant().sensors[1].name and found.significant
     assert [s.rows.start for s in found.each] == list(range(37, 1000, 90))
     assert [s.times[0] for s in found.each] == [float(recording.time[s.rows.start]) for s in found.each]
     assert found.samples == len(found.each)
@@ -102,4 +102,4 @@ def test_noise_with_heavy_tails_is_nothing_wrong_with_a_sensor() -> None:
     found = jumps_and_returns(student, torch.zeros(19999, dtype=torch.float64), 0.0)
     each = tuple(Outlier(slice(a, b), (float(a), float(b - 1)), height) for a, b, height in found)
     assert len(each) >= 3  # or this would test nothing
-    assert not SensorOutliers("h1", "memory", each).clear
+    assert not SensorOutliers("h1", "memory", each).significant

@@ -21,7 +21,7 @@ from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
 from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.hypothesis_search import HypothesisSearch
 from fdi_torch.gap.localization.regressors import backlash
-from fdi_torch.gap.problem import PLAIN, problem_of
+from fdi_torch.gap.problem import DEFAULT_SETTINGS, problem_of
 from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.stage_progress import StageProgress
 from fdi_torch.gap.trajectory_problem import first_lowest
@@ -167,7 +167,7 @@ def test_an_effect_that_random_flows_have_absorbed_is_found_beside_a_discrepancy
     slack = blank.inputs.clone()
     slack[:, 0] = backlash(blank.inputs[:, 0], torch.tensor([[3e-6]], dtype=torch.float64))[0]
     recording = recorded_by_reference(plant, replace(blank, inputs=slack), {"OUT2.outlet_drop.drop": 0.006}, seed=0)
-    problem = problem_of(plant, [replace(recording, inputs=blank.inputs)], [], PLAIN)
+    problem = problem_of(plant, [replace(recording, inputs=blank.inputs)], [], DEFAULT_SETTINGS)
     fitter, null, _ = recalibrate(problem.data)
     placements = [p for p in problem.library if not p.effect.quantizes]
     options = options_of(placements, fitter, operating_range_of(recording, plant))

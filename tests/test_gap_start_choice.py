@@ -12,7 +12,7 @@ from fdi_torch.estimate.linearisation import Linearisation
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.diagnose import recalibrate
-from fdi_torch.gap.problem import PLAIN, problem_of
+from fdi_torch.gap.problem import DEFAULT_SETTINGS, problem_of
 from fdi_torch.gap.start_choice import Start, _Projected, likeliest_starts
 from fdi_torch.plant.effect import Placement
 from fdi_torch.simulate.collocation import Collocation
@@ -29,7 +29,7 @@ def sound() -> tuple[Fitter, Fit]:
     """A recording with a leak from 250 s on, and the plant recalibrated to it."""
     truth = {SIZE: 0.3, ONSET: 250.0}
     recording = recorded(THREE_TANK, random_steps(THREE_TANK, 600.0), truth, seed=0)
-    return recalibrate(problem_of(THREE_TANK, [recording], [], PLAIN).data)[:2]
+    return recalibrate(problem_of(THREE_TANK, [recording], [], DEFAULT_SETTINGS).data)[:2]
 
 
 def test_the_best_of_many_starts_is_found_by_one_descent_of_the_whole_problem(

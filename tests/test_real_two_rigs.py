@@ -17,7 +17,7 @@ from fdi_torch.gap.explanation_pool import ExplanationPool
 from fdi_torch.gap.free_runs.prediction import predict
 from fdi_torch.gap.free_runs.refit import refit
 from fdi_torch.gap.marginal_likelihood import evidence_under, with_estimated_noise
-from fdi_torch.gap.problem import PLAIN, problem_of
+from fdi_torch.gap.problem import DEFAULT_SETTINGS, problem_of
 from fdi_torch.recording import Recording
 
 ROOT = Path(__file__).parents[1]
@@ -53,7 +53,7 @@ def test_the_cascade_predicts_a_quarter_that_its_numbers_never_saw(quarter: int)
 
 def test_the_noise_of_the_recalibrated_cascade_is_the_most_likely_one_with_its_fit() -> None:
     """Linearised about the free run, the plant is another one after a refit, in which the fit may be less likely."""
-    data = problem_of(load_plant(REAL / "cascaded_tanks_nominal.yaml"), [cascade()], [], PLAIN).data
+    data = problem_of(load_plant(REAL / "cascaded_tanks_nominal.yaml"), [cascade()], [], DEFAULT_SETTINGS).data
     fitter, null, _ = recalibrate(data)
     pool = ExplanationPool(fitter, null, 100)
     base = pool.evaluate(null)

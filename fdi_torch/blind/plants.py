@@ -1,10 +1,11 @@
 """The rigs of the blind benchmark, with their own numbers: nothing is read from the library's plant files.
 
-The benchmark's absolute amounts are chosen for bench size, to which a rig of any size and speed is converted. The units
-are `length` m for lengths, `time` s for times and `area` m^2 for cross-sections of tanks. The balance A dh/dt = q and
-the orifice law q = C_d a sqrt(2 g h) keep their form if flows are measured in area x length / time and cross-sections a
-of pipes in area x sqrt(length) / time. All units are powers of ten, so that a recording of another size has the same
-digits: its samples are at round times, and its readings have as many digits as on the bench.
+The benchmark draws sizes of faults, noise levels and durations for rigs of bench size. A rig of another size or speed
+is scaled to bench size and simulated there, and its recording is scaled back. The scale factors are `length` for
+lengths, `time` for times and `area` for cross-sections of tanks. The balance A dh/dt = q and the orifice law q = C_d a
+sqrt(2 g h) keep their form if flows are scaled by area x length / time, and cross-sections a of pipes by area x
+sqrt(length) / time. All factors are powers of ten, so that recordings of every size have the same digits: samples at
+round times, and readings with equally many digits.
 """
 
 from __future__ import annotations

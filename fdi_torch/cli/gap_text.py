@@ -8,7 +8,7 @@ from typing import Any
 
 from fdi_torch.cli.screen import Screen
 from fdi_torch.gap.answer import UNKNOWN, Answer
-from fdi_torch.gap.constant_remarks import MOVED
+from fdi_torch.gap.constant_remarks import OFF_TOLERANCES
 from fdi_torch.gap.verdict_words import closed_sentence, holdout_warning, rounds, verdict_sentence
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.report.gap_tables import (
@@ -43,7 +43,7 @@ def show(answer: Answer, plant: PlantDescription, steps: Sequence[str], screen: 
     if answer.closure and has_causes(as_json):
         screen.say(closed_sentence(answer.closure))
         screen.points(filter(None, [absorbed_sentence(as_json)]))
-    screen.show(constant_table(as_json, MOVED if has_causes(as_json) else 0.0))
+    screen.show(constant_table(as_json, OFF_TOLERANCES if has_causes(as_json) else 0.0))
     screen.points([*reliability_sentences(as_json), *_limits(as_json)])
 
 

@@ -14,7 +14,7 @@ from fdi_torch.cli.screen import Screen
 from fdi_torch.config.loaded_recordings import planned_recordings
 from fdi_torch.config.plant_file import chosen_plant
 from fdi_torch.config.simulation import reading_noise
-from fdi_torch.gap.identifiability import PARTED, Identifiability, planned_identifiability
+from fdi_torch.gap.identifiability import SEPARABLE, Identifiability, planned_identifiability
 from fdi_torch.jobs.gap import library_entries, one_thread
 from fdi_torch.names import counted
 
@@ -45,4 +45,4 @@ def _show(limits: Identifiability, noise: str, screen: Screen) -> None:
         screen.say(f"hidden: {effect_words(name, place)}")
     for (a, at), (b, there), distance in limits.inseparable:
         both = f"{effect_words(a, at)} and {effect_words(b, there)}"
-        screen.say(f"not distinguished: {both} (chi-square {distance:.1f}; {PARTED:g} would distinguish them)")
+        screen.say(f"not distinguished: {both} (chi-square {distance:.1f}; {SEPARABLE:g} would distinguish them)")

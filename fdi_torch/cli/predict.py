@@ -24,7 +24,7 @@ from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.config.yaml_files import YAML_ENDINGS
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import Misfit
-from fdi_torch.gap.constant_remarks import MOVED
+from fdi_torch.gap.constant_remarks import OFF_TOLERANCES
 from fdi_torch.gap.free_runs.prediction import Prediction, predict
 from fdi_torch.jobs.python_results import FreeRun, sensor_unit, shown_errors
 from fdi_torch.plant.description import PlantDescription
@@ -146,7 +146,7 @@ def _own_constants(run: FreeRun, screen: Screen) -> None:
     for name, value in run.prediction.own.items():
         constant = constants[name]
         far = abs(value - constant.nominal) / constant.std
-        if far > MOVED:
+        if far > OFF_TOLERANCES:
             screen.say(
                 f"- {Path(run.recording.source).name}: in its first samples {name} = "
                 f"{quantity_text(value, constant.unit, 3)}, {far:.2g} tolerances off: the plant file does not fit them"

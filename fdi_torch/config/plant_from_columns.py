@@ -24,11 +24,12 @@ HEIGHT = 0.6  # m, of a tank that is still to be measured
 AT_RIM = {"1": 1.0, "V": 10.0, "A": 0.02, "Pa": 9810.0 * HEIGHT}
 """Reading of a sensor at the rim, by the unit of its reading: 100 %, 10 V, 20 mA, water."""
 READING = re.compile(r"[LHX]|P[DIRT]|.*(level|füllstand|niveau|pegel|pressure|druck)", re.IGNORECASE)
-"""Tags of levels and pressures (ISA-5.1: PT, PI; P-101 and PK are pumps), letters of levels by custom, and words."""
+"""Names of readings: tags of levels and pressures by ISA-5.1 (LT, PT, PI, but not the pumps P-101 and PK), the letters
+h and x, which are customary for levels, and words such as level."""
 COMMAND = re.compile(
     r".*(pump|valve|ventil|pwm|duty|cmd|command|speed|drehzahl)|[A-Z]+C\W?\d+\W?(out|op)$", re.IGNORECASE
 )
-"""Words, and tags of a controller's output (LIC-101.OUT)."""
+"""Names of commands: words such as pump, and tags of a controller's output (LIC-101.OUT)."""
 PUMPS = "pumps:    # ! the tank that each fills, and its maximum flow; a flow out of a tank belongs under transfers"
 
 
@@ -58,8 +59,9 @@ class _Column(NamedTuple):
 def plant_from_recording(path: Path, name: str) -> str:
     """The text of a plant file: a pump for each flow or command, and a row of tanks, one for each level.
 
-    A column is a reading if its unit is a length or a pressure, or if its name says so; if none is, each that may be.
-    Others are commands. Raises ValueError if no column with a unit in its header can be a reading.
+    A column is a reading if its unit is a length or a pressure, or if its name is that of a level or pressure. If no
+    column is, every column counts as a reading whose unit a sensor can have and whose name is not that of a command.
+    All other columns are commands. Raises ValueError if no column with a unit in its header can be a reading.
     """
     try:
         header = read_header(path)
@@ -127,8 +129,8 @@ def _columns(path: Path, headers: list[str]) -> list[_Column]:
 
 
 def _tanks(sensors: list[_Column]) -> list[str]:
-    """The tank of each sensor: the letter at the end of its name, as of 'level D', if these differ; else A, B and so on
-    in the order of the columns, or T1, T2 for more than the alphabet has.
+    """Name the tank of each sensor by the letter at the end of the sensor's name ('level D'), if these letters differ;
+    otherwise A, B, C in the order of the columns, or T1, T2, T3 for more than 26 sensors.
     """
     letters = [distinguishing_end(column.name) for column in sensors]
     taken = {column.own for column in sensors}

@@ -100,17 +100,18 @@ def damped_step(model: Quadratic, damping: Float[Tensor, " L"]) -> Step:
     return Step(trial, predicted, solvable)
 
 
-def bent_step(
-    model: Quadratic, damping: Float[Tensor, " L"], trial: Float[Tensor, "L P"], bend: Float[Tensor, "L P"]
+def second_order_step(
+    model: Quadratic, damping: Float[Tensor, " L"], trial: Float[Tensor, "L P"], nonlinearity: Float[Tensor, "L P"]
 ) -> tuple[Float[Tensor, "L P"], Bool[Tensor, " L"]]:
     """The step to `trial` (L, P) with its second-order correction, (L, P), and whether it is valid, (L,) bool.
 
-    bend (L, P): J'c, with c = r(theta + step) - r(theta) - J step the nonlinearity of the residuals along the step. The
-    correction -(H + damping diag H)^-1 J'c is invalid if it is not finite or too long relative to the step.
+    nonlinearity (L, P): J'c, with c = r(theta + step) - r(theta) - J step, the nonlinear part of the change of the
+    residuals. The correction -(H + damping diag H)^-1 J'c is invalid if it is not finite or too long relative to the
+    step.
     """
     unit = model.unit
     free = (trial > model.low) & (trial < model.high)
-    rhs = torch.where(free, -bend * unit, 0.0)
+    rhs = torch.where(free, -nonlinearity * unit, 0.0)
     correction, positive = solve_positive(_reduced(model.damped(damping), free), rhs)
     step = (trial - model.theta) / unit
     short_enough = 4.0 * dot(correction, correction) < _MAX_CORRECTION_RATIO**2 * dot(step, step)

@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from fdi_torch.estimate.damped_step import Quadratic, Step, bent_step, damped_step, newton_decrement
+from fdi_torch.estimate.damped_step import Quadratic, Step, damped_step, newton_decrement, second_order_step
 from fdi_torch.estimate.linearisation import (
     ABANDONED,
     CONVERGED,
@@ -240,15 +240,15 @@ def _try_with_correction(
 ) -> tuple[Step, Tensor, Linearisation]:
     """The steps, the lanes whose trial has a lower cost, (N,), and the models there.
 
-    A trial that would be refused is replaced by its second-order correction, if that is valid (see `bent_step`).
+    A trial that would be refused is replaced by its second-order correction, if that is valid (`second_order_step`).
     """
     trial = neighbourhood.attempt(step.trial, lanes.model, step.trial - lanes.theta)
     lower = _lower(lanes.model.cost, step, trial.cost)
     refused = (step.solvable & (step.predicted > 0) & ~lower).nonzero().flatten()
     if len(refused):
         point, known, refused_trial = step.trial[refused], lanes[refused], trial[refused]
-        bend = neighbourhood.bend(known.model, refused_trial, point - known.theta)
-        corrected, valid = bent_step(known.quadratic, known.damping, point, bend)
+        nonlinearity = neighbourhood.nonlinearity(known.model, refused_trial, point - known.theta)
+        corrected, valid = second_order_step(known.quadratic, known.damping, point, nonlinearity)
         valid = (valid & torch.isfinite(refused_trial.cost)).nonzero().flatten()
         if len(valid):
             corrected, refused = corrected[valid], refused[valid]

@@ -193,7 +193,7 @@ class Neighbourhood(Protocol[AnyTrial]):
     def attempt(self, theta: Tensor, known: Linearisation, step: Tensor, near: AnyTrial | None = None) -> AnyTrial:
         """The points theta (L, P). `step` (L, P) leads there from the points of the model `known`, or from `near`."""
 
-    def bend(self, known: Linearisation, trial: AnyTrial, step: Tensor) -> Tensor:
+    def nonlinearity(self, known: Linearisation, trial: AnyTrial, step: Tensor) -> Tensor:
         """J'c (L, P) with c = r(theta + step) - r(theta) - J step, priors included; J is the Jacobian of `known`."""
 
     def model(self, theta: Tensor, trial: AnyTrial) -> Linearisation:

@@ -44,7 +44,10 @@ NOT_ESTABLISHED, NONE_EXPLAINS = "not established", "none of the suspected fault
 
 
 def unreliable(ratio: float, share: float = 1.0) -> str:
-    """The warning about a model whose residuals are this multiple of the noise, or whose faults explain this share."""
+    """Warning about a model that does not explain its recording.
+
+    ratio: of the residuals to the noise of the sensors. share: of the misfit, that the faults explain.
+    """
     if share < LEAST_SHARE:
         return (
             f"{UNRELIABLE} (residuals are correlated in time, the faults explain {100.0 * share:.0f} % of the misfit)"

@@ -97,7 +97,11 @@ def _curves(result: DiagnosisResult) -> list[dict[str, Any]]:
     if result.verdict == "no_gap" or result.fitter.data.further:
         return []
     places = causal_places(result)
-    return [curve.to_dict() for place in places for curve in curves_at(result.fitter, result.best, place, result.reach)]
+    return [
+        curve.to_dict()
+        for place in places
+        for curve in curves_at(result.fitter, result.best, place, result.operating_range)
+    ]
 
 
 def _constants(result: DiagnosisResult) -> dict[str, dict[str, object]]:
@@ -131,12 +135,12 @@ def _confusability(result: DiagnosisResult) -> dict[str, object]:
         return {}
     (cause,) = result.effects_fit.key
     gap = max(result.gap, 1.0)
-    return {"simulated": simulated_confusions(result.search.shown, cause, gap, result.fitter.data.plant)}
+    return {"simulated": simulated_confusions(result.search.null_pairs, cause, gap, result.fitter.data.plant)}
 
 
 def _identifiability(result: DiagnosisResult) -> dict[str, Any]:
     """Effects that this recording's inputs cannot show or separate, by the names of the answer."""
-    shown = identifiability(result.search.shown, result.fitter.data.plant)
+    shown = identifiability(result.search.null_pairs, result.fitter.data.plant)
     pairs = [{"between": names((a, b)), "parted_by": separation} for a, b, separation in shown.inseparable]
     return {"hidden": names(shown.hidden), "inseparable": pairs}
 

@@ -23,7 +23,7 @@ from fdi_torch.gap.channel_noise import Noise, low_frequency_excess
 from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.gap.start_choice import Start, likeliest_starts, vector_of
-from fdi_torch.gap.trajectory_problem import CAP, DescentResult, TrajectoryProblem, descend, first_lowest
+from fdi_torch.gap.trajectory_problem import MAX_EVALUATIONS, DescentResult, TrajectoryProblem, descend, first_lowest
 from fdi_torch.parameters import ParameterSpace, common_name, name_in_recording
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.network import TankNetwork
@@ -79,7 +79,7 @@ class Fitter:
         candidate: Candidate,
         base: Fit | None = None,
         target: float = math.inf,
-        cap: int = CAP,
+        cap: int = MAX_EVALUATIONS,
         held: Collection[str] = (),
     ) -> Fit:
         """Fit all starts of a candidate and return the best. Nuisance parameters start from `base`.
@@ -141,7 +141,7 @@ class Fitter:
         engine: Collocation | JointCollocation,
         theta: Tensor,
         target: float = math.inf,
-        cap: int = CAP,
+        cap: int = MAX_EVALUATIONS,
         held: Collection[str] = (),
     ) -> DescentResult:
         """Least squares from theta (L, P). held: parameters that keep their values."""

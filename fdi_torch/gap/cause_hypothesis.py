@@ -4,9 +4,10 @@
     log weight(S, p) = log weight(S) + gain of a free discrepancy at p + log odds of an unknown there
 
 each under its most likely disturbance noise (`marginal_likelihood.py`, `localization/localize.py`). No library
-has the exact law of a rig (Brynjarsdottir and O'Hagan, 2014). The weight of a discrepancy at a place where S has an
-effect is therefore divided: it is the error of the effect's law, or the law there is a different one, and the effects
-at that place are part of the unknown. The odds depend on its size, relative to the influence of the effect.
+has the exact law of a rig (Brynjarsdottir and O'Hagan, 2014). A discrepancy at a place where S has an effect therefore
+yields two hypotheses, which share its weight: the effect is right and its law is inexact, or an unknown law acts there
+and the effect was fitted to a part of it. A small discrepancy, relative to the influence of the effect, favours the
+first (`hypothesis_weights.py`).
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class CauseHypothesis:
     """An explanation with or without a discrepancy at one place.
 
     causes: effects of the explanation, without those that an unknown replaces. weight: log posterior, not normalised.
-    discrepancy: an unknown, or the error of the law of an effect at the same place (then `inexact` is True).
+    discrepancy: an unknown; or, if `inexact`, the error of the law of an effect at the same place.
     """
 
     explanation: RankedExplanation
@@ -77,7 +78,7 @@ def relative_size(fitter: Fitter, fit: Fit, size: float, effects: Collection[Cau
 def influence(fitter: Fitter, fit: Fit, effects: Collection[CauseName]) -> float:
     """Norm of the influence of some of a fit's effects on the readings, in units of the sensor noise.
 
-    To first order without the part that the other parameters, within their tolerances, would have in common with it.
+    The part that the other parameters can explain within their tolerances is projected out to first order.
     """
     others = [p for p in fit.candidate.placements if p.cause not in effects]
     engine = fitter.engine(Candidate(tuple(others)), list(fit.values_of(others)))

@@ -265,6 +265,6 @@ def quantization_step(values: Tensor, noise: float) -> float:
     step = float(clear.min())
     step = float(clear[clear < 1.5 * step].mean())
     multiples = clear / step
-    on_lattice = bool(((multiples - multiples.round()).abs() < 0.02 * multiples.round()).all())
+    are_multiples = bool(((multiples - multiples.round()).abs() < 0.02 * multiples.round()).all())
     is_relevant = step**2 / 12.0 > RELEVANT * noise**2
-    return step if on_lattice and is_relevant and len(distinct) < 0.5 * len(values) else 0.0
+    return step if are_multiples and is_relevant and len(distinct) < 0.5 * len(values) else 0.0

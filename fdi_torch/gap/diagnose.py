@@ -25,7 +25,7 @@ from fdi_torch.gap.posterior import Posterior, posterior_of
 from fdi_torch.gap.preprocess.acquisition import thorough_findings
 from fdi_torch.gap.preprocess.outliers import sensor_with_outliers
 from fdi_torch.gap.preprocess.sensor_limits import noise_before_clipping, with_noise_limits
-from fdi_torch.gap.problem import PLAIN, DiagnosisProblem, Settings, problem_of
+from fdi_torch.gap.problem import DEFAULT_SETTINGS, DiagnosisProblem, Settings, problem_of
 from fdi_torch.gap.screening import options_of
 from fdi_torch.gap.stage_progress import StageProgress
 from fdi_torch.gap.structure_search import search
@@ -35,14 +35,14 @@ from fdi_torch.plant.operating_range import OperatingRange, operating_range_of_a
 from fdi_torch.progress import Tell, silent
 from fdi_torch.recording import Recording
 
-CONTENT = 0.95
+CREDIBLE_LEVEL = 0.95
 
 
 def diagnose(
     plant: PlantDescription,
     recording: Recording | Sequence[Recording],
     holdout: Recording | Sequence[Recording] | None = None,
-    settings: Settings = PLAIN,
+    settings: Settings = DEFAULT_SETTINGS,
     progress: Tell = silent,
 ) -> Answer:
     """Find out why the plant file does not explain one or several recordings, by causes that are common to all.
@@ -59,28 +59,32 @@ def solve_problem(problem: DiagnosisProblem, progress: Tell = silent) -> Answer:
     data, library, plant = problem.data, problem.library, problem.data.plant
     progress(0.05, "noise and recalibration")
     fitter, null, quantization_steps = recalibrate(data)
-    reach = with_simulated_levels(operating_range_of_all(problem.recordings, plant), plant, null.linearised.levels[0])
+    operating_range = with_simulated_levels(
+        operating_range_of_all(problem.recordings, plant), plant, null.linearised.levels[0]
+    )
     progress(0.2, "which effects")
     present = {p.prefix for p in problem.known_effects} | {ParameterName.parse(name).prefix for name in data.nuisance}
-    options = options_of([p for p in library if not p.effect.quantizes and p.prefix not in present], fitter, reach)
+    options = options_of(
+        [p for p in library if not p.effect.quantizes and p.prefix not in present], fitter, operating_range
+    )
     pool = ExplanationPool(fitter, null, len(library), StageProgress(progress, "which effects", 0.2, 0.6))
     result = search(pool, options, problem.settings.most)
     progress(0.6, "where")
     pool.progress = StageProgress(progress, "where", 0.6, 0.8)
     posterior = posterior_of(pool, result, options, plant, possible_places(plant), problem.settings.named_only)
-    credible_set = posterior.credible_set(CONTENT)
+    credible_set = posterior.credible_set(CREDIBLE_LEVEL)
     rounded = {s.name for s, step in zip(plant.sensors, quantization_steps, strict=True) if step > 0.0}
     from_readings = [p.cause for p in library if p.effect.quantizes and p.location in rounded]
     from_readings += [p.cause for p in problem.known_effects]
     if not problem.settings.named_only and (sensor := sensor_with_outliers(problem.outliers[0])):
         from_readings.append((UNKNOWN, sensor))
-    free_form_fit = _free_form(posterior, reach)
+    free_form_fit = _free_form(posterior, operating_range)
     verdict = verdict_of(credible_set, is_sure(posterior), from_readings)
     progress(0.8, "hold-out")
     diagnosis = DiagnosisResult(
         fitter,
         library,
-        reach,
+        operating_range,
         result,
         posterior,
         credible_set,
@@ -105,7 +109,7 @@ def is_sure(posterior: Posterior) -> bool:
     Laplace's approximation holds at a maximum. Away from it, the evidence and the sizes depend on where the fit ended.
     """
     best = posterior.best
-    return posterior.probabilities[0] >= CONTENT and (not best.causes or best.fit.converged)
+    return posterior.probabilities[0] >= CREDIBLE_LEVEL and (not best.causes or best.fit.converged)
 
 
 def verdict_of(credible_set: Sequence[CauseHypothesis], sure: bool, from_readings: Sequence[CauseName]) -> Verdict:
@@ -121,7 +125,7 @@ def verdict_of(credible_set: Sequence[CauseHypothesis], sure: bool, from_reading
     return "named" if sure else "ambiguous"
 
 
-def _free_form(posterior: Posterior, reach: OperatingRange) -> Fit | None:
+def _free_form(posterior: Posterior, operating_range: OperatingRange) -> Fit | None:
     """The fit of free functions at the unknown of the likeliest hypothesis; None if it has no unknown."""
     best = posterior.best
     if best.unknown is None:
@@ -129,7 +133,7 @@ def _free_form(posterior: Posterior, reach: OperatingRange) -> Fit | None:
     # The free functions shall explain what the drift of a sensor would absorb.
     fitter = with_disturbances(best.explanation.fitter, best.fit, replace(best.unknown.noise, wander=None))
     placements = [p for p in best.fit.candidate.placements if p.cause in best.causes]
-    return fitted_free_form(fitter, best.fit, placements, best.unknown, reach)
+    return fitted_free_form(fitter, best.fit, placements, best.unknown, operating_range)
 
 
 def recalibrate(data: DataSet) -> tuple[Fitter, Fit, list[float]]:

@@ -21,15 +21,18 @@ UNEXPLAINED = 0.1  # largest share of the gap that may remain if it counts as ex
 
 @dataclass(frozen=True)
 class DiagnosisResult:
-    """undisturbed: fitter with sensor noise alone. library: the effects searched. reach: ranges of the signals.
-    credible_set: the fewest hypotheses that have 95 % together. free_form_fit: fit of the free discrepancy, if the
-    likeliest hypothesis has an unknown. from_readings: causes that the readings show without a model (quantization,
+    """What the stages of a diagnosis found.
+
+    undisturbed: fitter with sensor noise alone. library: the effects searched. operating_range: of the recorded
+    signals. credible_set: the fewest hypotheses that have 95 % together. free_form_fit: fit of the free discrepancy, if
+    the likeliest hypothesis has an unknown. from_readings: causes that the readings show without a model (quantization,
     limits, stuck sensors, outliers). quantization_steps (C,): 0 where there is none. limits: limits of sensors with
-    their values. outliers: masked readings of the recordings, and of the hold-outs."""
+    their values. outliers: masked readings of the recordings, and of the hold-outs.
+    """
 
     undisturbed: Fitter
     library: tuple[Placement, ...]
-    reach: OperatingRange
+    operating_range: OperatingRange
     search: SearchResult
     posterior: Posterior
     credible_set: Sequence[CauseHypothesis]
@@ -78,5 +81,5 @@ class DiagnosisResult:
         the readings themselves show a cause."""
         if self.from_readings:
             return 0.0
-        gain = float(self.search.alarm.gain.max())
-        return min(1.0, len(self.search.alarm.options) * math.erfc(math.sqrt(max(gain, 0.0) / 2.0)))
+        gain = float(self.search.null_screening.gain.max())
+        return min(1.0, len(self.search.null_screening.options) * math.erfc(math.sqrt(max(gain, 0.0) / 2.0)))

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.free_form import UNIT, free_form, is_free_coefficient
+from fdi_torch.gap.free_form import TRIAL_SIZE, free_form, is_free_coefficient
 from fdi_torch.gap.free_form_coefficients import Coefficients, coefficients_of, fitted_coefficients
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.description import OUTSIDE, PlantDescription, Sensor, Tank
@@ -51,7 +51,7 @@ class Curve:
         return {n: v.tolist() if isinstance(v, Tensor) else v for n, v in values.items() if v is not None}
 
 
-def curves_at(fitter: Fitter, fit: Fit, place: str, reach: OperatingRange) -> list[Curve]:
+def curves_at(fitter: Fitter, fit: Fit, place: str, operating_range: OperatingRange) -> list[Curve]:
     """One curve for each local variable of a place.
 
     The causes that the fit has there are added to the residual of the free form; a free form that the fit contains is
@@ -63,8 +63,8 @@ def curves_at(fitter: Fitter, fit: Fit, place: str, reach: OperatingRange) -> li
         stages = dict.fromkeys(p.effect.stage for p in here)  # a tank has an inflow and a cross-section
         groups = [tuple(p for p in here if p.effect.stage is stage) for stage in stages]
         return [curve for group in groups for curve in _curves(fitter, fit, group, coefficients, None)]
-    free = _of_stage(free_form(place, fitter.data.plant, reach), here)
-    coefficients = coefficients_of(fitter, fit, free, reach, returned=here)
+    free = _of_stage(free_form(place, fitter.data.plant, operating_range), here)
+    coefficients = coefficients_of(fitter, fit, free, operating_range, returned=here)
     return _curves(fitter, fit, free, coefficients, _effect(fitter, fit, place, here) if here else None)
 
 
@@ -75,7 +75,10 @@ def _curves(
     place, prefixes = free[0].location, {p.prefix for p in free}
     own = [i for i, name in enumerate(coefficients.names) if ParameterName.parse(name).prefix in prefixes]
     names, covariance = [coefficients.names[i] for i in own], coefficients.covariance[own][:, own]
-    units = _local(fitter, fit, place, free, [{n: UNIT if n == one else 0.0 for n in names} for one in names]) / UNIT
+    units = (
+        _local(fitter, fit, place, free, [{n: TRIAL_SIZE if n == one else 0.0 for n in names} for one in names])
+        / TRIAL_SIZE
+    )
     quantity, quantity_unit = _quantity(fitter, free, place)
     curves = []
     for variable, unit, x in (*_phases(fitter, free, place), *_variables(fitter, fit, place)):

@@ -23,9 +23,9 @@ from fdi_torch.recording import Recording
 
 DESIGNS, SEED = 6, 0
 DURATION, HOLDS = 1500.0, (60.0, 120.0, 250.0)  # in units of the plant's time scale
-PARTED = 20.0  # chi-square units: odds of 20000 to 1
-HIGH, FULL = 0.8, 0.95  # highest share of a pump's limit, and of a tank's height
-TINY = 1e-10
+SEPARABLE = 20.0  # chi-square units: odds of 20000 to 1
+LARGEST_COMMAND, HIGHEST_LEVEL = 0.8, 0.95  # highest share of a pump's limit, and of a tank's height
+RIDGE = 1e-10
 
 
 def discriminating_input(fitter: Fitter, first: Fit, second: Fit) -> Mapping[str, Any] | None:
@@ -69,7 +69,7 @@ def _limits(fitter: Fitter) -> list[tuple[float, float]]:
     plant = fitter.data.plant
     limits = {channel: (0.2, 1.0) for channel in plant.channels()}
     for pump in plant.metered_flows():
-        full = HIGH * pump.full_command
+        full = LARGEST_COMMAND * pump.full_command
         limits[pump.channel] = (0.1 * full, full)
     return [limits[channel] for channel in plant.channels()]
 
@@ -84,11 +84,11 @@ def _separation(fitter: Fitter, first: Fit, second: Fit, recording: Recording) -
         _planned_run(planned_fitter, fit) for fit in (first, second)
     )
     heights = torch.tensor([t.height for t in data.plant.tanks], dtype=torch.float64)
-    if bool((levels > FULL * heights).any()) or bool((other_levels > FULL * heights).any()):
+    if bool((levels > HIGHEST_LEVEL * heights).any()) or bool((other_levels > HIGHEST_LEVEL * heights).any()):
         return None
     difference, slopes = (fitter.noise.whiten(x, planned.mask) for x in (predicted - rival, slopes))
     separation = _cumulative_separation(difference, slopes, _prior_information(fitter, first))
-    sufficient = (separation > PARTED).nonzero().flatten()
+    sufficient = (separation > SEPARABLE).nonzero().flatten()
     return float(separation[-1]), float(recording.time[sufficient[0]]) if len(sufficient) else None
 
 
@@ -119,7 +119,7 @@ def _cumulative_separation(difference: Tensor, slopes: Tensor, information: Tens
     j, prior = slopes / scale, information / (scale * scale.unsqueeze(1))
     curvature = torch.cumsum(torch.einsum("scp,scq->spq", j, j), dim=0) + prior
     pull = torch.cumsum(torch.einsum("scp,sc->sp", j, difference), dim=0)
-    explained = (pull * torch.linalg.solve(curvature + TINY * torch.eye(len(scale)).to(j), pull)).sum(dim=1)
+    explained = (pull * torch.linalg.solve(curvature + RIDGE * torch.eye(len(scale)).to(j), pull)).sum(dim=1)
     return torch.cumsum((difference**2).sum(dim=1), dim=0) - explained
 
 

@@ -31,7 +31,7 @@ from fdi_torch.gap.onsets import with_fine_onsets
 from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.screening import Option, ScreeningResult, pairs_of, screen
 from fdi_torch.gap.stage_progress import StageProgress
-from fdi_torch.gap.trajectory_problem import BEHIND, SHARE
+from fdi_torch.gap.trajectory_problem import GIVE_UP_DEFICIT, GIVE_UP_SHARE
 
 # BEAM, FITTED, STARTS, EVALUATED and PAIRS are budgets of computing. An extension that FITTED and EVALUATED leave out
 # keeps its share of the posterior, `ExplanationPool.unexamined`.
@@ -85,7 +85,7 @@ class ExplanationPool:
             if best is None or gain > 0.0:
                 best = likelier
             behind = leader - best.log_evidence
-            if behind > 0.5 * BEHIND and gain < SHARE * behind:
+            if behind > 0.5 * GIVE_UP_DEFICIT and gain < GIVE_UP_SHARE * behind:
                 break
             if climb and not gain > TOLERANCE:
                 fit = with_likeliest_parameters(best.fitter, best.fit, candidate.starts, self.choices)
@@ -105,7 +105,7 @@ class ExplanationPool:
         fit = replace(fit, cost=fitter.cost(fit))
         return RankedExplanation(fit, fitter, noise, log_evidence(fitter, fit, self.choices))
 
-    def without(self, explanation: RankedExplanation, cause: CauseName) -> RankedExplanation:
+    def refitted_without(self, explanation: RankedExplanation, cause: CauseName) -> RankedExplanation:
         """The explanation without one of its effects, refitted from its present values.
 
         A start near the optimum may avoid a local minimum in which an earlier fit of the same effects ended. The refit
@@ -251,7 +251,7 @@ class ExplanationPool:
             best = self.best
             for cause in sorted(best.key):
                 known = self.explanations.get(best.key - {cause})
-                reduced = self.without(best, cause)
+                reduced = self.refitted_without(best, cause)
                 if reduced is not known and options:
                     self.extend_by(reduced, options)
             if self.best is best:

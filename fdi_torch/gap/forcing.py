@@ -35,8 +35,8 @@ class Forcing:
     plant's constants, bound to one lane.
 
     Attributes at the middle of each step: levels (1, K) m of each tank; commands of each actuator; flows (m^3/s) and
-    heads (m): of each flow component by its name; still: level rates without the effect that is tried, m/s. The n rates
-    are those of the levels and then of the fitted effects' states.
+    heads (m): of each flow component by its name; unforced: level rates without the effect that is tried, m/s. The
+    n rates are those of the levels and then of the fitted effects' states.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ class Forcing:
         self._clock = actuation.clock
         self.commands = actuation.commands(values, 1)
         now = self._now(network, values, self.commands)
-        self._still_states = network.state_rates(now)
+        self._unforced_states = network.state_rates(now)
         first = network.flows(now)
         gathered = network.net_inflows(now, first)
         self._gathered = [net.expand(self.levels[0].shape) for net in gathered]
@@ -67,7 +67,7 @@ class Forcing:
         flows_at = {c.name: now.at_flow(c) for c in union.description.flow_components()}
         self.heads = {name: local.head for name, local in flows_at.items()}
         self._net = network.less_overflow(now, self._gathered)
-        self.still, self._by_inflow = self._inflow_slopes(network)
+        self.unforced, self._by_inflow = self._inflow_slopes(network)
         self._no_inflow: list[Row] = [[None] * len(self.levels) for _ in self._rows]
         self._readings = OutputMap(network, experiment, []).read(self._path, values)[0]
 
@@ -154,7 +154,7 @@ class Forcing:
             commands = Actuation(network, self.experiment, []).commands(values, lanes)
         now = self._now(network, values, commands)
         component = next(c for c in plant.flow_components() if c.name == place)
-        if component.order > FlowOrder.BY_LEVELS:  # its own limits depend on the net inflow, as `still` does
+        if component.order > FlowOrder.BY_LEVELS:  # its own limits depend on the net inflow, as `unforced` does
             rates = network.level_rates(now, network.less_overflow(now, self._gathered))
             return self._changes(rates, lanes)
         if placement.effect.states:
@@ -162,16 +162,16 @@ class Forcing:
         inflows = [torch.zeros_like(net) for net in self._gathered]
         network.transfer(inflows, component.source, component.target, network.flow(now, component) - self.flows[place])
         changes, after = self.by_inflows(inflows, lanes), network.state_rates(now)
-        for prefix, still in self._still_states.items():
+        for prefix, unforced in self._unforced_states.items():
             first = len(self.levels) + self._rows.index(prefix)
-            for row, (rate, before) in enumerate(zip(after[prefix], still, strict=True), first):
+            for row, (rate, before) in enumerate(zip(after[prefix], unforced, strict=True), first):
                 changes[row] = rate - before
         return changes
 
     def _changes(self, rates: Sequence[Tensor], lanes: int) -> Tensor:
-        """Differences of level rates from `still`, and no change of the states' rates, (n, M, K) m/s."""
+        """Differences of level rates from `unforced`, and no change of the states' rates, (n, M, K) m/s."""
         shape = (lanes, self.levels[0].shape[-1])
-        levels = [(a - b).expand(shape) for a, b in zip(rates, self.still, strict=True)]
+        levels = [(a - b).expand(shape) for a, b in zip(rates, self.unforced, strict=True)]
         return torch.stack([*levels, *(torch.zeros_like(levels[0]) for _ in self._no_inflow)])
 
     def _inflow_slopes(self, network: TankNetwork) -> tuple[list[Tensor], list[Row]]:

@@ -29,19 +29,22 @@ from fdi_torch.plant.signals import Clock
 
 LOCAL_NODES, TIME_NODES = 8, 16
 HEAD_NODES = 14
-PRIOR = 0.2  # standard deviation of a coefficient
-NARROWEST = 1e-6  # width of a grid, in units of the plant's scales or of its largest command
-UNIT = 0.01  # size of a coefficient at which its influence on the readings is computed
+PRIOR_STD = 0.2  # standard deviation of a coefficient
+MIN_GRID_WIDTH = 1e-6  # width of a grid, in units of the plant's scales or of its largest command
+TRIAL_SIZE = 0.01  # size of a coefficient at which its influence on the readings is computed
 
 
-class _Free(Effect):
-    """nodes: grid of each variable. The coefficient 'head_3' belongs to the fourth node of the head's grid."""
+class _FreeFunctions(Effect):
+    """Base of the free discrepancies.
+
+    nodes: grid of each variable. The coefficient 'head_3' belongs to the fourth node of the head's grid.
+    """
 
     nodes: dict[str, list[float]]
     scale: float
 
     def __init__(
-        self, nodes: dict[str, list[float]], scale: float, periods: Sequence[float] = (), prior: float = PRIOR
+        self, nodes: dict[str, list[float]], scale: float, periods: Sequence[float] = (), prior: float = PRIOR_STD
     ) -> None:
         self.nodes, self.scale, self.periods, self.prior = nodes, scale, tuple(periods), prior
 
@@ -50,10 +53,10 @@ class _Free(Effect):
         names += [f"{wave}_{j}" for j in range(len(self.periods)) for wave in ("cosine", "sine")]
         return tuple(Parameter(name, "1", 0.0, std=self.prior) for name in names)
 
-    def starts(self, place: str, plant: PlantDescription, reach: OperatingRange) -> list[dict[str, float]]:
+    def starts(self, place: str, plant: PlantDescription, operating_range: OperatingRange) -> list[dict[str, float]]:
         """One start for each coefficient, all of one form, so that they make one batch."""
         names = [p.name for p in self.parameters(place, plant)]
-        return [{name: UNIT if name == one else 0.0 for name in names} for one in names]
+        return [{name: TRIAL_SIZE if name == one else 0.0 for name in names} for one in names]
 
     def curve(self, variable: str, x: Tensor, p: Values) -> Tensor:
         """Piecewise linear function of x, constant beyond its grid; 0 if the effect has no such variable."""
@@ -66,7 +69,7 @@ class _Free(Effect):
             total = total + (p[f"{variable}_{j + 1}"] - p[f"{variable}_{j}"]) * share
         return total
 
-    def waves(self, clock: Clock, p: Values) -> Tensor | float:
+    def sinusoids(self, clock: Clock, p: Values) -> Tensor | float:
         """Sinusoids of the effect's periods, averaged over each step."""
         total: Tensor | float = 0.0
         for j, period in enumerate(self.periods):
@@ -76,7 +79,7 @@ class _Free(Effect):
         return total
 
 
-class FreeFlow(_Free):
+class FreeFlow(_FreeFunctions):
     """A flow component: scale f(head or command) + flow (g(level) + k(t))."""
 
     name = "free_flow"
@@ -85,12 +88,12 @@ class FreeFlow(_Free):
 
     def flow(self, flow: Tensor, local: Local, p: Values) -> Tensor:
         local_part = self.curve("command", local.command, p) + self.curve("head", local.head, p)
-        time = self.curve("time", local.clock.middle, p) + self.waves(local.clock, p)
+        time = self.curve("time", local.clock.middle, p) + self.sinusoids(local.clock, p)
         factor = self.curve("level", local.level, p) + time
         return flow + self.scale * local_part + flow * factor
 
 
-class FreeInflow(_Free):
+class FreeInflow(_FreeFunctions):
     """Any flow into a tank, scale (f(level) + k(t)), or between two tanks, scale (f(difference of levels) + k(t))."""
 
     name = "free_inflow"
@@ -99,10 +102,10 @@ class FreeInflow(_Free):
 
     def inflow(self, local: Local, p: Values) -> Tensor:
         local_part = self.curve("level", local.level, p) + self.curve("difference", local.level - local.far_level, p)
-        return self.scale * (local_part + self.curve("time", local.clock.middle, p) + self.waves(local.clock, p))
+        return self.scale * (local_part + self.curve("time", local.clock.middle, p) + self.sinusoids(local.clock, p))
 
 
-class FreeArea(_Free):
+class FreeArea(_FreeFunctions):
     """A tank's cross-section: A (1 + f(level))."""
 
     name = "free_area"
@@ -113,7 +116,7 @@ class FreeArea(_Free):
         return area * torch.clamp(1.0 + self.curve("level", local.level, p), min=0.05)
 
 
-class FreeReading(_Free):
+class FreeReading(_FreeFunctions):
     """A sensor: reading + scale (f(reading) + k(t))."""
 
     name = "free_reading"
@@ -121,7 +124,7 @@ class FreeReading(_Free):
     places: ClassVar[tuple[str, ...]] = ("sensor",)
 
     def reading(self, value: Tensor, memory: Memory, clock: Clock, p: Values) -> tuple[Tensor, Memory]:
-        time = self.curve("time", clock.end, p) + self.waves(clock, p)
+        time = self.curve("time", clock.end, p) + self.sinusoids(clock, p)
         return value + self.scale * (self.curve("reading", value, p) + time), memory
 
 
@@ -131,19 +134,25 @@ def is_free_coefficient(name: str) -> bool:
 
 
 def free_form(
-    place: str, plant: PlantDescription, reach: OperatingRange, periods: Sequence[float] = ()
+    place: str, plant: PlantDescription, operating_range: OperatingRange, periods: Sequence[float] = ()
 ) -> tuple[Placement, ...]:
     """The free discrepancy of a place. periods: of its sinusoids, s."""
-    return tuple(Placement(e, place) for e in _free_at(place, plant, reach, periods))
+    return tuple(Placement(e, place) for e in _free_at(place, plant, operating_range, periods))
 
 
 def fitted_free_form(
-    fitter: Fitter, fit: Fit, effects: Sequence[Placement], unknown: LocalizedDiscrepancy, reach: OperatingRange
+    fitter: Fitter,
+    fit: Fit,
+    effects: Sequence[Placement],
+    unknown: LocalizedDiscrepancy,
+    operating_range: OperatingRange,
 ) -> Fit:
     """Fit free functions for an unknown discrepancy together with some effects of a fit."""
     plant = fitter.data.plant
     placements = [
-        p for p in free_form(unknown.location, plant, reach, unknown.periods) if p.effect.quantity in unknown.quantities
+        p
+        for p in free_form(unknown.location, plant, operating_range, unknown.periods)
+        if p.effect.quantity in unknown.quantities
     ]
     start = {p.full_name(c.name): 0.0 for p in placements for c in p.effect.parameters(p.location, plant)}
     start |= fit.values_of(effects)
@@ -153,10 +162,10 @@ def fitted_free_form(
 def discrepancy_tables(fit: Fit) -> dict[str, object]:
     """The fitted discrepancy as tables over its local variables, as multiples of `scale`."""
     values, tables = fit.effect_values, {}
-    free = [p for p in fit.candidate.placements if isinstance(p.effect, _Free)]
+    free = [p for p in fit.candidate.placements if isinstance(p.effect, _FreeFunctions)]
     for placement in free:
         effect = placement.effect
-        assert isinstance(effect, _Free)
+        assert isinstance(effect, _FreeFunctions)
         for variable, grid in effect.nodes.items():
             share = [values[placement.full_name(f"{variable}_{j}")] for j in range(len(grid))]
             tables[f"{effect.name}.{variable}"] = {"at": grid, "share": share, "scale": effect.scale}
@@ -169,27 +178,33 @@ def discrepancy_tables(fit: Fit) -> dict[str, object]:
     return {"location": free[0].location, "tables": tables}
 
 
-def _free_at(place: str, plant: PlantDescription, reach: OperatingRange, periods: Sequence[float]) -> list[Effect]:
+def _free_at(
+    place: str, plant: PlantDescription, operating_range: OperatingRange, periods: Sequence[float]
+) -> list[Effect]:
     kind, length = place_kind(plant, place), length_scale(plant)
-    time = _grid((0.0, reach.duration), TIME_NODES, time_scale(plant))
+    time = _grid((0.0, operating_range.duration), TIME_NODES, time_scale(plant))
     if kind == "tank_pair":
         first, second = plant.tanks_at(place)
-        ends = reach.levels[first], reach.levels[second]
+        ends = operating_range.levels[first], operating_range.levels[second]
         grid = _root_grid((ends[0][0] - ends[1][1], ends[0][1] - ends[1][0]), HEAD_NODES, length)
         return [FreeInflow({"difference": grid, "time": time}, 0.3 * flow_scale(plant, first), periods)]
     if kind == "tank":
-        levels, flow = _grid(reach.levels[place], LOCAL_NODES, length), 0.3 * flow_scale(plant, place)
+        levels, flow = _grid(operating_range.levels[place], LOCAL_NODES, length), 0.3 * flow_scale(plant, place)
         return [FreeInflow({"level": levels, "time": time}, flow, periods), FreeArea({"level": levels}, 1.0)]
     component = plant.component(place)
     if isinstance(component, Sensor):
-        readings = _grid(reach.readings[place], LOCAL_NODES, length if component.unit == "m" else 1.0)
+        readings = _grid(operating_range.readings[place], LOCAL_NODES, length if component.unit == "m" else 1.0)
         return [FreeReading({"reading": readings, "time": time}, 0.2 * reading_span(plant, component), periods)]
     if isinstance(component, MeteredFlow):
-        command = _grid(reach.commands[component.channel], LOCAL_NODES, component.max_flow / component.gain)
-        nodes = {"command": command, "level": _grid(reach.levels[component.near_tank], 5, length), "time": time}
+        command = _grid(operating_range.commands[component.channel], LOCAL_NODES, component.max_flow / component.gain)
+        nodes = {
+            "command": command,
+            "level": _grid(operating_range.levels[component.near_tank], 5, length),
+            "time": time,
+        }
         return [FreeFlow(nodes, component.gain * max(abs(command[0]), abs(command[-1])), periods)]
     assert isinstance(component, FlowComponent)
-    (low, high), *far = (reach.levels[tank] for tank in component.depends_on)
+    (low, high), *far = (operating_range.levels[tank] for tank in component.depends_on)
     far_low, far_high = far[0] if far else (component.datum, component.datum)
     heads = (low - far_high, high - far_low)
     flow = 0.5 * flow_scale(plant, component.source)
@@ -197,9 +212,9 @@ def _free_at(place: str, plant: PlantDescription, reach: OperatingRange, periods
 
 
 def _grid(span: Range, count: int, scale: float) -> list[float]:
-    """Even grid over a range, at least NARROWEST times `scale` wide."""
+    """Even grid over a range, at least MIN_GRID_WIDTH times `scale` wide."""
     low, high = span
-    width = max(high - low, NARROWEST * scale)
+    width = max(high - low, MIN_GRID_WIDTH * scale)
     return [low + width * j / (count - 1) for j in range(count)]
 
 

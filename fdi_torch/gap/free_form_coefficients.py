@@ -15,7 +15,7 @@ from torch import Tensor
 
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter, covariance
-from fdi_torch.gap.free_form import UNIT
+from fdi_torch.gap.free_form import TRIAL_SIZE
 from fdi_torch.gap.screening import Option, effect_columns, options_of
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.effect import Placement
@@ -41,7 +41,7 @@ def coefficients_of(
     fitter: Fitter,
     fit: Fit,
     free: Sequence[Placement],
-    reach: OperatingRange,
+    operating_range: OperatingRange,
     returned: Sequence[Placement] = (),
 ) -> Coefficients:
     """Coefficients of free forms, fitted to the residual of a fit.
@@ -49,9 +49,9 @@ def coefficients_of(
     returned: causes of the fit whose influence the free forms shall describe instead; it is added to the residual. The
     amplitude of the coefficients' normal prior maximises the evidence.
     """
-    options = options_of(free, fitter, reach)
+    options = options_of(free, fitter, operating_range)
     names = tuple(next(n for n, v in o.start.items() if v != 0.0) for o in options)
-    columns = fitter.whiten(effect_columns(fitter, fit, options)) / UNIT
+    columns = fitter.whiten(effect_columns(fitter, fit, options)) / TRIAL_SIZE
     residual = fitter.residual(fit.linearised.readings)[0]
     if returned:
         fitted = [Option(p, fit.values_of([p]), p.effect.parameters(p.location, fitter.data.plant)) for p in returned]

@@ -27,8 +27,8 @@ from fdi_torch.simulate.collocation import Collocation
 
 START_SAMPLES = 120  # for the initial levels
 BLOCKS, DRAWS = 24, 400  # blocks of time, and draws of the bootstrap
-DEFINED = 5.0  # standard errors; a smaller gap is too uncertain to state a share of it
-LEAST = -9.0  # share closed where the causes make a gap many times as large
+MIN_STANDARD_ERRORS = 5.0  # standard errors; a smaller gap is too uncertain to state a share of it
+LOWEST_SHARE = -9.0  # share closed where the causes make a gap many times as large
 
 
 @dataclass(frozen=True)
@@ -145,29 +145,29 @@ def transferable_values(values: Mapping[str, float]) -> dict[str, float]:
 
 
 def _closed(holdouts: Sequence[HeldOut]) -> tuple[float | None, tuple[float, float] | None]:
-    """Share closed with its 95 % interval over blocks of time, LEAST at least. None if the gap, and what the causes
-    change of it, are below 5 standard errors.
+    """Share closed, at least LOWEST_SHARE, with its 95 % interval over blocks of time. None if the gap, and the change
+    of it by the causes, are both below MIN_STANDARD_ERRORS.
 
     The noise of a hold-out is the same in both runs. The gap is therefore the difference of their squares, plus the
     excess of the augmented run over the noise, as far as it exceeds the uncertainty of the noise.
     """
     difference = torch.cat([_blocks(h.weight * (h.squares["recalibrated"] - h.squares["augmented"])) for h in holdouts])
     excess = sum(float((h.weight * (h.squares["augmented"] - h.squares["noise_floor"])).sum()) for h in holdouts)
-    noise_error = math.sqrt(sum(_floor_variance(h) for h in holdouts))
+    noise_error = math.sqrt(sum(_noise_variance(h) for h in holdouts))
     remaining = max(excess - noise_error, 0.0)
     total, error = float(difference.sum()) + remaining, float(difference.std()) * math.sqrt(len(difference))
-    if max(total, -float(difference.sum())) < DEFINED * min(error, noise_error):
+    if max(total, -float(difference.sum())) < MIN_STANDARD_ERRORS * min(error, noise_error):
         return None, None
     generator = torch.Generator().manual_seed(0)
     picks = torch.randint(len(difference), (DRAWS, len(difference)), generator=generator)
     drawn_excess = remaining + noise_error * torch.randn(DRAWS, generator=generator, dtype=difference.dtype)
     gap = difference[picks].sum(dim=1) + drawn_excess.clamp(min=0.0)
-    drawn = (1.0 - drawn_excess / gap.clamp(min=noise_error)).clamp(LEAST, 1.0)
+    drawn = (1.0 - drawn_excess / gap.clamp(min=noise_error)).clamp(LOWEST_SHARE, 1.0)
     low, high = torch.quantile(drawn, torch.tensor([0.025, 0.975], dtype=drawn.dtype)).tolist()
-    return max(1.0 - remaining / max(total, noise_error), LEAST), (low, high)
+    return max(1.0 - remaining / max(total, noise_error), LOWEST_SHARE), (low, high)
 
 
-def _floor_variance(held: HeldOut) -> float:
+def _noise_variance(held: HeldOut) -> float:
     """Variance of the sum of squares of the noise alone."""
     std, count = held.noise.std * torch.sqrt(held.weight), held.data.mask.sum(dim=0)
     return float((2.0 * std**4 * count * held.noise.squared_correlations).sum())

@@ -60,11 +60,11 @@ class HypothesisSearch:
             hypotheses += self._everywhere(explanation, likeliest(hypotheses))
             self.pool.progress.so_far(likeliest(hypotheses).all_causes)
         hypotheses = self._after_fits_at_unknowns(hypotheses)
-        trials = self._climbed(likeliest(hypotheses))
+        trials = self._local_search(likeliest(hypotheses))
         best = likeliest([*hypotheses, *trials])
         if best.discrepancy and any(at != best.discrepancy.location for _, at in best.explanation.key):
             alone = self._with_discrepancies(result.null, [best.discrepancy.location])
-            trials += [*alone, *self._climbed(likeliest(alone))]
+            trials += [*alone, *self._local_search(likeliest(alone))]
         hypotheses += self._after_fits_at_unknowns(trials, likeliest(hypotheses).weight)
         least = likeliest(hypotheses).weight + math.log(RARE)
         hypotheses += [law for h in hypotheses if h.weight > least for law in self.weights.with_inexact_laws(h)]
@@ -118,7 +118,7 @@ class HypothesisSearch:
         alone = CauseHypothesis(explanation, causes, explanation.log_weight + localization.itself)
         return [alone, *known, *(h for each in hypotheses.values() for h in each)]
 
-    def _climbed(self, best: CauseHypothesis) -> list[CauseHypothesis]:
+    def _local_search(self, best: CauseHypothesis) -> list[CauseHypothesis]:
         """Hypotheses with an effect fewer or more than the best, or else with a discrepancy at another place, while
         that improves it. The discrepancy moves beside the same effects, or beside one more in its former place."""
         evaluated: list[CauseHypothesis] = []
@@ -148,7 +148,7 @@ class HypothesisSearch:
             return self._with_the_same(at, fits, best)
         if len(best.explanation.key) < 2:
             return []
-        explanations = [self.pool.without(best.explanation, cause) for cause in sorted(best.explanation.key)]
+        explanations = [self.pool.refitted_without(best.explanation, cause) for cause in sorted(best.explanation.key)]
         return [h for e in explanations for h in self._with_discrepancies(e, self.places, best)]
 
     def _with_more_effects(self, best: CauseHypothesis) -> list[CauseHypothesis]:
@@ -201,7 +201,9 @@ class HypothesisSearch:
                 named = self._named(h)
                 added += [law for e in named for law in self._with_discrepancies(e, [h.unknown.location], h)]
         return [
-            each for h in [*hypotheses, *added] for each in (self.weights.among_known(h) if h.weight > least else [h])
+            each
+            for h in [*hypotheses, *added]
+            for each in (self.weights.divided_among_effects(h) if h.weight > least else [h])
         ]
 
     def _named(self, h: CauseHypothesis) -> list[RankedExplanation]:

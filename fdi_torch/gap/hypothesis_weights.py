@@ -73,7 +73,7 @@ class HypothesisWeights:
     def _log_odds_of_law(self, error: float | None) -> float:
         return log_odds_of_law(error, self.pool.choices, self.places)
 
-    def among_known(self, h: CauseHypothesis) -> list[CauseHypothesis]:
+    def divided_among_effects(self, h: CauseHypothesis) -> list[CauseHypothesis]:
         """The hypothesis, and those of single effects in place of its unknown, with its weight divided among them."""
         if h.unknown is None:
             return [h]
@@ -119,7 +119,7 @@ class HypothesisWeights:
             at_place = [c for c in h.causes if c[1] == cause[1] and effect(c[0]).quantity == effect(cause[0]).quantity]
             if len(at_place) > 1:
                 error = relative_size(fitter, fit, influence(fitter, fit, [cause]), at_place)
-                reduced = self.pool.without(h.explanation, cause)
+                reduced = self.pool.refitted_without(h.explanation, cause)
                 odds = log_prior(reduced.key, self.pool.choices) - log_prior(h.explanation.key, self.pool.choices)
                 weight = h.weight + odds + self._log_selection(cause[1]) + log_law_error(error)
                 others = tuple(c for c in h.causes if c != cause)

@@ -48,8 +48,8 @@ from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.operating_range import operating_range_of
 from fdi_torch.recording import Recording
 
-SHOWN = 25.0  # chi-square of a visible effect: five standard errors
-PARTED = 25.0  # chi-square that separates two effects
+VISIBLE = 25.0  # chi-square of a visible effect: five standard errors
+SEPARABLE = 25.0  # chi-square that separates two effects
 
 
 @dataclass(frozen=True)
@@ -67,12 +67,12 @@ def identifiability(pairs: Pairs, plant: PlantDescription) -> Identifiability:
     gram, best = pairs.gram, most_visible(pairs.options, torch.diagonal(pairs.gram))
     shown = {cause: float(gram[i, i]) for cause, i in best.items()}
     inseparable = []
-    for a, b in combinations((c for c in shown if shown[c] >= SHOWN), 2):
+    for a, b in combinations((c for c in shown if shown[c] >= VISIBLE), 2):
         shared = float(gram[best[a], best[b]]) ** 2 / (shown[a] * shown[b])
         separation = min(shown[a], shown[b]) * (1.0 - shared)
-        if separation < PARTED and b not in equivalence_class(a, plant, {}):
+        if separation < SEPARABLE and b not in equivalence_class(a, plant, {}):
             inseparable.append((a, b, max(separation, 0.0)))
-    hidden = tuple(cause for cause in shown if shown[cause] < SHOWN)
+    hidden = tuple(cause for cause in shown if shown[cause] < VISIBLE)
     return Identifiability(hidden, tuple(sorted(inseparable, key=lambda pair: pair[2])), shown)
 
 
@@ -109,7 +109,7 @@ def _noise_free(
     return Fitter(replace(data, readings=readings, recordings=(replace(planned, outputs=readings),)), white)
 
 
-def unsearched_twins(
+def unsearched_equivalents(
     fitter: Fitter, fit: Fit, placed: Placement, options: Sequence[Option], level: float
 ) -> tuple[CauseName, ...]:
     """Causes outside the library that would explain the readings about as well as a cause of the fit, to first order.
@@ -121,7 +121,7 @@ def unsearched_twins(
     own = Option(placed, fit.values_of([placed]))
     _, gram = products(fitter, fit, [own, *options], besides=tuple(own.start))
     shared, strength = gram[0, 1:], torch.diagonal(gram)[1:]
-    explained = torch.where(shared > 0.0, shared**2 / strength.clamp(min=VISIBLE), 0.0)
+    explained = torch.where(shared > 0.0, shared**2 / strength.clamp(min=LEAST_STRENGTH), 0.0)
     near = float(gram[0, 0]) - explained < 2.0 * math.log(level / (1.0 - level))
     each = zip(options, near, strength, explained, strict=True)
     return tuple(dict.fromkeys(o.cause for o, is_near, s, gap in each if is_near and _possible(o, s, float(gap))))
@@ -132,8 +132,8 @@ def exact_areas_like(fitter: Fitter, fit: Fit, explained: Placement | Tensor, le
     first order, by name, with the values that they would need, m^2.
 
     explained: one of the fit's effects, or what something unknown explains of the readings (S, C). level: as in
-    `unsearched_twins`. An error of any other constant is itself an effect of the library: plugging, the gain of a pump,
-    or the gain or bias of a sensor.
+    `unsearched_equivalents`. An error of any other constant is itself an effect of the library: plugging, the gain of a
+    pump, or the gain or bias of a sensor.
     """
     constants = fitter.network(fit.candidate.placements).constants
     areas = [constants[n] for t in fitter.data.plant.tanks if (n := f"{t.name}.area") not in fit.space]
@@ -149,7 +149,7 @@ def exact_areas_like(fitter: Fitter, fit: Fit, explained: Placement | Tensor, le
         else effect_columns(fitter, fit, [Option(explained, besides)])[..., 0]
     )
     _, gram = products_of(fitter, fit, torch.cat([own.unsqueeze(-1), columns], dim=-1), tuple(besides))
-    change = gram[0, 1:] / torch.diagonal(gram)[1:].clamp(min=VISIBLE)
+    change = gram[0, 1:] / torch.diagonal(gram)[1:].clamp(min=LEAST_STRENGTH)
     left = float(gram[0, 0]) - gram[0, 1:] * change
     near = left < 2.0 * math.log(level / (1.0 - level))
     values = ((a, a.nominal + float(c)) for a, c, is_near in zip(areas, change, near, strict=True) if is_near)
@@ -158,7 +158,7 @@ def exact_areas_like(fitter: Fitter, fit: Fit, explained: Placement | Tensor, le
 
 DRAWS, SEED = 40, 0
 PASSES = 0.02  # share of the gap that a wrong cause may leave if a test of fit shall accept it
-VISIBLE = 1e-6
+LEAST_STRENGTH = 1e-6
 
 
 def simulated_confusions(pairs: Pairs, named: CauseName, gap: float, plant: PlantDescription) -> dict[str, Any] | None:
@@ -177,7 +177,9 @@ def simulated_confusions(pairs: Pairs, named: CauseName, gap: float, plant: Plan
     confused, passed = 0, dict.fromkeys((kinds[i] for i in rivals), 0)
     for i in rivals:
         scores = torch.sqrt(gap / strength[i]) * pairs.gram[i] + noise
-        gains = torch.where((scores > 0) & (strength > VISIBLE), scores**2 / strength.clamp(min=VISIBLE), 0.0)
+        gains = torch.where(
+            (scores > 0) & (strength > LEAST_STRENGTH), scores**2 / strength.clamp(min=LEAST_STRENGTH), 0.0
+        )
         is_true = torch.tensor([kind == kinds[i] for kind in kinds])
         best, others = gains[:, is_named].amax(1), gains[:, ~is_named & ~is_true]
         confused += int((gains.amax(1) <= best).sum())
@@ -195,7 +197,7 @@ def simulated_confusions(pairs: Pairs, named: CauseName, gap: float, plant: Plan
 
 def _possible(option: Option, strength: Tensor, gap: float) -> bool:
     """Whether an effect can cause such a gap within its range, to first order from its start."""
-    if float(strength) <= VISIBLE:
+    if float(strength) <= LEAST_STRENGTH:
         return False
     _, start, size = size_of(option)
     needed = size.nominal + (gap / float(strength)) ** 0.5 * (start - size.nominal)

@@ -41,7 +41,7 @@ def reference_models(result: DiagnosisResult) -> dict[str, Model]:
         "augmented": model_of(best),
         FROZEN["recalibrated"]: Model(best.candidate.placements, constants_of(result.null) | best.effect_values),
         FROZEN["nominal"]: Model(best.candidate.placements, best.effect_values),
-        "ceiling": ceiling_model(result),
+        "ceiling": free_form_model(result),
     }
 
 
@@ -53,13 +53,15 @@ def constants_of(fit: Fit) -> dict[str, float]:
     return {n: fit.values[n] for n in constants if names[n].prefix not in new}
 
 
-def ceiling_model(result: DiagnosisResult) -> Model:
+def free_form_model(result: DiagnosisResult) -> Model:
     """The best explanation with free functions added, or as it is if it already has the free form of an unknown."""
     best, plant = result.best, result.fitter.data.plant
     if result.free_form_fit:
         return model_of(best)
-    free = without_time_course([p for place in causal_places(result) for p in free_form(place, plant, result.reach)])
-    coefficients: Mapping[str, float] = coefficients_of(result.fitter, best, free, result.reach).by_name()
+    free = without_time_course(
+        [p for place in causal_places(result) for p in free_form(place, plant, result.operating_range)]
+    )
+    coefficients: Mapping[str, float] = coefficients_of(result.fitter, best, free, result.operating_range).by_name()
     return Model((*best.candidate.placements, *free), {**best.values, **coefficients})
 
 

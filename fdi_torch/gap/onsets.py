@@ -27,8 +27,8 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.screening import Option, ScreeningResult, products, screen
 
 SPACING = 4.0  # times t; no onset is further than 2 t from a start, where most of its gain is left
-MOST = 127  # onset times, a limit on computing time
-FEWEST = 60  # instants of intervals, which have no other starts in between
+MAX_ONSETS = 127  # of an effect, a limit on computing time
+MIN_INSTANTS = 60  # of the grid on which intervals begin and end
 INTERVALS = 4  # the likeliest intervals of an effect, from each of which a fit starts
 
 
@@ -58,7 +58,7 @@ def fine_onsets(options: Sequence[Option], fitter: Fitter) -> list[Option]:
 
 def likeliest_intervals(options: Sequence[Option], fitter: Fitter, fit: Fit) -> list[Option]:
     """The intervals in which these options explain most in addition to a fit, for effects that begin and end."""
-    count, duration = max(_count(fitter), FEWEST), fitter.data.longest_duration
+    count, duration = max(_count(fitter), MIN_INSTANTS), fitter.data.longest_duration
     times = torch.arange(count, dtype=torch.float64) * duration / count
     further: list[Option] = []
     for option in {o.cause: o for o in options}.values():
@@ -91,7 +91,7 @@ def _best_pairs(score: Tensor, gram: Tensor) -> list[tuple[int, int, float]]:
 
 def _count(fitter: Fitter) -> int:
     """Number of instants that random flows require."""
-    return min(math.ceil(fitter.data.longest_duration / (SPACING * detection_time(fitter))), MOST)
+    return min(math.ceil(fitter.data.longest_duration / (SPACING * detection_time(fitter))), MAX_ONSETS)
 
 
 def detection_time(fitter: Fitter) -> float:

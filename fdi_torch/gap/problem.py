@@ -17,7 +17,7 @@ from fdi_torch.gap.library import library_of
 from fdi_torch.gap.preprocess.acquisition import StuckSegment, usable, without_sensors
 from fdi_torch.gap.preprocess.outliers import Outlier, SensorOutliers, outliers_of, without
 from fdi_torch.gap.preprocess.sensor_limits import limits_from_readings
-from fdi_torch.gap.structure_search import DEEPEST
+from fdi_torch.gap.structure_search import MAX_EFFECTS
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Placement
 from fdi_torch.plant.scales import time_scale
@@ -25,7 +25,7 @@ from fdi_torch.recording import Recording
 from fdi_torch.recordings.plant_limits import with_rims_unknown
 from fdi_torch.simulate.step_length import commensurate_step
 
-LEAST = 60
+MIN_READINGS = 60
 """Fewest readings of a sensor; with fewer, noise cannot be separated from a model error. Two of the slowest periods
 that count as noise."""
 
@@ -42,16 +42,16 @@ RELIABLE_BITS = 30
 
 @dataclass(frozen=True)
 class Settings:
-    """library, leave_out: as in `library_of`. step: of the simulation, s; None: as in `checked_data_set`.
+    """library, leave_out: as in `library_of`. step: of the simulation, s; None chooses it (`checked_data_set`).
 
     most: effects in one explanation. named_only: report the best set of named effects, however much it leaves
-    unexplained; an intermediate step if many causes act together. trusted: as in `Recording`, for all of them.
+    unexplained, as an intermediate step if many causes act together. trusted: as in `Recording`, for all of them.
     """
 
     library: tuple[str, ...] | None = None
     leave_out: tuple[str, ...] = ()
     step: float | None = None
-    most: int = DEEPEST
+    most: int = MAX_EFFECTS
     named_only: bool = False
     trusted: bool = False
 
@@ -62,7 +62,7 @@ class Settings:
             raise ValueError(f"step: expected a positive number of seconds, got {self.step:g}")
 
 
-PLAIN = Settings()
+DEFAULT_SETTINGS = Settings()
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class DiagnosisProblem:
 def problem_of(
     plant: PlantDescription, recordings: Sequence[Recording], holdouts: Sequence[Recording], settings: Settings
 ) -> DiagnosisProblem:
-    """Check the recordings and lay them out.
+    """Check the recordings and put their readings on the time grid of the simulation.
 
     Raises ValueError for unknown effects or places, missing sensors or inputs, too few readings, and a hold-out that is
     one of the recordings.
@@ -181,7 +181,7 @@ def _without_stuck_sensors(
         s.sensor.name: sum(int(r.mask[:, r.output_names.index(s.sensor.column)].sum()) for r in recordings)
         for s in stuck
     }
-    silent = {name for name, count in remaining.items() if count < LEAST}
+    silent = {name for name, count in remaining.items() if count < MIN_READINGS}
     if not silent:
         return plant
     if len(silent) == len(plant.sensors):
@@ -209,10 +209,10 @@ def _check_readings(plant: PlantDescription, recordings: Sequence[Recording]) ->
 
 
 def _expect_enough(source: str, sensor: str, count: int) -> None:
-    if count < LEAST:
+    if count < MIN_READINGS:
         raise ValueError(
-            f"{source}: expected at least {LEAST} readings of every sensor, got {count} of {sensor}; record longer or "
-            "more often, or leave the sensor out of the plant file"
+            f"{source}: expected at least {MIN_READINGS} readings of every sensor, got {count} of {sensor}; record "
+            "longer or more often, or leave the sensor out of the plant file"
         )
 
 
@@ -245,8 +245,9 @@ def checked_data_set(
 ) -> DataSet:
     """Lay the recordings out on the grid of their simulation, with the mean of the readings in each step.
 
-    step: s; None for the shortest sampling interval of a recording, or the multiple or fraction of it that lies between
-    SHORTEST_STEP and LONGEST_STEP, for about MANY_STEPS at most, in parts where that is not accurate enough.
+    step: length of the simulation's steps, s. None chooses it: the shortest sampling interval of the recordings, or a
+    whole multiple or fraction of it, between SHORTEST_STEP and LONGEST_STEP and with about MANY_STEPS steps at most.
+    Where such a step is not accurate enough, it is divided further.
     """
     data = _laid_out(plant, nominal_effects, recordings, step)
     for sensor, count in zip(plant.sensors, data.mask.sum(dim=0).tolist(), strict=True):

@@ -21,7 +21,7 @@ from fdi_torch.gap.constant_remarks import Constants, constant_remarks
 from fdi_torch.gap.diagnosis_result import DiagnosisResult, unexplained_chi_square
 from fdi_torch.gap.free_form import discrepancy_tables
 from fdi_torch.gap.holdout import HeldOut
-from fdi_torch.gap.identifiability import exact_areas_like, unsearched_twins
+from fdi_torch.gap.identifiability import exact_areas_like, unsearched_equivalents
 from fdi_torch.gap.library import equivalence_class
 from fdi_torch.gap.preprocess.outliers import SensorOutliers
 from fdi_torch.gap.screening import options_of
@@ -62,7 +62,7 @@ def remarks_on(result: DiagnosisResult, held: Sequence[HeldOut], constants: Cons
     remarks += implausible_flows(data.plant, result.posterior.best.noise, data.row_spacing)
     remarks += [_masked_outliers(s) for group in result.outliers for s in group]
     remarks += [*_nominal_values_out_of_range(data.plant), *_values_at_bounds(result), *_periods(result)]
-    remarks += [*_exact_areas(result), *_twins_outside_library(result)]
+    remarks += [*_exact_areas(result), *_equivalents_outside_library(result)]
     remarks += _warnings_of_holdouts(held, remarks, data.plant)
     on_holdouts = [remark(result, h) for remark in (_free_form_fails, rig_difference) for h in held]
     return remarks + [sentence for sentence in on_holdouts if sentence]
@@ -132,7 +132,7 @@ def _periods(result: DiagnosisResult) -> list[str]:
     ]
 
 
-def _twins_outside_library(result: DiagnosisResult) -> list[str]:
+def _equivalents_outside_library(result: DiagnosisResult) -> list[str]:
     """Effects that were not searched and would explain the readings about as well as a cause of the answer."""
     best, fitter, plant = result.posterior.best, result.fitter, result.fitter.data.plant
     if best.unknown:
@@ -143,11 +143,11 @@ def _twins_outside_library(result: DiagnosisResult) -> list[str]:
         for p in all_placements(plant, [e for e in EFFECTS if not e.quantizes])
         if not searched & equivalence_class(p.cause, plant, {})
     ]
-    options = options_of(further, fitter, result.reach)
+    options = options_of(further, fitter, result.operating_range)
     if not options:
         return []
     twins = {
-        f"{p.effect.name} at {p.location}": unsearched_twins(fitter, best.fit, p, options, CERTAIN)
+        f"{p.effect.name} at {p.location}": unsearched_equivalents(fitter, best.fit, p, options, CERTAIN)
         for p in best.fit.candidate.placements
     }
     return [

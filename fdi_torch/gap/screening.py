@@ -123,14 +123,14 @@ def most_visible(options: Sequence[Option], strength: Tensor) -> dict[tuple[str,
     return best
 
 
-def options_of(placements: Sequence[Placement], fitter: Fitter, reach: OperatingRange) -> list[Option]:
+def options_of(placements: Sequence[Placement], fitter: Fitter, operating_range: OperatingRange) -> list[Option]:
     """One option for each start value of each effect at each place."""
     plant = fitter.data.plant
     return [
         Option(p, {p.full_name(name): value for name, value in start.items()}, parameters)
         for p in placements
         for parameters in [p.effect.parameters(p.location, plant)]
-        for start in p.effect.starts(p.location, plant, reach)
+        for start in p.effect.starts(p.location, plant, operating_range)
     ]
 
 

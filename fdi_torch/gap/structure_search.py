@@ -20,21 +20,24 @@ from fdi_torch.gap.ranked_explanation import RankedExplanation
 from fdi_torch.gap.screening import Option, Pairs, ScreeningResult, pairs_of, screen, screen_under_each
 
 # Budgets of computing.
-DEEPEST = 4  # effects in one explanation
-TURNS = 4  # rounds in which further unfitted candidates are fitted
+MAX_EFFECTS = 4  # effects in one explanation
+FINAL_ROUNDS = 4  # rounds in which further unfitted candidates are fitted
 
 
 @dataclass(frozen=True)
 class SearchResult:
-    """explanations: all that were evaluated, the likeliest first. null: the recalibrated plant among them. alarm:
-    screening about the recalibrated plant under its own noise. shown: regression on pairs about the same under the
-    noise of the best explanation. unexamined: odds of the candidates that were not fitted, against the best
-    explanation."""
+    """The explanations of a recording.
+
+    explanations: all that were evaluated, the likeliest first. null: the recalibrated plant among them. null_screening:
+    screening about the recalibrated plant under its own noise. null_pairs: regression on pairs about the recalibrated
+    plant under the noise of the best explanation. unexamined: odds of the candidates that were not fitted, against the
+    best explanation.
+    """
 
     null: RankedExplanation
     explanations: tuple[RankedExplanation, ...]
-    alarm: ScreeningResult
-    shown: Pairs
+    null_screening: ScreeningResult
+    null_pairs: Pairs
     unexamined: float
 
     @property
@@ -42,12 +45,12 @@ class SearchResult:
         return self.explanations[0]
 
 
-def search(pool: ExplanationPool, options: Sequence[Option], most: int = DEEPEST) -> SearchResult:
+def search(pool: ExplanationPool, options: Sequence[Option], most: int = MAX_EFFECTS) -> SearchResult:
     """Search from the recalibrated plant. most: effects in one explanation."""
     pool.progress.remaining(EXTENSION * (1 + BEAM * (most - 1)))
     base = pool.evaluate(pool.null)
-    alarm, of_sensors = screen_under_each([base.fitter, pool.fitter], base.fit, options)
-    pool.extend(base, alarm, of_sensors)
+    null_screening, of_sensors = screen_under_each([base.fitter, pool.fitter], base.fit, options)
+    pool.extend(base, null_screening, of_sensors)
     pool.progress.so_far(pool.best.key)
     frontier = pool.best_of(1)[:BEAM]
     for depth in range(2, most + 1):
@@ -60,15 +63,15 @@ def search(pool: ExplanationPool, options: Sequence[Option], most: int = DEEPEST
         frontier = pool.best_of(depth)[:BEAM]
     pool.progress.remaining(EXTENSION * (1 + len(pool.best.key)))
     pool.exchange_effects(options)
-    for _ in range(TURNS):
+    for _ in range(FINAL_ROUNDS):
         if pool.unexamined() < RARE:
             break
         pool.fit_unexamined()
     explanations = sorted(pool.explanations.values(), key=lambda e: -e.log_evidence)
     if pool.explanations[base.key] is not base:
         base = pool.explanations[base.key]
-        alarm = screen(base.fitter, base.fit, options)
+        null_screening = screen(base.fitter, base.fit, options)
     likeliest = explanations[0].fitter
-    screening = alarm if likeliest is base.fitter else screen(likeliest, base.fit, options)
-    shown = pairs_of(likeliest, base.fit, screening)
-    return SearchResult(base, tuple(explanations), alarm, shown, pool.unexamined())
+    screening = null_screening if likeliest is base.fitter else screen(likeliest, base.fit, options)
+    null_pairs = pairs_of(likeliest, base.fit, screening)
+    return SearchResult(base, tuple(explanations), null_screening, null_pairs, pool.unexamined())

@@ -19,9 +19,10 @@ from fdi_torch.simulate.linearised import Linearised
 # A descent ends if a further step is predicted to gain less than this share of the chi-square per reading, or of one if
 # that is more. Parameters are then within a tenth of a standard error, misfit included.
 DECREMENT = 0.01
-CAP = 200  # evaluations, a guard against descents without an end
-# A start is given up if it is so many chi-square units behind and gains less than a quarter of that in a step.
-BEHIND, SHARE = 30.0, 0.25
+MAX_EVALUATIONS = 200  # a guard against descents without an end
+# A start is given up if its chi-square exceeds that of the best other fit by GIVE_UP_DEFICIT, and one step reduces this
+# deficit by less than GIVE_UP_SHARE of it.
+GIVE_UP_DEFICIT, GIVE_UP_SHARE = 30.0, 0.25
 
 
 def first_lowest(cost: Tensor) -> int:
@@ -58,7 +59,7 @@ class Objective(Protocol):
 
 @dataclass(frozen=True)
 class FittedTrajectory:
-    """A linearised trajectory with its whitened Jacobian (L, S, C, P)."""
+    """Linearised trajectories of L lanes, with their whitened Jacobians (L, S, C, P)."""
 
     linearised: Linearised
     jacobian: Tensor
@@ -126,12 +127,12 @@ class TrajectoryProblem:
         cost = 0.5 * self.objective.chi_square(self.engine.space, theta, self.objective.residual(readings))
         return TrialTrajectory(cost, levels, readings)
 
-    def bend(self, known: Linearisation, trial: TrialTrajectory, step: Tensor) -> Tensor:
+    def nonlinearity(self, known: Linearisation, trial: TrialTrajectory, step: Tensor) -> Tensor:
         """J'c (L, P) for the second-order change c of the whitened readings along the step; priors are linear."""
         here = _fitted(known)
         linear = here.linearised.readings + _along(here.linearised.jacobian, step)
-        bend = self.objective.whiten(trial.readings - linear)
-        return (here.jacobian.flatten(1, 2).mT @ bend.flatten(1).unsqueeze(-1)).squeeze(-1)
+        nonlinearity = self.objective.whiten(trial.readings - linear)
+        return (here.jacobian.flatten(1, 2).mT @ nonlinearity.flatten(1).unsqueeze(-1)).squeeze(-1)
 
     def model(self, theta: Tensor, trial: TrialTrajectory) -> Linearisation:
         """Readings and Jacobian at the parameters of a trial step."""
@@ -174,14 +175,18 @@ def descend(
     theta: Tensor,
     readings: int,
     target: float = math.inf,
-    cap: int = CAP,
+    cap: int = MAX_EVALUATIONS,
     decrement: float = DECREMENT,
     box: tuple[Tensor, Tensor] | None = None,
 ) -> DescentResult:
-    """Least squares from theta (L, P). readings: number of valid ones. target: cost of a competitor, see BEHIND.
-    cap: maximum number of evaluations. decrement: as DECREMENT. box: bounds of each lane, low and high (L, P)."""
+    """Minimise chi-square from each of the starts theta (L, P).
+
+    readings: number of valid readings. target: chi-square of the best other fit, by which starts are given up
+    (GIVE_UP_DEFICIT). cap: maximum number of evaluations. decrement: Newton decrement at which a descent ends, by
+    default DECREMENT. box: lower and upper bounds of each start (L, P), by default those of the problem.
+    """
     # The optimiser's cost is a negative log-likelihood, half of chi-square.
-    competition = Competition(0.5 * BEHIND, SHARE, 0.5 * target)
+    competition = Competition(0.5 * GIVE_UP_DEFICIT, GIVE_UP_SHARE, 0.5 * target)
     share = decrement / max(readings, 1)
     settings = RefineSettings(cap, 0.5 * decrement, share, step_tolerance=0.0, competition=competition)
     low, high = box or problem.box[:2]

@@ -14,7 +14,7 @@ from torch import Tensor
 from fdi_torch.config.plant_writer import dump_plant, plant_mapping
 from fdi_torch.gap.answer import Answer
 from fdi_torch.gap.diagnose import solve_problem
-from fdi_torch.gap.problem import PLAIN, Settings, problem_of
+from fdi_torch.gap.problem import DEFAULT_SETTINGS, Settings, problem_of
 from fdi_torch.gap.stage_progress import SO_FAR
 from fdi_torch.jobs.log_paths import STARTS_OVER
 from fdi_torch.jobs.logged_recordings import log_prediction, log_recording
@@ -33,7 +33,7 @@ def run_gap(
     plant: PlantDescription,
     recording: Recording | Sequence[Recording],
     holdouts: Sequence[Recording] = (),
-    settings: Settings = PLAIN,
+    settings: Settings = DEFAULT_SETTINGS,
     tell: Tell = silent,
     parent_run_id: str | None = None,
 ) -> Answer:

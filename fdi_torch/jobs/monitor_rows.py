@@ -27,8 +27,6 @@ from fdi_torch.monitor.samples import GAP, Samples
 from fdi_torch.recording import Recording
 
 ALARM, CLOCK = "/observer/alarm", "/source/clock"
-Items = list[Row | str]
-"""Rows and notices."""
 FROM_SOURCE = "from_source"
 """Field of an alarm message: whether it is a notice about the delivery of samples."""
 

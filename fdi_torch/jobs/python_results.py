@@ -14,7 +14,7 @@ from fdi_torch.effects import build_network
 from fdi_torch.estimate.misfit import Misfit, misfit_of
 from fdi_torch.estimate.uncertainty import parameters_at_bounds
 from fdi_torch.gap.answer import Answer, adopted
-from fdi_torch.gap.constant_remarks import MOVED
+from fdi_torch.gap.constant_remarks import OFF_TOLERANCES
 from fdi_torch.gap.free_runs.between_runs import between_run_spread
 from fdi_torch.gap.free_runs.prediction import LeftOutRun, Prediction
 from fdi_torch.gap.free_runs.refit import Refit, narrowed
@@ -211,7 +211,7 @@ class RefitResult(Shown):
         remarks = [
             f"{name} lies {tolerances:.2g} tolerances from its value in the plant file"
             for name, tolerances in far.items()
-            if tolerances > MOVED
+            if tolerances > OFF_TOLERANCES
         ]
         return [*remarks, *(end_words(*each) for each in parameters_at_bounds(space, values).items())]
 

@@ -10,7 +10,7 @@ import torch
 from fdi_torch.config.loaded_recordings import known_segments_of, read_recording
 from fdi_torch.config.recording_config import RecordingConfig
 from fdi_torch.gap.preprocess.acquisition import FEWEST, examined
-from fdi_torch.gap.problem import LEAST
+from fdi_torch.gap.problem import MIN_READINGS
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import RecordingCheck, check_recording
@@ -38,10 +38,11 @@ def checked(config: RecordingConfig, plant: PlantDescription, base: Path) -> tup
         problems.insert(0, ChannelFinding("empty", sensor.column, text, {"samples": len(whole)}))
     silent = {sensor.column for sensor in empty}
     counts = zip(whole.output_names, whole.mask.sum(dim=0).tolist(), strict=True)
-    few = {name: count for name, count in counts if count < LEAST and name not in silent}
+    few = {name: count for name, count in counts if count < MIN_READINGS and name not in silent}
     if few:
         text = (
-            f"{min(few.values())} readings: fdi gap and fdi refit expect at least {LEAST}, of all recordings together"
+            f"{min(few.values())} readings: fdi gap and fdi refit expect at least {MIN_READINGS}, "
+            "of all recordings together"
         )
         if len(whole) < FEWEST:
             text += f"; units, swapped channels and clocks are examined from {FEWEST} samples on"

@@ -73,7 +73,10 @@ class FlowComponent(Component):
 
     @classmethod
     def example(cls, name: str, source: str, target: str) -> Self:
-        """A component of usual size for tanks of about 100 cm^2 and 50 cm, for the contract tests and the catalogue."""
+        """A component of usual size for tanks of about 100 cm^2 and 50 cm, for the contract tests and the catalogue.
+
+        With 5 cm of head it carries about as much as a pump of 70 cm^3/s, up to some times that.
+        """
         raise NotImplementedError
 
     def constants(self) -> list[tuple[str, str, str]]:

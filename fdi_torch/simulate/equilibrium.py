@@ -21,8 +21,9 @@ def equilibrium(network: TankNetwork, inputs: Float[Tensor, " channels"]) -> Flo
     """Levels (tanks,), m, at which dh/dt = 0 for constant inputs (channels,) and nominal constants.
 
     Pseudo-transient continuation (Kelley and Keyes, 1998): implicit Euler steps that double until they equal Newton's.
-    Along the trajectory, the tanks' volume rates never grow in sum (Jacquez and Simon, 1993); a step that makes them
-    grow, as Newton's beyond a kink at equal levels, is repeated with a quarter of its length.
+    Along the true trajectory, the sum of the tanks' absolute rates of volume never grows (Jacquez and Simon, 1993). A
+    step after which this sum has grown, as of Newton's method across the kink at equal levels, is repeated with a
+    quarter of its length.
     Raises ValueError if none is found.
     """
     values = network.bind(ParameterSpace(), inputs.new_zeros(0))

@@ -28,9 +28,8 @@ class PlantOde(nn.Module):
     The state holds the tanks' levels and then the states of effects, such as the flow of a pipe with inertia.
 
     network: the plant. space, theta (*batch, P): constants and effects that differ from their nominal values. inputs:
-    SI, one per input channel of the plant, in its order. resolution: time scale of the smoothing of square roots and
-    rims, s. Gradients flow to theta and x through every call; a new theta needs a new PlantOde. The device is that of
-    theta, else that of the inputs.
+    SI, one per input channel of the plant, in its order. Gradients flow to theta and x through every call; a new theta
+    needs a new PlantOde. The device is that of theta, else that of the inputs.
 
     Raises ValueError for an actuator with memory or dead time, whose output is not a function of t alone.
     """
@@ -41,8 +40,6 @@ class PlantOde(nn.Module):
         inputs: Inputs,
         space: ParameterSpace | None = None,
         theta: Tensor | None = None,
-        *,
-        resolution: float | None = None,
     ) -> None:
         super().__init__()
         space = space or ParameterSpace()
@@ -58,7 +55,7 @@ class PlantOde(nn.Module):
                 "engine of fdi_torch.set_up"
             )
         scale = time_scale(network.description)
-        self._instant, self._resolution = INSTANT * scale, like.new_tensor(resolution or RESOLUTION * scale)
+        self._instant, self._resolution = INSTANT * scale, like.new_tensor(RESOLUTION * scale)
         self._inputs = _function_of_time(inputs, network, like)
 
     @property

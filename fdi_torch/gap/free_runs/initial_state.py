@@ -27,9 +27,9 @@ from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Effect, Local, Placement, Stage, Values
 
-PARTS = 8  # parts of the segment
-SHARES = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3)  # inflow over the outflow of a full tank
-FINEST, COARSEST = 1e-5, 1e-2  # bounds of the noise, as shares of the sensor's span
+SEGMENT_PARTS = 8  # parts of the segment
+INFLOW_SHARES = (1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3)  # inflow over the outflow of a full tank
+MIN_NOISE, MAX_NOISE = 1e-5, 1e-2  # bounds of the noise, as shares of the sensor's span
 
 
 class UnknownInflow(Effect):
@@ -69,7 +69,7 @@ def estimate_initial_state(segment: DataSet, starts: Sequence[Mapping[str, float
     starts: of the initial levels, m. rough: sensor noise of the first fit, from which the noise is then estimated.
     """
     plant, seconds = segment.plant, float(segment.experiment.nodes[-1])
-    parts = max(1, min(PARTS, len(segment.recording) // 2))
+    parts = max(1, min(SEGMENT_PARTS, len(segment.recording) // 2))
     fitter = Fitter(segment, rough)
     plain = fitter.fit(Candidate(starts=tuple(starts)))
     fitter = Fitter(segment, _fine_noise(segment, plain))
@@ -77,7 +77,7 @@ def estimate_initial_state(segment: DataSet, starts: Sequence[Mapping[str, float
     fitted_values = {n: best.values[n] for n in plant.varying}
     nominal = {n: best.space[n].nominal for n in plant.varying}
     lowest = _negative_log_evidence(fitter, best)
-    for share in SHARES:
+    for share in INFLOW_SHARES:
         inflow = UnknownInflow(seconds, parts, share)
         placements = tuple(Placement(inflow, tank.name) for tank in plant.tanks)
         zero = {p.full_name(q.name): 0.0 for p in placements for q in inflow.parameters(p.location, plant)}
@@ -107,9 +107,9 @@ def _fine_noise(segment: DataSet, fit: Fit) -> Noise:
     The median is not used, since a sensor with coarse steps has equal readings most of the time.
     """
     span = torch.tensor([reading_span(segment.plant, s) for s in segment.plant.sensors], dtype=torch.float64)
-    residual, size = segment.readings - fit.linearised.readings[0], COARSEST * span
+    residual, size = segment.readings - fit.linearised.readings[0], MAX_NOISE * span
     valid = segment.mask[2:] & segment.mask[1:-1] & segment.mask[:-2]
     differences = (residual[2:] - 2.0 * residual[1:-1] + residual[:-2]) / math.sqrt(6.0)
     for c in valid.any(dim=0).nonzero().flatten().tolist():
         size[c] = differences[valid[:, c], c].square().mean().sqrt()
-    return Noise.white(torch.minimum(torch.maximum(size, FINEST * span), COARSEST * span))
+    return Noise.white(torch.minimum(torch.maximum(size, MIN_NOISE * span), MAX_NOISE * span))

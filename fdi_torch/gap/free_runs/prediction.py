@@ -37,7 +37,7 @@ from fdi_torch.simulate.collocation import Collocation
 START_SAMPLES = 50  # for the initial levels
 HALVINGS = 4  # halvings of the simulation step
 CONVERGED = 1e-5  # largest defect of a converged trajectory, in units of the plant's length scale
-NEARLY = 10.0  # in units of CONVERGED: a defect that shorter steps need not improve
+NEARLY_CONVERGED = 10.0  # in units of CONVERGED: a defect that shorter steps need not improve
 MOST_STEPS = 4000  # in the first attempt; levels change more slowly than close samples
 UNMEASURED_STARTS = (0.1, 0.25, 0.5, 0.8)  # initial levels, as shares of the height, of a tank without a sensor
 
@@ -95,7 +95,7 @@ def predict(
         data = data_set_of(plant, nominal_effects, recording, step)
         prediction, previous = _run(data, start_samples, skipped), defect
         defect = prediction.defect
-        stalled = defect < NEARLY * CONVERGED * length_scale(plant) and defect > 0.5 * previous
+        stalled = defect < NEARLY_CONVERGED * CONVERGED * length_scale(plant) and defect > 0.5 * previous
         if prediction.settled or stalled:  # an empty tank oscillates at its floor with any step
             break
         step *= 0.5

@@ -178,10 +178,10 @@ def _run_constants(fitter: Fitter, fit: Fit) -> tuple[RunConstant, ...]:
 
 def _initial_values(plant: PlantDescription, recordings: Sequence[Recording]) -> dict[str, float]:
     """Present values of the effects' parameters that a fit may change; limits that the readings show are not fitted."""
-    reach = operating_range_of_all(recordings, plant)
+    operating_range = operating_range_of_all(recordings, plant)
     start: dict[str, float] = {}
     for placed in plant.effects:
-        movable = {n for s in effect(placed.effect).starts(placed.location, plant, reach) for n in s}
+        movable = {n for s in effect(placed.effect).starts(placed.location, plant, operating_range) for n in s}
         if not effect(placed.effect).quantizes and not any(
             _is_limit_from_readings(placed, plant, r) for r in recordings
         ):

@@ -237,7 +237,7 @@ def _tank(place: str, plant: PlantDescription) -> DiscrepancyModel:
     tank = _index(plant, place)
 
     def signals(trajectory: Forcing) -> Signals:
-        level, rate = trajectory.levels[tank], trajectory.still[tank]
+        level, rate = trajectory.levels[tank], trajectory.unforced[tank]
         return {"level": level, "root": _root(level), "rate": rate, "one": torch.ones_like(level)}
 
     def terms(at: LocalSignals) -> list[Terms]:

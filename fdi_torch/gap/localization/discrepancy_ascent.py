@@ -28,7 +28,7 @@ from fdi_torch.gap.localization.single_regressor_gain import largest_influence
 from fdi_torch.gap.localization.sparse_regression import SparseFit, regressor_costs
 from fdi_torch.gap.localization.whitened_discrepancy import WhitenedDiscrepancy
 from fdi_torch.gap.marginal_likelihood import LinearParameters, estimate_disturbances, with_disturbances
-from fdi_torch.gap.trajectory_problem import SHARE
+from fdi_torch.gap.trajectory_problem import GIVE_UP_SHARE
 
 LESS_NOISE = (0.3, 0.1, 0.03, 0.01)  # random flows in successive regressions, as shares of the likeliest without one
 MOST_REGRESSORS = 100  # that a relevant law needs; a regression that so many steps would not save is given up
@@ -122,7 +122,7 @@ def gain_of(discrepancy: EvaluatedDiscrepancy | LocalizedDiscrepancy) -> float:
     return discrepancy.gain
 
 
-class Ascent:
+class DiscrepancyAscent:
     """Maximises the evidence of a discrepancy beside a fit: over its noise, its regressors, and the fit's parameters.
 
     fitter: with the disturbance noise without the discrepancy. level_filter: predicts the levels. base: log evidence of
@@ -177,7 +177,7 @@ class Ascent:
         regression = DiscrepancyRegression(right, fit, selection.frequencies, self.level_filter)
         return self.evaluate(regression, regression.of(place, selection.positions), place, noise, selection.precision)
 
-    def under_less_and_less_noise(
+    def with_decreasing_noise(
         self, regression: DiscrepancyRegression, place: str, noise: StateNoise
     ) -> EvaluatedDiscrepancy:
         """The likeliest discrepancy at a place under this noise or under ones with smaller random flows.
@@ -203,14 +203,14 @@ class Ascent:
             best = self.with_finer_positions(best)
             if turn == 0 or bool((best.regressed.used & best.discrepancy.sinusoids).any()):
                 best = max(best, self._with_finer_frequency(best), key=gain_of)
-            if best.gain < max(not_refitted + TOLERANCE, SHARE * (needed - best.gain)):
+            if best.gain < max(not_refitted + TOLERANCE, GIVE_UP_SHARE * (needed - best.gain)):
                 break
             refitted = self._refitted(best)
             if refitted.gain > best.gain:
                 best = refitted
             else:
                 not_refitted = best.gain
-            if best.gain - before < max(TOLERANCE, SHARE * (needed - best.gain)):
+            if best.gain - before < max(TOLERANCE, GIVE_UP_SHARE * (needed - best.gain)):
                 break
         return best
 

@@ -19,7 +19,7 @@ from fdi_torch.estimate.evidence import RARE, TOLERANCE
 from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.localization.discrepancy_ascent import Ascent, gain_of
+from fdi_torch.gap.localization.discrepancy_ascent import DiscrepancyAscent, gain_of
 from fdi_torch.gap.localization.discrepancy_regression import DiscrepancyRegression
 from fdi_torch.gap.localization.fine_positions import FREQUENCY_ERROR
 from fdi_torch.gap.localization.localized_discrepancy import (
@@ -96,7 +96,7 @@ def localize(
     itself = max(evidence - base, 0.0)
     if not places:
         return Localization((), itself)
-    ascent = Ascent(fitter, regression.level_filter, base)
+    ascent = DiscrepancyAscent(fitter, regression.level_filter, base)
     noises = likely, nearly_without_disturbances(likely)
     first_order = _first_order_gains(regression, noises, places, base)
     if hopeless and all(expected < needed for expected, _ in first_order.values()):
@@ -106,7 +106,7 @@ def localize(
     for place, (expected, alone) in sorted(first_order.items(), key=lambda item: -item[1][0]):
         if any(shortfall.excludes(expected, alone, needed) for shortfall in (earlier, here)):
             continue
-        best = ascent.climbed(ascent.under_less_and_less_noise(regression, place, likely), needed)
+        best = ascent.climbed(ascent.with_decreasing_noise(regression, place, likely), needed)
         step()
         for shortfall in (earlier, here):
             shortfall.note(best.gain, expected, alone)
@@ -120,7 +120,7 @@ def localize(
         period = max(evaluated.values(), key=gain_of).periods[0]
         periodic = DiscrepancyRegression(fitter, fit, [1.0 / period], regression.level_filter)
     for at in others:
-        again = ascent.climbed(ascent.under_less_and_less_noise(periodic, at.location, likely), needed)
+        again = ascent.climbed(ascent.with_decreasing_noise(periodic, at.location, likely), needed)
         evaluated[at.location] = max(at, again.localized(fitter), key=gain_of)
     processes = [*drifting_sensors(regression, likely, places, base, needed)]
     processes += random_flows(regression, likely, places, base, needed)
@@ -188,7 +188,7 @@ def localize_beside(
         processes = [*drifting_sensors(regression, likely, [at.location], base, needed)]
         processes += random_flows(regression, likely, [at.location], base, needed)
         return max(processes, key=gain_of, default=None)
-    ascent = Ascent(fitter, at.level_filter, base)
+    ascent = DiscrepancyAscent(fitter, at.level_filter, base)
     first = ascent.about(fit, at.explained, at.noise, at.location, at.selection)
     return ascent.climbed(ascent.with_finer_positions(first), needed).localized(fitter)
 

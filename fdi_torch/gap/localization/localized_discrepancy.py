@@ -49,7 +49,7 @@ class Estimate:
     def log_density(
         self, i: int, value: float, bounds: tuple[float, float], held: Mapping[int, float] | None = None
     ) -> float:
-        """Log density of parameter i at a value: normal between its bounds, and zero outside.
+        """Log density of parameter i at a value: that of a normal distribution truncated at its bounds.
 
         held: given values of other parameters. If the readings show nothing of the parameter, the density is uniform
         between its bounds.
@@ -72,13 +72,13 @@ class Estimate:
 class LocalizedDiscrepancy:
     """A discrepancy at one component, in addition to a fit.
 
-    gain: in log evidence against the fit alone, without prior odds. log_likelihood: gain in it against the fit alone,
-    by this effective number of parameters. explained: its influence on the readings (S, C); none of a random process.
-    predicted (S, C): the readings with it; None of a random process. size: norm of the part of it that no parameter of
-    the fit explains, in units of the sensor noise. selection: its regressors; None of a random process. fit, noise: the
-    fit refitted, and the most likely disturbance noise, with the discrepancy. estimate: of the fit's parameters beside
-    it. level_filter: predicts the levels about which its plant is linearised. quantities: what it changes, of 'area'
-    (of a tank) and 'flow' (or the reading of a sensor).
+    gain: increase of the log evidence over that of the fit alone, without prior odds. log_likelihood: increase of the
+    log-likelihood, by `parameters`, its effective number of parameters. explained (S, C): its influence on the
+    readings; zero for a random process. predicted (S, C): the readings with it; None for a random process. size: norm
+    of the part of it that no parameter of the fit explains, in units of the sensor noise. selection: its regressors;
+    None for a random process. fit, noise: the fit and the most likely disturbance noise, both estimated with the
+    discrepancy. estimate: of the fit's parameters beside it. level_filter: predicts the levels about which the plant is
+    linearised. quantities: what it changes: 'area' (of a tank), 'flow' (or the reading of a sensor), or both.
     """
 
     location: str

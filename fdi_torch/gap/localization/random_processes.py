@@ -29,7 +29,7 @@ from fdi_torch.gap.localization.localized_discrepancy import (
     nearly_without_disturbances,
 )
 from fdi_torch.gap.marginal_likelihood import estimate_disturbances, with_disturbances
-from fdi_torch.gap.trajectory_problem import SHARE
+from fdi_torch.gap.trajectory_problem import GIVE_UP_SHARE
 from fdi_torch.simulate.linearised import Linearised
 
 SMALLEST_DRIFT = 0.1  # as a share of the sensor's noise
@@ -100,12 +100,12 @@ def _most_likely(
 ) -> tuple[float, StateNoise]:
     """The largest gain of a random process, and its most likely parameters.
 
-    Its correlation time stays that of `start` if its gain is then below SHARE of what it lacks to be relevant.
+    Its correlation time stays that of `start` if its gain is then below GIVE_UP_SHARE of what it lacks to be relevant.
     """
     fitter, fit = regression.fitter, regression.fit
     first = estimate_disturbances(fitter, fit, linearised, start=start, climb=False).noise
     gain = gain_under(first)
-    if gain < SHARE * (needed - gain):
+    if gain < GIVE_UP_SHARE * (needed - gain):
         return gain, first
     climbed = estimate_disturbances(fitter, fit, linearised, start=first).noise
     return max((gain, first), (gain_under(climbed), climbed), key=lambda f: f[0])

@@ -6,7 +6,7 @@ With the columns C of all regressors, the parameters of a fit projected out, the
 
 need only r and z mapped back through the noise whitening, the sensors and the linearised plant to the flow into each
 tank at each time. A whole network costs hardly more than one component. The result tells for which places the full
-regression (`discrepancy_regression.py`) is worth its cost.
+regression (`discrepancy_regression.py`) is worth its computing time.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class SingleRegressorGains:
         return max(gains, key=lambda g: g.net)
 
     def _adjoints_at(self, place: str) -> Adjoints:
-        """The adjoints; of a sensor with the residual about the model's level of its tank."""
+        """The adjoints at a place. For a sensor, the residual is that about the simulated level of its tank."""
         if self.regression.sensor(place) is None:
             return self._adjoints
         fit, linearised = self.regression.fit, self.regression.at(place)[1]
@@ -149,7 +149,7 @@ def strengths_of(products: Tensor) -> Tensor:
 
 
 def whitened_residual(under: Fitter, fit: Fit, linearised: Linearised) -> Tensor:
-    """Whitened residual and prior residual of the parameters, (S C + P, 1)."""
+    """Whitened residual of the readings, and below it that of the parameters' priors: (S C + P, 1)."""
     off = under.priors(fit.space, fit.theta)[2]
     return torch.cat([under.residual(linearised.readings).flatten(), -off]).unsqueeze(1)
 

@@ -25,7 +25,7 @@ from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet, data_set_of
-from fdi_torch.gap.trajectory_problem import BEHIND, CAP, SHARE
+from fdi_torch.gap.trajectory_problem import GIVE_UP_DEFICIT, GIVE_UP_SHARE, MAX_EVALUATIONS
 from fdi_torch.parameters import ParameterName
 from fdi_torch.plant.constants import flow_scale, reading_span
 from fdi_torch.plant.description import PlantDescription
@@ -141,7 +141,7 @@ def blockwise_fit(
     blocked: BlockedRecording,
     candidate: Candidate = Candidate(),  # noqa: B008
     base: BlockwiseFit | None = None,
-    cap: int = CAP,
+    cap: int = MAX_EVALUATIONS,
     target: float = -math.inf,
 ) -> BlockwiseFit:
     """Fit the plant, with the effects of a candidate, within its tolerances.
@@ -163,7 +163,7 @@ def blockwise_fit(
         variance = blocked.variance(data.readings - fit.linearised.readings[0])
         fitted = BlockwiseFit(blocked, fit, variance, means, prior_chi_square(fit, fit.theta))
         behind = target - fitted.log_likelihood
-        if behind > 0.5 * BEHIND and fitted.log_likelihood - before < SHARE * behind:
+        if behind > 0.5 * GIVE_UP_DEFICIT and fitted.log_likelihood - before < GIVE_UP_SHARE * behind:
             break
         before = fitted.log_likelihood
     return fitted

@@ -21,22 +21,27 @@ from fdi_torch.gap.dataset import DataSet, at_recorded_times
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.repeated_readings import resolution
 
-FAR = 5.0  # size of a jump in usual differences of neighbours: seven standard deviations of white noise
-LATE = 3.0  # samples of timing error; the change that the slope makes of them is no jump
-WING = 5  # samples to either side, whose median is the undisturbed reading
-BACK = 0.3  # share of an outlier's height to within which the reading must return
-ENOUGH = 100  # fewest readings of a sensor
-RETURNS = 8  # jumps after one with which it may return; a spike returns with the next
-MOST = 0.1  # share of a sensor's readings beyond which they are no outliers but its normal behaviour
+JUMP_THRESHOLD = 5.0  # in usual differences of neighbours, that is seven standard deviations of white noise
+TIMING_ERROR = 3.0  # samples; a change that the slope of the level makes within this time is no jump
+HALF_WINDOW = 5  # samples before and after a jump, whose median is the undisturbed reading
+RETURN_SHARE = 0.3  # of an outlier's height, to within which the reading must return
+MIN_READINGS = 100  # of a sensor
+RETURN_CANDIDATES = 8  # jumps after one that may end it; a spike ends with the next
+LARGEST_SHARE = 0.1  # of a sensor's readings; more of them are no outliers but its normal behaviour
 PASSES = 3  # each with a fit that leaves out the outliers found before
-CLEAR = 1.4  # times FAR; the median outlier of heavy-tailed noise is nearer (Laplace 1.1, Student with 3 degrees 1.26)
-EVENTS, SAMPLES = 3, 6  # so many outliers, or samples in all, mean that something is wrong with the sensor
+# In units of JUMP_THRESHOLD; the median outlier of heavy-tailed noise is smaller (Laplace 1.1, Student's t with three
+# degrees of freedom 1.26).
+CLEAR_FACTOR = 1.4
+MIN_OUTLIERS, MIN_SAMPLES = 3, 6  # with so many outliers, or samples in all, something is wrong with the sensor
 
 
 @dataclass(frozen=True)
 class Outlier:
-    """Outliers of one sensor in succession. rows: their samples. times: of the first and the last, s. jumps: their
-    height over the usual difference of neighbouring readings; infinite for stuck readings."""
+    """One run of successive outlying readings of a sensor.
+
+    rows: their samples. times: of the first and the last, s. jumps: their height over the usual difference of
+    neighbouring readings; infinite for stuck readings.
+    """
 
     rows: slice
     times: tuple[float, float]
@@ -56,11 +61,11 @@ class SensorOutliers:
         return sum(s.rows.stop - s.rows.start for s in self.each)
 
     @property
-    def clear(self) -> bool:
-        """Whether they are more than an accident, and more than heavy-tailed noise makes."""
-        far = [s.jumps for s in self.each if s.jumps > FAR]
-        many = len(self.each) >= EVENTS or self.samples >= SAMPLES
-        return many and bool(far) and median(far) > CLEAR * FAR
+    def significant(self) -> bool:
+        """Whether they show a faulty sensor: more than a few, and larger than those of heavy-tailed noise."""
+        far = [s.jumps for s in self.each if s.jumps > JUMP_THRESHOLD]
+        many = len(self.each) >= MIN_OUTLIERS or self.samples >= MIN_SAMPLES
+        return many and bool(far) and median(far) > CLEAR_FACTOR * JUMP_THRESHOLD
 
 
 def outliers_of(recording: Recording, lay_out: Callable[[Sequence[Recording]], DataSet]) -> tuple[SensorOutliers, ...]:
@@ -74,7 +79,9 @@ def outliers_of(recording: Recording, lay_out: Callable[[Sequence[Recording]], D
             c = recording.output_names.index(sensor.column)
             new_outliers = _channel_outliers(masked, model[:, i], c)
             new_mask = without(mask, new_outliers, c)
-            if new_outliers and int((recording.mask & ~new_mask)[:, c].sum()) <= MOST * int(recording.mask[:, c].sum()):
+            if new_outliers and int((recording.mask & ~new_mask)[:, c].sum()) <= LARGEST_SHARE * int(
+                recording.mask[:, c].sum()
+            ):
                 outliers.setdefault(sensor.name, []).extend(new_outliers)
                 mask = new_mask
         if mask is masked.mask:
@@ -88,9 +95,9 @@ def outliers_of(recording: Recording, lay_out: Callable[[Sequence[Recording]], D
 
 
 def sensor_with_outliers(sensors: Sequence[SensorOutliers]) -> str | None:
-    """The sensor with most outlying readings, if they are more than an accident."""
-    clear = [s for s in sensors if s.clear]
-    return max(clear, key=lambda s: s.samples).sensor if clear else None
+    """The sensor with the most outlying readings, if they show that it is faulty."""
+    faulty = [s for s in sensors if s.significant]
+    return max(faulty, key=lambda s: s.samples).sensor if faulty else None
 
 
 def without(mask: Tensor, outliers: Sequence[Outlier], channel: int) -> Tensor:
@@ -111,7 +118,7 @@ def _fitted_readings(data: DataSet) -> Tensor:
 def _channel_outliers(recording: Recording, model: Tensor, channel: int) -> list[Outlier]:
     """Outliers of one channel of a recording whose readings a model (S,) predicts."""
     at = recording.mask[:, channel].nonzero().flatten()
-    if len(at) < ENOUGH:
+    if len(at) < MIN_READINGS:
         return []
     values, predicted, time = recording.outputs[at, channel], model[at], recording.time[at]
     spans = jumps_and_returns(values - predicted, torch.diff(predicted).abs(), resolution(values))
@@ -129,25 +136,25 @@ def jumps_and_returns(x: Tensor, slope: Tensor, least: float) -> list[tuple[int,
     """
     change = torch.diff(x)
     usual = max(1.4826 * float((change - change.median()).abs().median()), least)
-    movement = torch.nn.functional.max_pool1d(slope.reshape(1, 1, -1), 2 * WING + 1, 1, WING).flatten()
-    limit = FAR * usual + LATE * movement
+    movement = torch.nn.functional.max_pool1d(slope.reshape(1, 1, -1), 2 * HALF_WINDOW + 1, 1, HALF_WINDOW).flatten()
+    limit = JUMP_THRESHOLD * usual + TIMING_ERROR * movement
     jumps = (change.abs() > limit).nonzero().flatten().tolist()
-    longest, values = int(MOST * len(x)), x.tolist()
+    longest, values = int(LARGEST_SHARE * len(x)), x.tolist()
     if len(jumps) > 2 * longest:
         return []
     segments: list[tuple[int, int, float]] = []
     for n, last in enumerate(jumps):
         if segments and last < segments[-1][1]:
             continue
-        before = median(values[max(last + 1 - WING, 0) : last + 1])
-        for back in jumps[n + 1 : n + 1 + RETURNS]:
+        before = median(values[max(last + 1 - HALF_WINDOW, 0) : last + 1])
+        for back in jumps[n + 1 : n + 1 + RETURN_CANDIDATES]:
             if back - last > longest:
                 break
-            block, following = values[last + 1 : back + 1], values[back + 1 : back + 1 + WING]
+            block, following = values[last + 1 : back + 1], values[back + 1 : back + 1 + HALF_WINDOW]
             middle = 0.5 * (before + median(following))
             height = median(abs(v - middle) for v in block)
             mismatch = max(abs(median(following) - before), abs(following[0] - middle), abs(values[last] - middle))
-            if height > float(limit[last]) and mismatch < BACK * height:
+            if height > float(limit[last]) and mismatch < RETURN_SHARE * height:
                 # The samples before and after, as many as the block has, decide which of the two is the outlier.
                 around = values[max(2 * last + 1 - back, 0) : last + 1] + values[back + 1 : 2 * back + 1 - last]
                 if median(abs(v - median(around)) for v in block) > 0.5 * height:

@@ -103,9 +103,9 @@ def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str], target: float
     ranges = operating_range_of_all([blocked.recording], plant)
     for _ in range(MOST_EFFECTS):
         fit, fitter = parent.fit, parent.fitter
-        reach = with_simulated_levels(ranges, plant, fit.linearised.levels[0])
+        operating_range = with_simulated_levels(ranges, plant, fit.linearised.levels[0])
         further = [p for p in library if p.prefix not in known and p.cause not in fit.key]
-        screening = screen(fitter, fit, options_of(further, fitter, reach))
+        screening = screen(fitter, fit, options_of(further, fitter, operating_range))
         best: dict[tuple[str, str], Option] = {}
         for k in torch.argsort(screening.gain, descending=True).tolist():
             best.setdefault(screening.options[k].cause, screening.options[k])

@@ -39,13 +39,13 @@ def swapped(a: str, b: str) -> RecordingFault:
 
 
 def clock_offset(columns: tuple[str, ...], delay: float, everything: bool) -> RecordingFault:
-    """Readings are `delay` seconds late. everything: all of them, against the inputs."""
+    """Time stamps of readings that are `delay` seconds late. everything: all readings are, relative to the inputs."""
     what = "the readings" if everything else ", ".join(columns)
     reference = "the inputs" if everything else "the other channels"
     fix = ", ".join([f"t: {{shift: {-delay:.3g} s}}", *(f"{column}: {{column: {column}}}" for column in columns)])
     text = (
-        f"{what}: stamped {abs(delay):.3g} s too {'late' if delay > 0 else 'early'}, by the times of {reference}; "
-        f"if that is a fault of the clock, name the file once more, with another shift: also: "
+        f"{what}: time stamps are {abs(delay):.3g} s too {'late' if delay > 0 else 'early'} compared with {reference}; "
+        f"if their clock is wrong, read these columns from the file a second time with a shifted clock: also: "
         f"[{{file: ..., columns: {{{fix}}}}}]"
     )
     return RecordingFault(("all",) if everything else columns, text, physical=not everything)

@@ -18,7 +18,7 @@ from fdi_torch.report.style import BAR_NAME, bar_panel
 
 MOST_BARS = 10
 LEAST_SHOWN = 1e-3  # of a probability that gets a bar
-CONTENT = 0.95  # probability of the plausible explanations together
+CREDIBLE_LEVEL = 0.95  # probability of the plausible explanations together
 
 
 def where_section(material: Material) -> Section | None:
@@ -76,7 +76,7 @@ def _content(answer: Mapping[str, Any]) -> list[list[Mapping[str, Any]]]:
     """The fewest explanations with 95 % of the probability together."""
     total, chosen = 0.0, []
     for item in answer.get("posterior", []):
-        if total >= CONTENT:
+        if total >= CREDIBLE_LEVEL:
             break
         total += as_float(item.get("probability"))
         chosen.append(causes_of(item))
