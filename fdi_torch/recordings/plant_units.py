@@ -211,7 +211,11 @@ def _reading_corrections(
         number = {"m": "level", "Pa": "pressure"}.get(kind)
         written = _written(kind, columns[0], recording) if number else ""
         names = f"the {number} {columns[0]} is" if len(columns) == 1 else f"the {number}s {', '.join(columns)} are"
+        alone = len(sensors) < sum(s.unit == kind for s in plant.sensors)
         for right, ratio in _other_units(kind, written) if number else ():
+            # Of a sensor alone, a factor such as that of inches is rather due to swapped sensors or an effect.
+            if alone and not _is_power_of_ten(ratio):
+                continue
             if balance := _with_readings(plant, recording, columns, ratio):
                 yield Correction(names, written, right, ratio, balance, columns)
 
@@ -249,6 +253,11 @@ def _other_units(kind: str, written: str) -> list[tuple[str, float]]:
     """The usual units of this kind other than the written one, and the ratio of the written one to them."""
     ratios = {unit: unit_factor(written, kind) / unit_factor(unit, kind) for unit in UNITS[kind]}
     return [(unit, ratio) for unit, ratio in ratios.items() if abs(ratio - 1.0) > 1e-6]
+
+
+def _is_power_of_ten(ratio: float) -> bool:
+    decade = math.log10(ratio)
+    return abs(decade - round(decade)) < 1e-6
 
 
 def _written(kind: str, channel: str, recording: Recording) -> str:
