@@ -32,7 +32,7 @@ from fdi_torch.units import same_kind
 UNITS = {
     "m": ("mm", "cm", "in", "dm", "ft", "m"),
     "Pa": ("Pa", "mbar", "kPa", "psi", "bar"),
-    "m^2": ("mm^2", "cm^2", "in^2", "dm^2", "ft^2", "m^2"),
+    "m^2": ("mm^2", "cm^2", "dm^2", "m^2"),
     "m^3/s": ("ml/min", "cm^3/s", "l/h", "l/min", "gal/min", "l/s", "m^3/h", "m^3/s"),
     "s": ("ms", "s", "min", "h"),
 }
