@@ -271,12 +271,19 @@ def test_runs_are_compared_in_python_as_by_the_command(tmp_path: Path) -> None:
     found = fdi_torch.compare(logs)
     estimates = {row[0]: row for row in zip(*found.table().columns.values(), strict=True)}
     names = ["parameter", "unit", "seed3", "seed3 std error", "seed4", "seed4 std error", "p", "agree"]
-    assert list(found.table().columns) == names
+    assert list(found.table().columns) == [*names, "difference, std errors"]
     for name, wanted in zip(("A.leak.size", "A.start_level"), ("1", "mm"), strict=True):
         (result,) = (each for each in found.comparison.results if each.name == name)
         scale = 1000.0 if wanted == "mm" else 1.0
         numbers = [scale * x for pair in zip(result.values, result.std, strict=True) for x in pair]
-        assert estimates[name] == (name, wanted, *map(pytest.approx, numbers), result.p_value, result.agree)
+        assert estimates[name] == (
+            name,
+            wanted,
+            *map(pytest.approx, numbers),
+            result.p_value,
+            result.agree,
+            result.apart,
+        )
     assert found.headline.startswith("seed3: Single fault: leak at A") and found.headline.endswith(
         "there they agree at 95 %."
     )
