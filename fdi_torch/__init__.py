@@ -7,6 +7,7 @@ Some functions share their name with the package that implements them: `fdi_torc
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
@@ -64,8 +65,15 @@ class _CallableModule(ModuleType):
 
     @property
     def __doc__(self) -> str | None:  # type: ignore[override]
-        """The function's documentation, for `help` in a notebook."""
-        return self.__wrapped__.__doc__
+        """The function's signature and documentation: `help` of a module shows no signature otherwise."""
+        import inspect  # takes a while to load
+
+        function = self.__wrapped__
+        signature = inspect.signature(function)
+        names = [p.replace(annotation=p.empty) for p in signature.parameters.values()]
+        short = str(signature.replace(parameters=names, return_annotation=signature.empty))
+        short = re.sub(r"<function (\w+) at \w+>", r"\1", short)  # a default
+        return f"{function.__name__}{short}\n\n{inspect.getdoc(function)}"
 
     @property
     def __wrapped__(self) -> Callable[..., Any]:

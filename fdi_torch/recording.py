@@ -144,16 +144,29 @@ class Recording(Shown):
         ]
         return Table(("channel", "role", "unit", "lowest", "highest", "missing"), rows)
 
-    def to_pandas(self) -> Any:
+    def __repr__(self) -> str:
+        return "\n".join([super().__repr__(), *(f"- {note}" for note in self.notes)])
+
+    def to_pandas(self, own_units: bool = False) -> Any:
         """A pandas.DataFrame (extra `pandas`): one column per channel in SI, indexed by time in s; masked readings are
         NaN.
 
-        Its `attrs["units"]` holds the unit of each column.
+        Its `attrs["units"]` holds the unit of each column. own_units: in the units in which the channels were written,
+        which the columns name: 'h1 [cm]'. `read_frame` reads both.
         """
         frame = needed("pandas").DataFrame(self._columns(), index=self.time.cpu().numpy())
         frame.index.name = "t"
         frame.attrs["units"] = {"t": "s"} | self._units()
-        return frame
+        return self._in_own_units(frame) if own_units else frame
+
+    @in_its_units
+    def _in_own_units(self, frame: Any) -> Any:
+        shown = {name: in_display_unit(name, unit, 1.0) for name, unit in self._units().items()}
+        for name, (_, factor) in shown.items():
+            frame[name] *= factor
+        frame.attrs = {}
+        names = {name: f"{name} [{unit}]" for name, (unit, _) in shown.items()}
+        return frame.rename(columns=names).rename_axis("t [s]")
 
     def to_xarray(self) -> Any:
         """An xarray.Dataset (extra `xarray`): one variable per channel in SI over `time` in s; masked readings

@@ -271,12 +271,19 @@ def test_runs_are_compared_in_python_as_by_the_command(tmp_path: Path) -> None:
     found = fdi_torch.compare(logs)
     estimates = {row[0]: row for row in zip(*found.table().columns.values(), strict=True)}
     names = ["parameter", "unit", "seed3", "seed3 std error", "seed4", "seed4 std error", "p", "agree"]
-    assert list(found.table().columns) == names
+    assert list(found.table().columns) == [*names, "difference, std errors"]
     for name, wanted in zip(("A.leak.size", "A.start_level"), ("1", "mm"), strict=True):
         (result,) = (each for each in found.comparison.results if each.name == name)
         scale = 1000.0 if wanted == "mm" else 1.0
         numbers = [scale * x for pair in zip(result.values, result.std, strict=True) for x in pair]
-        assert estimates[name] == (name, wanted, *map(pytest.approx, numbers), result.p_value, result.agree)
+        assert estimates[name] == (
+            name,
+            wanted,
+            *map(pytest.approx, numbers),
+            result.p_value,
+            result.agree,
+            result.apart,
+        )
     assert found.headline.startswith("seed3: Single fault: leak at A") and found.headline.endswith(
         "there they agree at 95 %."
     )
@@ -609,6 +616,24 @@ def test_a_recording_comes_back_from_its_data_frame() -> None:
     again = fdi_torch.read_frame(recording.to_pandas(), RIG)
     assert torch.equal(again.time, recording.time) and torch.equal(again.inputs, recording.inputs)
     assert torch.equal(again.outputs, recording.outputs) and again.source == "data frame"
+
+
+def test_a_data_frame_in_the_user_s_units_names_them_and_is_read_again() -> None:
+    pytest.importorskip("pandas")
+    rig = replace(RIG, units={**RIG.units, "m": "mm", "m^3/s": "l/min"})
+    recording = fdi_torch.simulate(rig, inputs=STEPS, duration="300 s")
+    frame = recording.to_pandas(own_units=True)
+    assert list(frame.columns) == ["Q [l/min]", "h [mm]"] and frame.index.name == "t [s]"
+    assert frame["h [mm]"].to_numpy() == pytest.approx(1000.0 * recording.outputs[:, 0].numpy())
+    again = fdi_torch.read_frame(frame, rig)
+    torch.testing.assert_close(again.outputs, recording.outputs, rtol=1e-12, atol=0.0)
+    torch.testing.assert_close(again.inputs, recording.inputs, rtol=1e-12, atol=0.0)
+
+
+def test_a_simulation_beyond_the_limits_of_a_pump_says_so() -> None:
+    limit = RIG.pumps[0].max_flow
+    recording = fdi_torch.simulate(RIG, inputs={"Q": f"{2e6 * limit:g} cm^3/s"}, duration="60 s")
+    assert repr(recording).splitlines()[-1].startswith("- Q asks for up to ")
 
 
 def test_a_recording_comes_back_from_its_csv_file(tmp_path: Path) -> None:

@@ -272,6 +272,23 @@ def test_a_wrong_unit_concerns_the_sensors_of_its_kind(
     assert sentence in wrong_units(plant, wrong)
 
 
+@pytest.mark.parametrize("gain", [1.0, 0.9])
+def test_levels_in_inches_that_the_file_calls_centimetres_are_named(folder: Path, gain: float) -> None:
+    """All sensors share one factor, that of two units; a gain of each sensor would explain it as well."""
+    plant = load_plant(folder / "rig.yaml")
+    run = recorded(plant, {"Q.pump_gain": gain})
+    wrong = replace(run, outputs=run.outputs / 2.54, written={"hA": "cm", "hB": "cm"})
+    assert "the levels hA, hB are 2.54 times too small (write in in place of cm)" in wrong_units(plant, wrong)
+
+
+def test_one_level_off_by_the_ratio_of_an_inch_is_not_said_to_be_in_inches(folder: Path) -> None:
+    plant = load_plant(folder / "rig.yaml")
+    run = recorded(plant, {})
+    factors = torch.tensor([1.0 / 2.54, 1.0], dtype=torch.float64)
+    wrong = replace(run, outputs=factors * run.outputs, written={"hA": "cm", "hB": "cm"})
+    assert wrong_units(plant, wrong) == "" and doubtful_units(plant, wrong) == []
+
+
 STEADY: dict[str, Any] = {"inputs": {"Q1": "50 cm^3/s", "Q2": "50 cm^3/s"}, "duration": "600 s"}
 STEADY |= {"noise": {"std": {"h1": "1 mm", "h2": "1 mm", "h3": "1 mm"}}}
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import pydoc
 import subprocess
 import sys
 
@@ -43,6 +45,19 @@ assert len(effects()) == len(effects.EFFECTS) and fdi_torch.gap.answer is answer
 assert fdi_torch.simulate.experiment.Experiment
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("name", ["gap", "train", "monitor", "simulate", "study", "report", "effects"])
+def test_help_of_a_function_with_a_package_s_name_begins_with_its_signature(name: str) -> None:
+    function = getattr(fdi_torch, name)
+    first, empty, said, *_ = pydoc.getdoc(function).splitlines()
+    assert first.startswith(f"{name}(") and all(p in first for p in inspect.signature(function).parameters)
+    assert "'Any" not in first and not empty and said
+    assert f"fdi_torch.{name} - {first}" in pydoc.plain(pydoc.render_doc(function))
+
+
+def test_public_names_are_completed() -> None:
+    assert set(fdi_torch.__all__) <= set(dir(fdi_torch))
 
 
 def test_tensors_in_tensors_out() -> None:

@@ -269,7 +269,7 @@ def test_valve_in_percent_taken_for_a_share() -> None:
     )
     assert found(check_recording(recording, rig), "unit") == (
         "vLM",
-        "opens from 60 to 60 where 0 is closed and 1 is open: is its unit right (pct)?",
+        "opens from 6000 % to 6000 %, where 100 % is fully open: is its unit right (pct)?",
     )
 
 

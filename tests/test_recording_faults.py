@@ -132,6 +132,37 @@ def test_a_thorough_examination_finds_a_swap_beside_a_leak(seed: int, size: floa
     assert thorough_findings(plant, [sound, swapped]) == (swap_of("hA", "hB"),)
 
 
+def test_effects_that_explain_a_swap_as_far_as_they_can_do_not_hide_it() -> None:
+    """They compete with the swap by the same likelihood; those of the sound recording win."""
+    plant, leak = bench(), Placement(effect("leak"), "A")
+    sound = recorded(plant, random_steps(plant, 600.0, seed=6), {"A.leak.size": 0.3}, 6)
+    swapped = replace(sound, outputs=sound.outputs[:, [1, 0]])
+    best = Candidate(
+        (leak, Placement(effect("sensor_gain"), "hA")), ({"A.leak.size": 0.3, "hA.sensor_gain.factor": 0.8},)
+    )
+    assert examined(plant, swapped).thorough_finding(best) == swap_of("hA", "hB")
+    assert examined(plant, sound).thorough_finding(Candidate((leak,), ({"A.leak.size": 0.3},))) == ""
+
+
+def test_a_thorough_examination_repeats_no_fit_of_the_plain_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant, fits = bench(), 0
+    sound = recorded(plant, random_steps(plant, 600.0, seed=6), {"A.leak.size": 0.3}, 6)
+    original = Fitter.fit
+
+    def counted(self: Fitter, *arguments: object, **options: object) -> object:
+        nonlocal fits
+        fits += 1
+        return original(self, *arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Fitter, "fit", counted)
+    examined(plant, sound, thorough=True)
+    at_once, fits = fits, 0
+    checked = examined(plant, sound)
+    assert fits
+    checked.thorough_finding()
+    assert fits == at_once
+
+
 EFFECTS = ("leak", "plugging", "pump_gain", "sensor_gain", "sensor_bias")
 
 

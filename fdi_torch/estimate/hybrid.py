@@ -37,6 +37,7 @@ from fdi_torch.estimate.uncertainty import Estimate, make_estimate
 from fdi_torch.plant.scales import time_scale
 from fdi_torch.simulate.engine import Engine
 from fdi_torch.simulate.step_length import choose_step, probe_points, step_ladder
+from fdi_torch.tables import Shown, Table, in_its_units
 
 # The longest step of the first probing simulation, in units of the plant's time scale.
 FIRST_STEP = 5.0
@@ -44,8 +45,8 @@ FIRST_STEP = 5.0
 PROBE_SAMPLES = 20_000
 
 
-@dataclass(frozen=True)
-class HybridResult:
+@dataclass(frozen=True, repr=False)
+class HybridResult(Shown):
     """The estimate, its diagnosis, and how it was computed.
 
     likelihood: negative log-likelihood behind the standard errors, with the noise levels of the estimate.
@@ -64,6 +65,17 @@ class HybridResult:
     noise: tuple[Tensor, ...]
     steps: tuple[float, float]
     engine: str
+
+    @property
+    @in_its_units
+    def headline(self) -> str:
+        """The diagnosis in one sentence; it begins with a warning if the model does not explain the recording."""
+        warning = self.estimate.warning
+        return f"{warning}. {self.diagnosis.headline}" if warning else self.diagnosis.headline
+
+    def table(self) -> Table:
+        """As of the estimate."""
+        return self.estimate.table()
 
 
 @on_its_device

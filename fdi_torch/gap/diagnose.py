@@ -22,7 +22,6 @@ from fdi_torch.gap.free_form import fitted_free_form
 from fdi_torch.gap.library import possible_places
 from fdi_torch.gap.marginal_likelihood import with_disturbances
 from fdi_torch.gap.posterior import Posterior, posterior_of
-from fdi_torch.gap.preprocess.acquisition import thorough_findings
 from fdi_torch.gap.preprocess.outliers import sensor_with_outliers
 from fdi_torch.gap.preprocess.sensor_limits import noise_before_clipping, with_noise_limits
 from fdi_torch.gap.problem import DEFAULT_SETTINGS, DiagnosisProblem, Settings, problem_of
@@ -97,10 +96,23 @@ def solve_problem(problem: DiagnosisProblem, progress: Tell = silent) -> Answer:
     )
     answer = build_answer(diagnosis, problem.holdouts)
     remarks = dict.fromkeys(problem.remarks)
-    if verdict in ("ambiguous", "unknown"):
+    if verdict != "no_gap":
         progress(0.95, "examining the recordings")
-        remarks |= dict.fromkeys(thorough_findings(plant, problem.recordings))
+        explanation = None if posterior.best.unknown else posterior.best.fit
+        remarks |= dict.fromkeys(_recording_faults(problem, explanation))
     return replace(answer, remarks=[*remarks, *answer.remarks])
+
+
+def _recording_faults(problem: DiagnosisProblem, explanation: Fit | None) -> list[str]:
+    """What is probably wrong with the recordings.
+
+    explanation: named effects that explain them, against which a fault of a recording is weighed: causes that are sure
+    may be no more than the best set of effects for swapped sensors.
+    """
+    effects = None
+    if explanation is not None:
+        effects = Candidate(explanation.candidate.placements, (explanation.effect_values,))
+    return [text for check in problem.checks if (text := check.thorough_finding(effects))]
 
 
 def is_sure(posterior: Posterior) -> bool:

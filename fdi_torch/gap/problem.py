@@ -14,7 +14,7 @@ from fdi_torch.effects.stuck import Stuck
 from fdi_torch.gap.accurate_steps import with_accurate_steps
 from fdi_torch.gap.dataset import DataSet, data_set_of
 from fdi_torch.gap.library import library_of
-from fdi_torch.gap.preprocess.acquisition import StuckSegment, usable, without_sensors
+from fdi_torch.gap.preprocess.acquisition import CheckedRecording, StuckSegment, usable, without_sensors
 from fdi_torch.gap.preprocess.outliers import Outlier, SensorOutliers, outliers_of, without
 from fdi_torch.gap.preprocess.sensor_limits import limits_from_readings
 from fdi_torch.gap.structure_search import MAX_EFFECTS
@@ -70,7 +70,7 @@ class DiagnosisProblem:
     """library: the effects to search. known_effects: limits of sensors, and stuck sensors, that the readings show
     without a model. data: the recordings, for the plant with these effects and without sensors that are stuck
     throughout. holdouts: the hold-outs, likewise. outliers: masked readings of the recordings, and of the hold-outs.
-    remarks: on what was changed in the plant."""
+    remarks: on what was changed in the plant. checks: of the recordings."""
 
     library: tuple[Placement, ...]
     recordings: tuple[Recording, ...]
@@ -80,6 +80,7 @@ class DiagnosisProblem:
     settings: Settings
     outliers: tuple[Sequence[SensorOutliers], Sequence[SensorOutliers]]
     remarks: Sequence[str]
+    checks: Sequence[CheckedRecording]
 
 
 def problem_of(
@@ -96,8 +97,10 @@ def problem_of(
     longest = max(float(r.time[-1] - r.time[0]) for r in recordings)
     if settings.step is not None and settings.step > longest:
         raise ValueError(f"step: expected one within the {longest:g} s recorded, got {settings.step:g} s; shorten it")
-    recordings, stuck, remarks = _examined(plant, recordings, settings.trusted)
-    holdouts, _, remarks_on_holdouts = _examined(plant, holdouts, settings.trusted)
+    checks = _examined(plant, recordings, settings.trusted)
+    checks_of_holdouts = _examined(plant, holdouts, settings.trusted)
+    recordings, stuck = [c.recording for c in checks], [s for c in checks for s in c.stuck]
+    holdouts = [c.recording for c in checks_of_holdouts]
     plant = with_rims_unknown(plant, [*recordings, *holdouts])
     freezing = {p.location: p for p in library if isinstance(p.effect, Stuck)}
     stuck_for_good = {s.sensor.name: s for s in stuck if s.for_good and s.sensor.name in freezing}
@@ -123,7 +126,8 @@ def problem_of(
         tuple(holdout_data),
         settings,
         masked,
-        [*remarks, *remarks_on_holdouts],
+        [c.fault.text for c in (*checks, *checks_of_holdouts) if c.fault],
+        checks,
     )
 
 
@@ -144,19 +148,15 @@ def _without_outliers(
     return masked, all_outliers
 
 
-def _examined(
-    plant: PlantDescription, recordings: Sequence[Recording], trusted: bool
-) -> tuple[list[Recording], list[StuckSegment], list[str]]:
+def _examined(plant: PlantDescription, recordings: Sequence[Recording], trusted: bool) -> list[CheckedRecording]:
     """The recordings without readings of stuck sensors, when each of these is stuck, and what else looks wrong.
 
     Raises ValueError for a faulty recording.
     """
-    checked = [
+    return [
         usable(plant, replace(_without_rounding_errors(r), trusted=r.trusted or trusted), effects=True)
         for r in recordings
     ]
-    doubts = [c.fault.text for c in checked if c.fault]
-    return [c.recording for c in checked], [s for c in checked for s in c.stuck], doubts
 
 
 def _without_rounding_errors(recording: Recording) -> Recording:

@@ -6,12 +6,14 @@ trusted.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fdi_torch.amounts import effect_words, probability_words
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import UNKNOWN
+from fdi_torch.gap.constant_remarks import MOVED
 from fdi_torch.names import listed
 from fdi_torch.quantities import quantity_text
 
@@ -127,9 +129,9 @@ def _verdict(answer: Named, best: str) -> str:
     chance = f", probability {probability_words(probability)}" if isinstance(probability, int | float) else ""
     best = best or _with_equivalents(causes_of(first), answer.get("causes") or [])
     if verdict == "no_gap":
-        return "No gap: the plant file explains the recording within noise and tolerances."
+        return f"No gap: {_explained(answer, 'noise')}."
     if verdict == "named" and not apart_from_rounding(causes_of(first)):
-        return f"No gap: the plant file explains the recording within rounding, noise and tolerances{chance}."
+        return f"No gap: {_explained(answer, 'rounding', 'noise')}{chance}."
     if verdict == "named":
         return f"The gap comes from {best}{chance}."
     explanations, certain = answer.get("ambiguity_set") or [], apart_from_rounding(answer.get("certain") or [])
@@ -149,6 +151,26 @@ def _verdict(answer: Named, best: str) -> str:
         return f"The gap comes from {best}{chance}; no effect of the library describes the unknown part."
     place = next((str(w["location"]) for w in answer.get("where") or []), "a sensor")  # logs of earlier versions
     return f"Readings of {place} are outliers or stuck; apart from these, the plant file explains the recording."
+
+
+def _explained(answer: Named, *within: str) -> str:
+    """That the plant file explains the recording, and within what; constants that had to move far for it are named."""
+    moved = _moved_constants(answer)
+    if not moved:
+        return f"the plant file explains the recording within {listed([*within, 'tolerances'])}"
+    those = "its tolerance" if len(moved) == 1 else "their tolerances"
+    return f"apart from {listed(moved)}, beyond {those}, the plant file explains the recording within {listed(within)}"
+
+
+def _moved_constants(answer: Named) -> list[str]:
+    """Constants that are MOVED tolerances off or more: 'link.discharge_coefficient (3.1 tolerances off)'."""
+    moved = []
+    for name, constant in (answer.get("constants") or {}).items():
+        numbers = [constant.get(key) for key in ("nominal", "augmented", "tolerance")]
+        nominal, fitted, tolerance = (float(x) if isinstance(x, int | float) else math.nan for x in numbers)
+        if tolerance > 0.0 and abs(fitted - nominal) > MOVED * tolerance:
+            moved.append(f"{name} ({(fitted - nominal) / tolerance:.2g} tolerances off)")
+    return moved
 
 
 def _with_equivalents(explanation: Sequence[Named], fitted: Sequence[Named]) -> str:

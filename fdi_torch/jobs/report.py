@@ -14,7 +14,7 @@ from fdi_torch.disk import write_text
 from fdi_torch.logbook import Comparison, Run, read_run
 from fdi_torch.plant.description import PlantDescription
 from fdi_torch.progress import Tell, rounded, silent
-from fdi_torch.report.comparison import comparison_section, in_words, result_table
+from fdi_torch.report.comparison import DIFFERENCE, comparison_section, in_words, result_table
 from fdi_torch.report.comparison_headline import comparison_headline, setting_table
 from fdi_torch.report.html import Markup
 from fdi_torch.report.material import Material, gather
@@ -137,14 +137,16 @@ class ComparisonResult(Shown):
     @in_its_units
     def table(self) -> Table:
         """One row per estimated parameter: value and standard error in each run, in its unit for display; `p`: of the
-        hypothesis that all runs estimate one value; `agree`: whether it holds at 95 %, None if no error is known.
+        hypothesis that all runs estimate one value; `agree`: whether it holds at 95 %, None if no error is known or if
+        runs read the same recording; the largest difference of two runs in the smaller of their standard errors.
         """
         errors = [(label, f"{label} std error") for label in self.comparison.labels]
         rows = []
         for each in self.comparison.results:
             numbers = [number for pair in zip(each.values, each.std, strict=True) for number in pair]
-            rows.append((each.name, *in_display_unit(each.name, each.unit, *numbers), each.p_value, each.agree))
-        return Table(("parameter", "unit", *sum(errors, ()), "p", "agree"), rows)
+            shown = in_display_unit(each.name, each.unit, *numbers)
+            rows.append((each.name, *shown, each.p_value, each.agree, each.apart))
+        return Table(("parameter", "unit", *sum(errors, ()), "p", "agree", DIFFERENCE), rows)
 
     @property
     def verdicts(self) -> dict[str, str]:

@@ -65,8 +65,7 @@ class TrainResult(Shown):
     @in_its_units
     def headline(self) -> str:
         """The diagnosis in one sentence; it begins with a warning if the model does not explain the recording."""
-        warning = self.estimate.warning
-        return f"{warning}. {self.result.diagnosis.headline}" if warning else self.result.diagnosis.headline
+        return self.result.headline
 
     @property
     def exact_constants(self) -> str:

@@ -9,6 +9,7 @@ import math
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import orjson
 
 from fdi_torch.logbook.payload import WALL
 from fdi_torch.logbook.reader import Message, Run, read_run
-from fdi_torch.logbook.signals import series
+from fdi_torch.logbook.signals import own_signals, recording_groups, series
 
 
 def content_hash(messages: Iterable[Message]) -> str:
@@ -54,7 +55,9 @@ class Result:
 
     p_value: of the hypothesis that all runs estimate one true value with independent errors, by Cochran's Q = sum w (x
     - mean)^2, w = 1 / std^2, against chi^2; for two runs Q = z^2. Runs whose model does not explain their recording are
-    left out, since their errors do not hold. NaN if fewer than two runs have standard errors.
+    left out, since their errors do not hold. NaN if fewer than two runs have standard errors, or if runs read the same
+    recording. apart: the largest difference between two of these runs, in the smaller of their standard errors; NaN if
+    fewer than two have one.
     """
 
     name: str
@@ -63,6 +66,7 @@ class Result:
     std: tuple[float, ...]
     p_value: float
     ends: tuple[str, ...] = ()
+    apart: float = math.nan
 
     @property
     def agree(self) -> bool | None:
@@ -74,8 +78,9 @@ class Result:
 class Comparison:
     """labels: one per run. differences: section -> key -> one text per run, "" if a run lacks it.
 
-    same_content: whether all logs have the same messages. same_data: whether all runs used the same data; their errors
-    are then not independent, and `agree` only states that the methods differ by less than the noise explains.
+    same_content: whether all logs have the same messages. same_data: whether all runs used the same data. shares_data:
+    whether two runs used a recording in common; their errors are then not independent: the variance of a difference is
+    not the sum of the variances, and `agree` is None.
     """
 
     labels: tuple[str, ...]
@@ -83,6 +88,7 @@ class Comparison:
     results: tuple[Result, ...]
     same_content: bool
     same_data: bool
+    shares_data: bool = False
 
     def rows(self) -> list[list[str]]:
         """The whole comparison as a table with a header, for CSV."""
@@ -101,15 +107,25 @@ def compare(paths: Sequence[str | Path]) -> Comparison:
     if len(paths) < 2:
         raise ValueError(f"expected at least two logs to compare, got {len(paths)}; name more")
     runs = [read_run(path) for path in paths]
-    # Hashes of the recordings' files; "" for a recording that was in memory.
-    first, *others = ({k: text for k, text in run.about("data").items() if k.endswith("sha256")} for run in runs)
+    used = [_recordings(run) for run in runs]
+    shares_data = any(not a.isdisjoint(b) for a, b in combinations(used, 2))
     return Comparison(
         labels_of([run.path for run in runs]),
         {section: entries for section in SECTIONS if (entries := _differing(runs, section))},
-        _results(runs),
+        _results(runs, independent=not shares_data),
         len({content_hash(run.messages()) for run in runs}) == 1,
-        bool(first) and all(first.values()) and all(other == first for other in others),
+        shares_data and all(other == used[0] for other in used),
+        shares_data,
     )
+
+
+def _recordings(run: Run) -> set[bytes | str]:
+    """The recordings that a run used, hold-outs left out: hashes of their logged readings, or else of their files."""
+    topics = dict.fromkeys(message.topic for message in run.messages())
+    groups = [group for group in recording_groups(topics) if not group.startswith("holdout")]
+    if logged := [own_signals(run, group) for group in groups]:
+        return {hashlib.sha256(each.time.tobytes() + each.outputs.tobytes()).digest() for each in logged}
+    return {text for key, text in run.about("data").items() if key.endswith("sha256") and text}
 
 
 def align(
@@ -160,14 +176,21 @@ def _differing(runs: Sequence[Run], section: str) -> dict[str, tuple[str, ...]]:
     return {key: texts for key, texts in table.items() if len(set(texts)) > 1}
 
 
-def _results(runs: Sequence[Run]) -> tuple[Result, ...]:
+def _apart(values: Sequence[float], std: Sequence[float]) -> float:
+    """The largest difference of two values in the smaller of their standard errors; NaN for fewer than two with one."""
+    known = [(x, s) for x, s in zip(values, std, strict=True) if math.isfinite(x) and math.isfinite(s) and s > 0.0]
+    return max((abs(a - b) / min(s, t) for (a, s), (b, t) in combinations(known, 2)), default=math.nan)
+
+
+def _results(runs: Sequence[Run], independent: bool) -> tuple[Result, ...]:
     estimates, results = [_estimates(run) for run in runs], []
     failing = [run.about("result").get("explained") == "false" for run in runs]
     for name in dict.fromkeys(name for each in estimates for name in each):
         values, std, units = zip(*(each.get(name, (math.nan, math.nan, "")) for each in estimates), strict=True)
         ends = tuple(run.at_bounds.get(name, "") for run in runs)
         counted = [math.nan if unreliable else error for unreliable, error in zip(failing, std, strict=True)]
-        results.append(Result(name, next(filter(None, units), ""), values, std, chi2_p_value(values, counted), ends))
+        p_value, unit = chi2_p_value(values, counted) if independent else math.nan, next(filter(None, units), "")
+        results.append(Result(name, unit, values, std, p_value, ends, _apart(values, counted)))
     return tuple(results)
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from fdi_torch.plant.description import PlantDescription, Sensor, Tank, with_tolerances
 from fdi_torch.plant.metered_flow import MeteredFlow
-from fdi_torch.quantities import quantity_text
+from fdi_torch.quantities import quantity_text, significant
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.plant_units import EXCESSIVE, doubtful_units, refusal
 from fdi_torch.sample_noise import sample_noise
@@ -200,5 +200,6 @@ def _valve_findings(valve: str, opening: Tensor) -> Iterator[ChannelFinding]:
     finite = opening[torch.isfinite(opening)]
     if len(finite) and (float(finite.max()) > 1 + RIM_MARGIN or float(finite.min()) < -RIM_MARGIN):
         low, high = float(finite.min()), float(finite.max())
-        text = f"opens from {low:.3g} to {high:.3g} where 0 is closed and 1 is open: is its unit right (pct)?"
+        least, most = (significant(100.0 * opening, 3) for opening in (low, high))
+        text = f"opens from {least} % to {most} %, where 100 % is fully open: is its unit right (pct)?"
         yield ChannelFinding("unit", valve, text, {"low": low, "high": high})

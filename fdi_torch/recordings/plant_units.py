@@ -30,10 +30,10 @@ from fdi_torch.recordings.volume_balance import DEVIATION, UNRELATED, Balance, b
 from fdi_torch.units import same_kind
 
 UNITS = {
-    "m": ("mm", "cm", "dm", "m"),
-    "Pa": ("Pa", "mbar", "kPa", "bar"),
+    "m": ("mm", "cm", "in", "dm", "ft", "m"),
+    "Pa": ("Pa", "mbar", "kPa", "psi", "bar"),
     "m^2": ("mm^2", "cm^2", "dm^2", "m^2"),
-    "m^3/s": ("ml/min", "cm^3/s", "l/h", "l/min", "l/s", "m^3/h", "m^3/s"),
+    "m^3/s": ("ml/min", "cm^3/s", "l/h", "l/min", "gal/min", "l/s", "m^3/h", "m^3/s"),
     "s": ("ms", "s", "min", "h"),
 }
 """The usual units of each kind of number."""
@@ -211,7 +211,11 @@ def _reading_corrections(
         number = {"m": "level", "Pa": "pressure"}.get(kind)
         written = _written(kind, columns[0], recording) if number else ""
         names = f"the {number} {columns[0]} is" if len(columns) == 1 else f"the {number}s {', '.join(columns)} are"
+        alone = len(sensors) < sum(s.unit == kind for s in plant.sensors)
         for right, ratio in _other_units(kind, written) if number else ():
+            # Of a sensor alone, a factor such as that of inches is rather due to swapped sensors or an effect.
+            if alone and not _is_power_of_ten(ratio):
+                continue
             if balance := _with_readings(plant, recording, columns, ratio):
                 yield Correction(names, written, right, ratio, balance, columns)
 
@@ -249,6 +253,11 @@ def _other_units(kind: str, written: str) -> list[tuple[str, float]]:
     """The usual units of this kind other than the written one, and the ratio of the written one to them."""
     ratios = {unit: unit_factor(written, kind) / unit_factor(unit, kind) for unit in UNITS[kind]}
     return [(unit, ratio) for unit, ratio in ratios.items() if abs(ratio - 1.0) > 1e-6]
+
+
+def _is_power_of_ten(ratio: float) -> bool:
+    decade = math.log10(ratio)
+    return abs(decade - round(decade)) < 1e-6
 
 
 def _written(kind: str, channel: str, recording: Recording) -> str:

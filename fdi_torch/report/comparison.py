@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from fdi_torch.amounts import with_error
+from fdi_torch.amounts import AT_95, with_error
 from fdi_torch.effects import EFFECTS
 from fdi_torch.logbook import Comparison, align
 from fdi_torch.logbook.compare import Result
@@ -29,6 +29,7 @@ from fdi_torch.report.style import MARK, MODEL, OTHER, SOFT
 from fdi_torch.tables import Table
 
 MOST_LETTERS = 160  # of a setting or result that differs; a longer one, such as a covariance, is cut
+DIFFERENCE = "difference, std errors"
 PIPE_CAPACITY = re.compile(r"plant\.pipes\..*\.(area|discharge_coefficient)")
 COLOURS = (MODEL, MARK, OTHER, SOFT)
 CURVES = {
@@ -70,18 +71,24 @@ def in_words(compared: Comparison, runs: Sequence[Material]) -> list[str]:
     """
     failing = [run.unexplained for run in runs]
     unreliable = [label for label, fails in zip(compared.labels, failing, strict=True) if fails]
-    shared = [result for result in compared.results if result.agree is not None]
+    shared = [result for result in compared.results if not math.isnan(result.apart)]
     if not shared:
         return [f"The estimates are not compared, as {_are_unreliable(unreliable)}."] if unreliable else []
-    apart = [result.name for result in shared if not result.agree]
+    # The difference of estimates from one recording is smaller than that of independent ones with these errors.
+    beyond = [result for result in shared if (result.apart > AT_95 if compared.shares_data else result.agree is False)]
+    apart = [result.name for result in beyond]
     words = [
         _shared_words(shared, len(compared.results), len(runs) - len(unreliable), "reliable " if unreliable else "")
     ]
-    if apart:
+    doubt = _are_unreliable(unreliable) if unreliable else ""
+    doubt = doubt or ("the runs name different faults" if _name_different_faults(runs) else "")
+    if compared.shares_data:
+        words[0] += "."
+        words.append(_differences_on_one_recording(compared, shared) + (f"; but {doubt}." if doubt else "."))
+    elif apart:
         words[0] += f"; at 95 % these differ: {', '.join(apart)}."
-    elif unreliable or _name_different_faults(runs):
-        reason = _are_unreliable(unreliable) if unreliable else "the runs name different faults"
-        words[0] += f"; none of these differs at 95 %, but {reason}."
+    elif doubt:
+        words[0] += f"; none of these differs at 95 %, but {doubt}."
     else:
         words[0] += "; there they agree at 95 %."
     relative = {effect.name for effect in EFFECTS if effect.capacity_share}  # to the capacity of a pipe, as a leak
@@ -91,9 +98,18 @@ def in_words(compared: Comparison, runs: Sequence[Material]) -> list[str]:
         words.append(
             f"{listed(shares)}: relative to the capacity of a pipe in the plant file; {listed(pipes)} differs."
         )
-    if compared.same_data:
-        words.append("All runs read the same data, so their errors are not independent.")
     return words
+
+
+def _differences_on_one_recording(compared: Comparison, shared: Sequence[Result]) -> str:
+    """By how much estimates from one recording differ: noise that they have in common does not show in a difference."""
+    most = max(shared, key=lambda result: result.apart)
+    which = "All runs" if compared.same_data else "Some of the runs"
+    return (
+        f"{which} read the same recording: their errors are not independent, so that standard errors do not add and no "
+        f"test of agreement applies; the estimates differ by at most {number(most.apart, 2)} of the smaller standard "
+        f"error ({most.name})"
+    )
 
 
 def _are_unreliable(labels: Sequence[str]) -> str:
@@ -118,7 +134,9 @@ def _name_different_faults(runs: Sequence[Material]) -> bool:
 
 
 def result_table(compared: Comparison) -> Table:
-    """Parameter, unit, value and error of each run and, if runs share one, p-value and agreement."""
+    """Parameter, unit, value and error of each run and, if runs share one, p-value and agreement; of runs that read the
+    same recording, their difference in standard errors.
+    """
     verdicts = {True: "yes", False: "no", None: ""}
     rows = []
     for result in compared.results:
@@ -128,8 +146,11 @@ def result_table(compared: Comparison) -> Table:
         values = ["–" if math.isnan(v) else with_error(scale * v, scale * s, end) for v, s, end in numbers]
         chance = "" if math.isnan(result.p_value) else number(result.p_value, 2)
         p_value = "< 0.0001" if result.p_value < 1e-4 else chance
-        rows.append([result.name, unit or "1", *values, p_value, verdicts[result.agree]])
-    return Table(("parameter", "unit", *compared.labels, "p", "agree"), rows, "estimates")
+        difference = "" if math.isnan(result.apart) else number(result.apart, 2)
+        last = [difference] if compared.shares_data else [p_value, verdicts[result.agree]]
+        rows.append([result.name, unit or "1", *values, *last])
+    last = [DIFFERENCE] if compared.shares_data else ["p", "agree"]
+    return Table(("parameter", "unit", *compared.labels, *last), rows, "estimates")
 
 
 def _convergence(compared: Comparison, runs: Sequence[Material]) -> list[Picture]:

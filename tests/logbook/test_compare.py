@@ -18,6 +18,8 @@ from fdi_torch.logbook import Message, Run, RunLog, align, compare, read_run, re
 from fdi_torch.logbook.compare import chi2_p_value, labels_of
 from fdi_torch.logbook.payload import pack
 
+OTHER_DATA = [{"path": "rig.csv", "sha256": "cd" * 32}]
+
 
 def write_run(path: Path, value: float, *, std: float = 0.01, generations: int = 3, **changes: Any) -> Path:
     with RunLog(path, "train", **{**FIXED, **changes}) as log:
@@ -59,12 +61,34 @@ def test_equal_runs_have_nothing_to_tell(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("other", "agree"), [(0.12, True), (0.15, False)])
 def test_results_agree_within_their_errors(tmp_path: Path, other: float, agree: bool) -> None:
-    found = compare([write_run(tmp_path / "a.mcap", 0.10), write_run(tmp_path / "b.mcap", other)])
+    found = compare([write_run(tmp_path / "a.mcap", 0.10), write_run(tmp_path / "b.mcap", other, data=OTHER_DATA)])
     leak, gain = found.results
+    assert not found.shares_data and leak.apart == pytest.approx((other - 0.10) / 0.01)
     z = (other - 0.10) / math.hypot(0.01, 0.01)
     assert leak.p_value == pytest.approx(2 * stats.norm.sf(z), rel=1e-12) and leak.agree is agree
     assert gain.agree is True and gain.unit == "m"
     assert ["std", "leak", "0.01", "0.01", "1", ""] in found.rows()
+
+
+def test_runs_on_one_recording_are_not_tested_as_if_their_errors_were_independent(tmp_path: Path) -> None:
+    """Standard errors of estimates from the same noise do not add: the difference is given in the smaller of them."""
+    a, b = write_run(tmp_path / "a.mcap", 0.10), write_run(tmp_path / "b.mcap", 0.12, std=0.02)
+    found = compare([a, b])
+    leak, gain = found.results
+    assert found.same_data and found.shares_data and leak.agree is None and math.isnan(leak.p_value)
+    assert leak.apart == pytest.approx(2.0) and gain.apart == 0.0
+    third = compare([a, b, write_run(tmp_path / "c.mcap", 0.11, data=OTHER_DATA)])
+    assert third.shares_data and not third.same_data and third.results[0].agree is None
+
+
+def test_recordings_are_the_same_by_their_readings_not_by_the_name_of_their_file(tmp_path: Path) -> None:
+    for name, level in (("a", 0.4), ("b", 0.4), ("c", 0.5)):
+        with RunLog(tmp_path / f"{name}.mcap", "train", **{**FIXED, "data": []}) as log:
+            time = np.arange(3.0)
+            log.recording(time, np.zeros((3, 0)), np.full((3, 1), level), (), ("h",), (), ("m",))
+            log.estimate(["leak"], [0.1], [0.01], np.eye(1), "converged", units=["1"])
+    a, b, c = (tmp_path / f"{name}.mcap" for name in "abc")
+    assert compare([a, b]).same_data and not compare([a, c]).shares_data
 
 
 @pytest.mark.parametrize("runs", [2, 3, 4, 7, 12])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -183,6 +184,24 @@ def test_runs_agree_only_if_each_is_reliable_and_they_name_the_same_faults(tmp_p
     assert agreement(a, bad) == ["The estimates are not compared, as bad is unreliable."]
 
 
+def test_runs_on_one_recording_differ_by_shares_of_one_standard_error(tmp_path: Path) -> None:
+    data = [{"path": "run.csv", "sha256": "1f"}]
+    logs = []
+    for name, size in (("a", 0.300), ("b", 0.305)):
+        with RunLog(tmp_path / f"{name}.mcap", "train", config_text="", config={}, env={}, git={}, data=data) as log:
+            log.estimate(["T1.leak.size"], [size], [0.01], np.eye(1), "converged", units=["1"])
+            log.fault("leak.size", "T1", True)
+            log.result({"explained": True})
+        logs.append(tmp_path / f"{name}.mcap")
+    assert agreement(*logs) == [
+        "Both runs have the same parameter.",
+        "All runs read the same recording: their errors are not independent, so that standard errors do not add and no "
+        "test of agreement applies; the estimates differ by at most 0.5 of the smaller standard error (T1.leak.size).",
+    ]
+    table = result_table(compare(logs))
+    assert table.header[-1] == "difference, std errors" and table.rows[0][-1] == "0.5"
+
+
 def test_every_difference_that_is_not_listed_is_counted(tmp_path: Path) -> None:
     a = write_fit(tmp_path / "a.mcap", 0.001, config={f"key{k}": 1 for k in range(9)})
     b = write_fit(tmp_path / "b.mcap", 0.001, level=0.2, config={f"key{k}": 2 for k in range(9)})
@@ -298,8 +317,8 @@ def test_units_on_the_terminal_are_written_as_in_files(tmp_path: Path, capsys: p
 def test_leaks_relative_to_another_capacity_are_not_compared_unsaid(
     tmp_path: Path, setting: str, name: str, said: bool
 ) -> None:
-    result = Result(name, "1", (0.150, 0.155), (2e-4, 2e-4), 1e-9)
-    compared = Comparison(("a", "b"), {"config": {setting: ("0.6", "0.62")}}, (result,), False, True)
+    result = Result(name, "1", (0.150, 0.155), (2e-4, 2e-4), math.nan, apart=25.0)
+    compared = Comparison(("a", "b"), {"config": {setting: ("0.6", "0.62")}}, (result,), False, True, True)
     runs = [gather(read_run(write_fit(tmp_path / f"{label}.mcap", 0.001))) for label in compared.labels]
     _, *others = in_words(compared, runs)
     explained = f"{name}: relative to the capacity of a pipe in the plant file; {setting} differs."

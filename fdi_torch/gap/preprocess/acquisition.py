@@ -15,8 +15,9 @@ from statistics import median
 import torch
 from torch import Tensor
 
+from fdi_torch.gap.candidate import Candidate
 from fdi_torch.gap.preprocess.blockwise_likelihood import BlockwiseFit, blocked_recording, blockwise_fit, noise_of
-from fdi_torch.gap.preprocess.recording_fault_decision import SURE, recording_fault
+from fdi_torch.gap.preprocess.recording_fault_decision import SURE, FaultSearch
 from fdi_torch.gap.preprocess.recording_fault_texts import RecordingFault, not_held
 from fdi_torch.plant.description import PlantDescription, Sensor, with_tolerances
 from fdi_torch.quantities import quantity_text
@@ -54,11 +55,22 @@ class StuckSegment:
 
 @dataclass(frozen=True)
 class CheckedRecording:
-    """A recording whose stuck readings are masked. fault: a fault of the whole recording, or None."""
+    """A recording whose stuck readings are masked. fault: a fault of the whole recording, or None. search: for faults
+    of the recording in which none was found, or None if there was none.
+    """
 
     recording: Recording
     stuck: tuple[StuckSegment, ...]
     fault: RecordingFault | None
+    search: FaultSearch | None = None
+
+    def thorough_finding(self, explanation: Candidate | None = None) -> str:
+        """What is probably wrong with the recording beside an effect of the plant; empty if nothing is.
+
+        explanation: effects of the plant that the diagnosis found, which a fault must surpass.
+        """
+        fault = self.fault or (self.search and self.search.fault(thorough=True, explanation=explanation))
+        return fault.text if fault else ""
 
 
 def examined(plant: PlantDescription, recording: Recording, thorough: bool = False) -> CheckedRecording:
@@ -82,9 +94,11 @@ def examined(plant: PlantDescription, recording: Recording, thorough: bool = Fal
     remaining, fault = without(recording, stuck), None
     # One value throughout may also be due to small noise, or to an end of the range.
     constant = [s for s in plant.sensors if len(remaining.valid_readings(s.column).unique()) == 1]
-    while not recording.trusted and (
-        fault := recording_fault(plant, remaining, tuple(s.column for s in constant), thorough)
-    ):
+    search = None
+    while not recording.trusted:
+        search = FaultSearch(plant, remaining, tuple(s.column for s in constant))
+        if not (fault := search.fault(thorough)):
+            break
         silent = [s for s in constant if s.column in fault.channels]
         if not (fault.silent and silent):
             break
@@ -95,7 +109,7 @@ def examined(plant: PlantDescription, recording: Recording, thorough: bool = Fal
     if fault is None and rims:
         columns = tuple(rim.sensor.column for rim in rims)
         fault = RecordingFault(columns, "; ".join(rim.text for rim in rims), physical=True)
-    return CheckedRecording(_with_notes(remaining, stuck), tuple(stuck), fault)
+    return CheckedRecording(_with_notes(remaining, stuck), tuple(stuck), fault, None if fault else search)
 
 
 def thorough_findings(plant: PlantDescription, recordings: Iterable[Recording]) -> tuple[str, ...]:

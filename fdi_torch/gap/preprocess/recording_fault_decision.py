@@ -12,8 +12,10 @@ effect as well, because channels can be swapped where a pipe is plugged. A fault
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from itertools import chain, islice
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import chain, count, islice
 from operator import itemgetter
 
 import torch
@@ -45,45 +47,95 @@ RIVALS, MOST_EFFECTS = 6, 2
 def recording_fault(
     plant: PlantDescription, recording: Recording, constant: tuple[str, ...] = (), thorough: bool = False
 ) -> RecordingFault | None:
-    """The likeliest fault of a recording, or None if faults have less than 95 % together.
+    """The likeliest fault of a recording, or None if faults have less than 95 % together; as `FaultSearch.fault`."""
+    return FaultSearch(plant, recording, constant).fault(thorough)
+
+
+@dataclass(frozen=True)
+class FaultSearch:
+    """The hypotheses about the faults of a recording; their fits are kept, so that a thorough search goes on from them.
 
     constant: columns of sensors that never move although noise should move them; such a sensor may be stuck, or at a
-    limit of its range all the time. thorough: try the likeliest fault beside an effect of the plant too, even if the
-    fault alone gains nothing.
+    limit of its range all the time.
     """
-    noise = noise_of(plant, recording)
-    as_is = blockwise_fit(blocked_recording(plant, recording, noise))
-    count = len(plant.sensors) + len(plant.channels())
-    prior = math.log(FAULT_PROBABILITY / (len(DECADES) * count + math.comb(count, 2) + 2 * len(plant.sensors) + 1))
-    most = as_is.most + prior - SURE  # what a perfect fit of a corrected recording allows the others
-    if most < as_is.log_likelihood:
-        return None
-    fits = CorrectedFits(plant, recording, as_is, prior, noise)
-    corrections = suspected(fits, constant, thorough)
-    if not corrections:
-        return None
-    silent_columns = {c for _, each in corrections if each.fault.silent for c in each.fault.channels}
-    silent = {s.name for s in plant.sensors if s.column in silent_columns}
-    others = _weights_with_effects(as_is, silent, as_is.log_likelihood + corrections[0][0] - SURE)
-    rivals = [as_is.log_likelihood]
-    for rival in islice(others, RIVALS):
-        rivals.append(rival)
-        if most < rival:
+
+    plant: PlantDescription
+    recording: Recording
+    constant: tuple[str, ...] = ()
+    _rivals: dict[tuple[frozenset[str], float], Rivals] = field(default_factory=dict)
+
+    @cached_property
+    def fits(self) -> CorrectedFits:
+        """The fit to the recording as it is, and those of corrected recordings."""
+        noise, channels = noise_of(self.plant, self.recording), len(self.plant.sensors) + len(self.plant.channels())
+        as_is = blockwise_fit(blocked_recording(self.plant, self.recording, noise))
+        hypotheses = len(DECADES) * channels + math.comb(channels, 2) + 2 * len(self.plant.sensors) + 1
+        return CorrectedFits(self.plant, self.recording, as_is, math.log(FAULT_PROBABILITY / hypotheses), noise)
+
+    def fault(self, thorough: bool = False, explanation: Candidate | None = None) -> RecordingFault | None:
+        """The likeliest fault, or None if faults have less than 95 % together.
+
+        thorough: try the likeliest fault beside an effect of the plant too, even if the fault alone gains nothing.
+        explanation: effects of the plant that compete as well, with the parameters with which they were fitted.
+        """
+        fits, as_is = self.fits, self.fits.as_is
+        most = as_is.most + fits.prior - SURE  # what a perfect fit of a corrected recording allows the others
+        if most < as_is.log_likelihood:
             return None
-    faults = [fits.weighed(correction) for _, correction in corrections]
-    found = [(each.weight, each.fault) for each in faults]
-    best = max(faults, key=lambda each: each.weight)
-    if thorough and _log_odds([weight for weight, _ in found], rivals) <= SURE:
-        for each in (f for f in faults if f is best or f.fault.swapped):
-            if each.most - max(rivals) > SURE:
-                beside = _weights_with_effects(each.fitted, silent, max(rivals) + SURE - each.prior)
-                found += [(each.prior + weight, each.fault) for weight in islice(beside, RIVALS)]
-    weights = [weight for weight, _ in found]
-    for rival in chain([-math.inf], others):
-        rivals.append(rival)
-        if _log_odds(weights, rivals) <= SURE:
+        corrections = suspected(fits, self.constant, thorough)
+        if not corrections:
             return None
-    return max(found, key=itemgetter(0))[1]
+        silent_columns = {c for _, each in corrections if each.fault.silent for c in each.fault.channels}
+        silent = frozenset(s.name for s in self.plant.sensors if s.column in silent_columns)
+        others = self._weights_of_effects(silent, as_is.log_likelihood + corrections[0][0] - SURE)
+        rivals = [as_is.log_likelihood]
+        explained = [] if explanation is None else [self._weight_of(explanation)]
+        for rival in chain(explained, islice(others, RIVALS)):
+            rivals.append(rival)
+            if most < rival:
+                return None
+        faults = [fits.weighed(correction) for _, correction in corrections]
+        found = [(each.weight, each.fault) for each in faults]
+        best = max(faults, key=lambda each: each.weight)
+        if thorough and _log_odds([weight for weight, _ in found], rivals) <= SURE:
+            for each in (f for f in faults if f is best or f.fault.swapped):
+                if each.most - max(rivals) > SURE:
+                    beside = _weights_with_effects(each.fitted, silent, max(rivals) + SURE - each.prior)
+                    found += [(each.prior + weight, each.fault) for weight in islice(beside, RIVALS)]
+        weights = [weight for weight, _ in found]
+        for rival in chain([-math.inf], others):
+            rivals.append(rival)
+            if _log_odds(weights, rivals) <= SURE:
+                return None
+        return max(found, key=itemgetter(0))[1]
+
+    def _weights_of_effects(self, excluded: frozenset[str], target: float) -> Iterator[float]:
+        """As `_weights_with_effects` of the unchanged recording; those of an earlier call are not fitted again."""
+        if (excluded, target) not in self._rivals:
+            self._rivals[excluded, target] = Rivals(_weights_with_effects(self.fits.as_is, excluded, target))
+        return iter(self._rivals[excluded, target])
+
+    def _weight_of(self, explanation: Candidate) -> float:
+        """Log weight of the unchanged recording, fitted with these effects."""
+        as_is = self.fits.as_is
+        fitted = blockwise_fit(as_is.blocked, explanation, as_is)
+        return _log_weight(fitted, as_is, len(library_of(as_is.blocked.plant)))
+
+
+class Rivals:
+    """Values of an iterator that are kept, so that it can be iterated over again."""
+
+    def __init__(self, source: Iterator[float]) -> None:
+        self.source, self.kept = source, list[float]()
+
+    def __iter__(self) -> Iterator[float]:
+        for k in count():
+            if k == len(self.kept):
+                try:
+                    self.kept.append(next(self.source))
+                except StopIteration:
+                    return
+            yield self.kept[k]
 
 
 def _log_odds(weights: list[float], rivals: list[float]) -> float:
@@ -92,7 +144,7 @@ def _log_odds(weights: list[float], rivals: list[float]) -> float:
     return float(for_them - against)
 
 
-def _weights_with_effects(as_is: BlockwiseFit, excluded: set[str], target: float) -> Iterator[float]:
+def _weights_with_effects(as_is: BlockwiseFit, excluded: Collection[str], target: float) -> Iterator[float]:
     """Log weights of a recording, fitted as it is, with one and with two effects of the library, by a greedy search.
 
     excluded: places at which no effect is tried. target: log-likelihood below which an effect changes no decision.
