@@ -61,7 +61,7 @@ class Recording(Shown):
                     "convert it by torch.tensor(..., dtype=torch.float64)"
                 )
         if self.mask is None:
-            object.__setattr__(self, "mask", torch.isfinite(self.outputs))
+            object.__setattr__(self, "mask", torch.ones_like(self.outputs, dtype=torch.bool))
         samples = len(self.time)
         for name, tensor, width in (
             ("inputs", self.inputs, len(self.input_names)),
@@ -72,6 +72,7 @@ class Recording(Shown):
                 raise ValueError(
                     f"{self.source}: expected {name} of shape {(samples, width)}, got {tuple(tensor.shape)}"
                 )
+        object.__setattr__(self, "mask", self.mask & torch.isfinite(self.outputs))
         beyond = self.time[~(self.time.abs() <= LONGEST)]
         if len(beyond):
             raise ValueError(

@@ -33,6 +33,12 @@ def test_missing_readings_do_not_count() -> None:
     assert recording([0, 1, 2], [1, 1, 1], [1, float("nan"), 3]).mask.flatten().tolist() == [True, False, True]
 
 
+def test_a_reading_that_is_no_number_does_not_count_whatever_the_mask_says() -> None:
+    gap = replace(ramp(3), outputs=torch.tensor([[1.0], [float("nan")], [3.0]]).double())
+    assert gap.mask.flatten().tolist() == [True, False, True]
+    assert gap.valid_readings("h1").tolist() == [1.0, 3.0]
+
+
 def test_window_keeps_the_clock() -> None:
     assert ramp(10).window(2.0, 5.0).time.tolist() == [2, 3, 4, 5]
 
