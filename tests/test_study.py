@@ -386,5 +386,7 @@ def test_bounds_without_noise_are_those_of_a_millimetre_in_any_unit_of_the_senso
 
 
 def test_a_constant_output_has_no_signal_to_noise_ratio() -> None:
-    with pytest.raises(ValueError, match="study.snr_db: expected outputs that vary in every trial, got a constant hB"):
+    with pytest.raises(
+        ValueError, match=r"study\.snr_db: expected outputs that vary in every trial, got a constant hB"
+    ):
         make_trials(two_separate_tanks({}, "3 l/min", 30.0), Block(0, 0, 2, 0))
