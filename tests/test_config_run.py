@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,14 @@ import torch
 import yaml
 
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
-from fdi_torch.config.loaded_recordings import load_recordings, read_recording
+from fdi_torch.config.loaded_recordings import LoadedRecording, load_recordings, read_recording
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.problems import ConfigError, Source
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.simulation import NoiseConfig, noise_std, planned_recording
 from fdi_torch.config.yaml_files import SHIPPED, read_yaml
 from fdi_torch.effects import build_network
-from fdi_torch.jobs.run_setup import requested_space, simulate_recording
+from fdi_torch.jobs.run_setup import fitting_of, requested_space, simulate_recording
 from fdi_torch.parameters import ParameterSpace
 
 PAPER = ["T1.leak.size", "OUT2.net_outlet.size", "T3.leak.size", "P13.openness.size", "P32.openness.size"]
@@ -270,6 +271,15 @@ def test_noise_that_cannot_be_is_refused() -> None:
         noise_std(NoiseConfig(std={"h9": "1 mm"}), run().plant, clean)
     with pytest.raises(ConfigError, match=r"simulate.noise.std.h1: expected a quantity in m"):
         noise_std(NoiseConfig(std={"h1": "1 V"}), run().plant, clean)
+
+
+@pytest.mark.parametrize("first", [0.0, -600.0, 1.7e9])
+def test_an_onset_is_sought_within_the_recording_wherever_its_clock_begins(first: float) -> None:
+    wanted = run(estimate={"parameters": ["T1.leak", "T1.leak.onset"]})
+    recording = replace(simulate_recording(run()).every(10), trusted=True)
+    loaded = [LoadedRecording(replace(recording, time=recording.time + first), {"T1": 0.5, "T2": 0.5, "T3": 0.5})]
+    space = fitting_of(wanted, requested_space(wanted), loaded).space
+    assert (space["T1.leak.onset"].low, space["T1.leak.onset"].high) == (0.0, 1000.0)
 
 
 def test_an_output_that_varies_by_rounding_errors_only_is_constant() -> None:

@@ -117,7 +117,7 @@ def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording
     """The estimation problem of parameters and recordings, with all tensors on the configured device."""
     device = usable_device(run.config.device)
     recordings = [part.recording.to(device) for part in loaded]
-    space = bounded_by_recording(space, max(float(r.time[-1]) for r in recordings))
+    space = bounded_by_recording(space, max(float(r.time[-1] - r.time[0]) for r in recordings))
     fitting = set_up(run.plant, recordings, space, [part.start_levels for part in loaded], run.config.engine)
     expect_enough_samples(recordings, fitting.space)
     return fitting
