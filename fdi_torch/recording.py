@@ -203,9 +203,12 @@ class Recording(Shown):
 
     @property
     def origin(self) -> dict[str, str]:
-        """What a log says of the recording's file: path, hash, time 0, and the unit of each channel in it."""
+        """What a log says of the recording's file: path, hash, time 0, first time of a part, s, and the unit of each
+        channel in the file.
+        """
         began = "" if self.began is None else stamp(self.began, self.zone)
         clock = {"began": began} if began else {}
+        clock |= {"first": repr(float(self.time[0]))} if len(self) and self.time[0] else {}
         return {"path": self.source, "sha256": self.sha256} | clock | {f"unit.{n}": u for n, u in self.written.items()}
 
     @property

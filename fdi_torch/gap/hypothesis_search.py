@@ -14,7 +14,7 @@ from dataclasses import replace
 
 from fdi_torch.estimate.evidence import RARE
 from fdi_torch.gap.answer import CauseName
-from fdi_torch.gap.candidate import Candidate, Fit
+from fdi_torch.gap.candidate import Candidate, Fit, Key
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.cause_hypothesis import (
     CauseHypothesis,
@@ -27,6 +27,7 @@ from fdi_torch.gap.localization.localize import CALIBRATED, Shortfall, localize,
 from fdi_torch.gap.localization.localized_discrepancy import (
     LocalizedDiscrepancy,
     log_likelihood,
+    nearly_without_disturbances,
 )
 from fdi_torch.gap.marginal_likelihood import log_prior, with_disturbances
 from fdi_torch.gap.ranked_explanation import RankedExplanation
@@ -151,12 +152,21 @@ class HypothesisSearch:
         return [h for e in explanations for h in self._with_discrepancies(e, self.places, best)]
 
     def _with_more_effects(self, best: CauseHypothesis) -> list[CauseHypothesis]:
-        """Variants of a hypothesis with one of the most promising further effects beside the discrepancy."""
+        """Variants of a hypothesis with one of the most promising further effects beside the discrepancy.
+
+        They are chosen under the noise that the discrepancy left, and nearly without random flows, which may have
+        absorbed an effect.
+        """
         if (at := best.discrepancy) is None:
             return []
         beside = _without_discrepancy(best, at)
         base = beside.fit(replace(at.fit.candidate, starts=(at.fit.effect_values,)), at.fit)
-        return self._with_the_same(at, self.pool.fits_beside(beside, base, self.options), best)
+        undisturbed = with_disturbances(beside, base, nearly_without_disturbances(at.noise))
+        fits: dict[Key, Fit] = {}
+        for fitter in (beside, undisturbed):
+            for fit in self.pool.fits_beside(fitter, base, self.options):
+                fits.setdefault(fit.key, fit)
+        return self._with_the_same(at, fits.values(), best)
 
     def _with_the_same(
         self, at: LocalizedDiscrepancy, fits: Iterable[Fit], best: CauseHypothesis
