@@ -11,7 +11,7 @@ import numpy as np
 from fdi_torch.recordings.csv_binding import bind_table
 from fdi_torch.recordings.csv_cells import parse_carefully
 from fdi_torch.recordings.csv_files import SINCE_1970, channels_in_si, from_first
-from fdi_torch.recordings.csv_text import heading_of, joined, open_csv
+from fdi_torch.recordings.csv_text import WINDOWS, heading_of, joined, open_csv
 from fdi_torch.recordings.sheets import fill_held
 from fdi_torch.recordings.source import ChannelSource, clock_in
 from fdi_torch.recordings.table_files import TableText
@@ -71,7 +71,7 @@ class GrowingCsv:
         self._place += len(whole)
         rows: list[np.ndarray] = []
         problems = []
-        for line in whole.decode(self._encoding, errors="replace").splitlines():
+        for line in whole.decode(self._encoding, errors=WINDOWS).splitlines():
             try:
                 row = parse_carefully([*joined([line], self._columns.heading)], self._columns, self._line)
                 rows += [values for values in row if np.isfinite(values[0])]
