@@ -218,7 +218,7 @@ _ALL_NUMBERS = re.compile(r"(?=.*\d)[\d\s.,;:+\-eE]+", re.DOTALL)  # also time s
 def _delimiter(line: str, header: bool) -> str:
     """The delimiter of the columns. In a row of numbers, a comma beside tabs or semicolons is a decimal comma."""
     if header:
-        return max(",;\t", key=line.count)
+        return max("\t;,", key=line.count)  # as many commas stand in the names
     return next((each for each in "\t;" if each in line), ",")
 
 
