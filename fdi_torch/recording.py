@@ -267,7 +267,7 @@ class Recording(Shown):
         return replace(self, mask=self.mask & keep[:, None])
 
     def every(self, step: int) -> Recording:
-        """Every step-th sample. A held input becomes its mean until the next kept sample, which preserves the volume.
+        """Every step-th sample. An input becomes its mean until the next kept sample, held, which preserves the volume.
 
         A mean over any unknown input (NaN) is unknown.
         """
@@ -277,19 +277,25 @@ class Recording(Shown):
             return self
         if step >= len(self):
             raise ValueError(f"{self.source}: expected every below its {len(self)} samples, got {step}; lower it")
-        inputs = self._held_means(step) if self.hold == "zero_order" else self.inputs[::step]
         return replace(
-            self, time=self.time[::step], inputs=inputs, outputs=self.outputs[::step], mask=self.mask[::step]
+            self,
+            time=self.time[::step],
+            inputs=self._means(step),
+            outputs=self.outputs[::step],
+            mask=self.mask[::step],
+            hold="zero_order",
         )
 
-    def _held_means(self, step: int) -> torch.Tensor:
-        """Mean inputs (T/step, M) over blocks of `step` samples, weighted by the time for which each is held."""
-        steps = torch.diff(self.time)
-        held = torch.cat((steps, steps[-1:]))[:, None]
+    def _means(self, step: int) -> torch.Tensor:
+        """Mean inputs (T/step, M) over blocks of `step` samples, weighted by the time from each sample to the next."""
+        steps, inputs = torch.diff(self.time), self.inputs
+        if self.hold == "linear":
+            inputs = torch.cat((0.5 * (inputs[1:] + inputs[:-1]), inputs[-1:]))
+        lasting = torch.cat((steps, steps[-1:]))[:, None]
         block = torch.arange(len(self.time), device=self.time.device) // step
-        first = self.inputs[::step]
-        volume = torch.zeros_like(first).index_add_(0, block, (self.inputs - first[block]) * held)
-        return first + volume / held.new_zeros(len(first), 1).index_add_(0, block, held)
+        first = inputs[::step]
+        volume = torch.zeros_like(first).index_add_(0, block, (inputs - first[block]) * lasting)
+        return first + volume / lasting.new_zeros(len(first), 1).index_add_(0, block, lasting)
 
     def known_segments(self) -> list[Recording]:
         """The longest segments in which all inputs are known."""

@@ -83,6 +83,16 @@ def test_every_weighs_by_how_long_a_command_is_held() -> None:
     )
 
 
+def test_every_keeps_the_volume_of_an_input_that_is_interpolated() -> None:
+    """A pump that runs at every tenth sample ran at every one that was kept: ten times the volume."""
+    pulses = recording([0, 1, 2, 3, 4, 5, 7, 9], [6, 0, 0, 0, 6, 0, 0, 2], [0] * 8)
+    thinned = replace(pulses, hold="linear").every(4)
+    assert (thinned.time.tolist(), thinned.hold) == ([0.0, 4.0], "zero_order")
+    volume = torch.trapezoid(pulses.inputs[:, 0], pulses.time)
+    assert thinned.inputs.flatten().tolist() == pytest.approx([6.0 / 4.0, (3.0 + 0.0 + 2.0 + 2.0 * 2.0) / 7.0])
+    assert float(volume) == pytest.approx(float(thinned.inputs[0] * 4.0 + thinned.inputs[1] * 7.0 - 2.0 * 2.0))
+
+
 def test_every_leaves_an_unknown_input_unknown() -> None:
     thin = recording([0, 1, 2, 3], [1, float("nan"), 1, 1], [0, 0, 0, 0]).every(2)
     assert torch.isnan(thin.inputs.flatten()).tolist() == [True, False]
