@@ -8,23 +8,29 @@ from contextvars import ContextVar
 from datetime import UTC, datetime, timedelta, timezone
 
 MOMENTS = ("onset", "begin")
-"""Names of effect parameters that are times of the recording."""
+"""Names of effect parameters that are times of the recording, from its first sample on."""
 _ZERO: ContextVar[float | None] = ContextVar("time 0 as the recording's clock showed it", default=None)
+_FIRST: ContextVar[float | None] = ContextVar("time of the first sample of what is fitted, s", default=0.0)
 
 
-def show_clock(zeros: Iterable[float | None]) -> None:
-    """From now on, show clock times if all recordings have the same time 0, s since 1970 in their own zone."""
+def show_clock(zeros: Iterable[float | None], firsts: Iterable[float] = (0.0,)) -> None:
+    """From now on, show clock times if all recordings have the same time 0, s since 1970 in their own zone.
+
+    firsts: times of their first samples, s, from which the moments of their effects count.
+    """
     _ZERO.set(_common(zeros))
+    _FIRST.set(_common(firsts))
 
 
 @contextmanager
-def clock_shown(zeros: Iterable[float | None]) -> Iterator[None]:
+def clock_shown(zeros: Iterable[float | None], firsts: Iterable[float] = (0.0,)) -> Iterator[None]:
     """Context within which clock times are shown as by `show_clock`."""
-    token = _ZERO.set(_common(zeros))
+    tokens = _ZERO.set(_common(zeros)), _FIRST.set(_common(firsts))
     try:
         yield
     finally:
-        _ZERO.reset(token)
+        _ZERO.reset(tokens[0])
+        _FIRST.reset(tokens[1])
 
 
 def clock_zero() -> float | None:
@@ -42,8 +48,13 @@ def clock_text(seconds: float) -> str:
 
 
 def clock_unit(unit: str, field: str, seconds: float) -> str:
-    """The unit of a parameter, with the clock time if it is a time of the recording: 's (2026-11-20 08:41:40)'."""
-    moment = clock_text(seconds) if field in MOMENTS else ""
+    """The unit of a parameter, with the clock time if it is a time of the recording: 's (2026-11-20 08:41:40)'; without
+    dates 's (at 700.1 s)' where the recording was cut, because a parameter counts from the first sample, in s.
+    """
+    first = _FIRST.get()
+    if field not in MOMENTS or first is None:
+        return unit
+    moment = clock_text(first + seconds) or (f"at {first + seconds:.6g} s" if first else "")
     return f"{unit} ({moment})" if moment else unit
 
 

@@ -61,7 +61,7 @@ class Recording(Shown):
                     "convert it by torch.tensor(..., dtype=torch.float64)"
                 )
         if self.mask is None:
-            object.__setattr__(self, "mask", torch.isfinite(self.outputs))
+            object.__setattr__(self, "mask", torch.ones_like(self.outputs, dtype=torch.bool))
         samples = len(self.time)
         for name, tensor, width in (
             ("inputs", self.inputs, len(self.input_names)),
@@ -72,6 +72,7 @@ class Recording(Shown):
                 raise ValueError(
                     f"{self.source}: expected {name} of shape {(samples, width)}, got {tuple(tensor.shape)}"
                 )
+        object.__setattr__(self, "mask", self.mask & torch.isfinite(self.outputs))
         beyond = self.time[~(self.time.abs() <= LONGEST)]
         if len(beyond):
             raise ValueError(
@@ -215,9 +216,12 @@ class Recording(Shown):
 
     @property
     def origin(self) -> dict[str, str]:
-        """What a log says of the recording's file: path, hash, time 0, and the unit of each channel in it."""
+        """What a log says of the recording's file: path, hash, time 0, first time of a part, s, and the unit of each
+        channel in the file.
+        """
         began = "" if self.began is None else stamp(self.began, self.zone)
         clock = {"began": began} if began else {}
+        clock |= {"first": repr(float(self.time[0]))} if len(self) and self.time[0] else {}
         return {"path": self.source, "sha256": self.sha256} | clock | {f"unit.{n}": u for n, u in self.written.items()}
 
     @property
@@ -276,7 +280,7 @@ class Recording(Shown):
         return replace(self, mask=self.mask & keep[:, None])
 
     def every(self, step: int) -> Recording:
-        """Every step-th sample. A held input becomes its mean until the next kept sample, which preserves the volume.
+        """Every step-th sample. An input becomes its mean until the next kept sample, held, which preserves the volume.
 
         A mean over any unknown input (NaN) is unknown.
         """
@@ -286,19 +290,25 @@ class Recording(Shown):
             return self
         if step >= len(self):
             raise ValueError(f"{self.source}: expected every below its {len(self)} samples, got {step}; lower it")
-        inputs = self._held_means(step) if self.hold == "zero_order" else self.inputs[::step]
         return replace(
-            self, time=self.time[::step], inputs=inputs, outputs=self.outputs[::step], mask=self.mask[::step]
+            self,
+            time=self.time[::step],
+            inputs=self._means(step),
+            outputs=self.outputs[::step],
+            mask=self.mask[::step],
+            hold="zero_order",
         )
 
-    def _held_means(self, step: int) -> torch.Tensor:
-        """Mean inputs (T/step, M) over blocks of `step` samples, weighted by the time for which each is held."""
-        steps = torch.diff(self.time)
-        held = torch.cat((steps, steps[-1:]))[:, None]
+    def _means(self, step: int) -> torch.Tensor:
+        """Mean inputs (T/step, M) over blocks of `step` samples, weighted by the time from each sample to the next."""
+        steps, inputs = torch.diff(self.time), self.inputs
+        if self.hold == "linear":
+            inputs = torch.cat((0.5 * (inputs[1:] + inputs[:-1]), inputs[-1:]))
+        lasting = torch.cat((steps, steps[-1:]))[:, None]
         block = torch.arange(len(self.time), device=self.time.device) // step
-        first = self.inputs[::step]
-        volume = torch.zeros_like(first).index_add_(0, block, (self.inputs - first[block]) * held)
-        return first + volume / held.new_zeros(len(first), 1).index_add_(0, block, held)
+        first = inputs[::step]
+        volume = torch.zeros_like(first).index_add_(0, block, (inputs - first[block]) * lasting)
+        return first + volume / lasting.new_zeros(len(first), 1).index_add_(0, block, lasting)
 
     def known_segments(self) -> list[Recording]:
         """The longest segments in which all inputs are known."""

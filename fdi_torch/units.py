@@ -22,6 +22,7 @@ MOST_CHARACTERS = 64
 
 _registry: pint.UnitRegistry[float] = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
 _registry.define("duty = [] ")
+_registry.define("turn = 1 = _ = revolution = cycle = circle")  # counted as Hz counts: 60 rpm are 1 Hz, not 2 pi 1/s
 _registry.define("lps = litre / second")
 _registry.define("percent = 0.01 = pct")
 for _short, _long in {"gpm": "gallon / minute", "gph": "gallon / hour", "lpm": "l / minute", "lph": "l / hour"}.items():

@@ -96,6 +96,15 @@ def test_a_sensor_that_never_moves_is_compared_with_its_neighbours_noise() -> No
 EACH_SENSOR = [(0, None, 0), (1, None, 800), (2, 0.0, 800), pytest.param(1, 0.0, 0, marks=pytest.mark.slow)]
 
 
+def test_the_onset_of_a_stuck_sensor_counts_from_the_first_sample_of_a_part_of_a_recording() -> None:
+    whole = from_sample(sound(), 1, 800, None)
+    for run in (whole, whole.window(float(whole.time[200]))):
+        first = 800 - len(whole) + len(run)
+        (known,) = problem_of(nominal_plant(), [run], [], PLAIN).known_effects
+        assert known.values is not None
+        assert known.values["onset"] == pytest.approx(float(run.time[first] - run.time[0]))
+
+
 @pytest.mark.parametrize(("column", "value", "first"), EACH_SENSOR)
 def test_a_stuck_sensor_is_masked_and_reported(column: int, value: float | None, first: int) -> None:
     found = examined(nominal_plant(), from_sample(sound(), column, first, value))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -12,6 +12,8 @@ from fdi_torch.clock import clock_text, clock_unit, show_clock
 from fdi_torch.config.loaded_recordings import read_recording
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.jobs.report import report
+from fdi_torch.quantities import displayed_in
+from fdi_torch.report.numbers import estimate_cells
 
 PLANT = """name: rig
 tanks: {A: {area: 200 cm^2, height: 60 cm}}
@@ -83,3 +85,30 @@ def test_events_of_a_monitor_and_its_page_show_the_clock_time(
     (path,) = tmp_path.glob("*.mcap")
     page = Path(report([path]).page).read_text()
     assert "2026-11-20 08:38:" in page and "after 2026-11-20 08:30:00" in page
+
+
+def test_a_moment_counts_from_the_first_sample_and_is_in_seconds_whatever_is_displayed() -> None:
+    show_clock([BEGAN.replace(tzinfo=UTC).timestamp()], [300.0])
+    assert clock_unit("s", "onset", 200.0) == "s (2026-11-20 08:38:20)" and clock_text(500.0) == "2026-11-20 08:38:20"
+    with displayed_in({"s": "min"}):
+        assert estimate_cells("A.leak.onset", "s", 180.0, 6.0)[:2] == ["min (2026-11-20 08:38:00)", "3.00 ± 0.10"]
+    show_clock([None], [300.0])
+    assert (clock_unit("s", "onset", 200.0), clock_unit("s", "ramp", 200.0)) == ("s (at 500 s)", "s")
+    show_clock([0.0], [0.0, 300.0])
+    assert clock_unit("s", "onset", 200.0) == "s"  # two parts of one file, each with its own onset
+    show_clock([None])
+    assert clock_unit("s", "onset", 200.0) == "s"
+
+
+def test_the_onset_in_a_part_of_a_recording_has_its_date_on_terminal_and_page(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "part.yaml").write_text(
+        "plant: plant.yaml\nrecordings: [{file: offset.csv, start: 300 s}]\n"
+        "estimate: {parameters: [A.leak, A.leak.onset], calibrate: [], search: {evaluations: 2000}}\n"
+    )
+    main(["train", "--config", str(folder / "part.yaml"), "--out", str(tmp_path), "--quiet"])
+    (row,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("A.leak.onset"))
+    assert "s (2026-11-20 08:38:2" in row or "s (2026-11-20 08:38:1" in row
+    (path,) = tmp_path.glob("*.mcap")
+    assert "(2026-11-20 08:38:" in Path(report([path]).page).read_text()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,14 @@ import torch
 import yaml
 
 from fdi_torch.config.estimation import estimated_space, parameter_values, placements_of
-from fdi_torch.config.loaded_recordings import load_recordings, read_recording
+from fdi_torch.config.loaded_recordings import LoadedRecording, load_recordings, read_recording
 from fdi_torch.config.monitor_file import load_monitor
 from fdi_torch.config.problems import ConfigError, Source
 from fdi_torch.config.run_file import Run, build_run, load_run
 from fdi_torch.config.simulation import NoiseConfig, noise_std, planned_recording
 from fdi_torch.config.yaml_files import SHIPPED, read_yaml
 from fdi_torch.effects import build_network
-from fdi_torch.jobs.run_setup import requested_space
+from fdi_torch.jobs.run_setup import fitting_of, requested_space, simulate_recording
 from fdi_torch.parameters import ParameterSpace
 
 PAPER = ["T1.leak.size", "OUT2.net_outlet.size", "T3.leak.size", "P13.openness.size", "P32.openness.size"]
@@ -270,6 +271,55 @@ def test_noise_that_cannot_be_is_refused() -> None:
         noise_std(NoiseConfig(std={"h9": "1 mm"}), run().plant, clean)
     with pytest.raises(ConfigError, match=r"simulate.noise.std.h1: expected a quantity in m"):
         noise_std(NoiseConfig(std={"h1": "1 V"}), run().plant, clean)
+
+
+@pytest.mark.parametrize("first", [0.0, -600.0, 1.7e9])
+def test_an_onset_is_sought_within_the_recording_wherever_its_clock_begins(first: float) -> None:
+    wanted = run(estimate={"parameters": ["T1.leak", "T1.leak.onset"]})
+    recording = replace(simulate_recording(run()).every(10), trusted=True)
+    loaded = [LoadedRecording(replace(recording, time=recording.time + first), {"T1": 0.5, "T2": 0.5, "T3": 0.5})]
+    space = fitting_of(wanted, requested_space(wanted), loaded).space
+    assert (space["T1.leak.onset"].low, space["T1.leak.onset"].high) == (0.0, 1000.0)
+
+
+def test_an_output_that_varies_by_rounding_errors_only_is_constant() -> None:
+    """Two separate tanks, one of them at rest: its noise was 30 dB below the errors of the simulation, 1e-12 m."""
+    tank, drain = {"area": "200 cm^2", "height": "60 cm"}, {"area": "0.5 cm^2", "discharge_coefficient": 0.6}
+    plant = {
+        "tanks": {"A": tank, "B": tank},
+        "pipes": {f"out{t}": {"source": t, "target": "outside", **drain} for t in "AB"},
+        "pumps": {f"Q{t}": {"target": t, "max_flow": "6 l/min"} for t in "AB"},
+        "sensors": {f"h{t}": {"tank": t} for t in "AB"},
+    }
+    inputs = {"QA": {"steps": [["0 s", "3 l/min"], ["200 s", "4 l/min"]]}, "QB": "3 l/min"}
+    simulate = {"inputs": inputs, "duration": "600 s", "noise": {"snr_db": 30}}
+    with pytest.raises(ConfigError, match="expected outputs that vary, got a constant hB; give std"):
+        simulate_recording(run(plant=plant, simulate=simulate))
+    simulate["noise"] = {"snr_db": 30, "definition": "power"}
+    assert float(simulate_recording(run(plant=plant, simulate=simulate)).outputs[:, 1].std()) > 1e-3
+
+
+@pytest.mark.parametrize("inside", [True, False])
+def test_a_limited_sensor_reads_no_more_than_its_limit_and_no_noise_far_beyond(inside: bool) -> None:
+    tank = {"area": "200 cm^2", "height": "60 cm"}
+    sensor = {"tank": "A"} | ({} if inside else {"low": "0 cm", "high": "15 cm"})
+    plant = {
+        "tanks": {"A": tank},
+        "pipes": {"out": {"source": "A", "target": "outside", "area": "0.5 cm^2", "discharge_coefficient": 0.6}},
+        "pumps": {"Q": {"target": "A", "max_flow": "6 l/min"}},
+        "sensors": {"h": sensor},
+    }
+    inputs = {"Q": {"steps": [["0 s", "4 l/min"], ["300 s", "0 l/min"]]}}
+    simulate = {"inputs": inputs, "duration": "900 s", "noise": {"std": {"h": "2 mm"}}}
+    simulate["faults"] = {"h.sensor_quantization": "5 mm"}
+    readings = simulate_recording(run(plant=plant, simulate=simulate)).outputs[:, 0]
+    steps = readings / 0.005
+    assert torch.allclose(steps, steps.round(), atol=1e-9), "the simulated fault rounds as one of the plant file"
+    if inside:
+        assert float(readings.max()) > 0.2 and float(readings.min()) < 0.0
+    else:
+        assert (float(readings.max()), float(readings.min())) == (0.15, 0.0)
+        assert readings[:200].unique().tolist() == [0.15], "0.25 m are far beyond the limit"
 
 
 CSV = "t_s,Q1_cm3_s,Q2_cm3_s,h1_cm,h2_cm,h3_cm\n" + "".join(

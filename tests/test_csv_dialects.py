@@ -53,6 +53,23 @@ def test_each_says_the_same(tmp_path: Path, text: str, encoding: str) -> None:
     torch.testing.assert_close(recording.outputs[:, 0], torch.tensor([0.10, 0.11, 0.125], dtype=torch.float64))
 
 
+def test_windows_letters_far_from_the_beginning_are_read(tmp_path: Path) -> None:
+    rows = [f"{k},50,10,{'x' * 60}" for k in range(2000)]
+    text = "\n".join(["t_s,Q1_cm3_s,h1_cm,Bemerkung µ", *rows, "2000,50,11,geöffnet 20 °C", "2001,50,12,"])
+    plain = read(tmp_path, text)
+    for late in (text.replace("µ", "u"), text):
+        recording = read(tmp_path, late, "cp1252")
+        assert torch.equal(recording.outputs, plain.outputs) and recording.notes == ()
+    growing = GrowingCsv(tmp_path / "run.csv", ["Q1"], ["h1"])
+    assert growing.new()[2][-1].tolist() == [0.11]  # the last line is not complete yet
+
+
+def test_as_many_commas_in_the_names_as_semicolons_separate_no_columns(tmp_path: Path) -> None:
+    text = "Zeit_s;Q, soll [cm3/s];h, ist [cm]\n0;50,5;10\n5;50,5;11\n"
+    mapping = {"Q1": ChannelSource("Q, soll"), "h1": ChannelSource("h, ist")}
+    assert read(tmp_path, text, **mapping).inputs[:, 0].tolist() == pytest.approx([50.5e-6, 50.5e-6])
+
+
 @pytest.mark.parametrize("word", ["#N/A", "#DIV/0!", "Bad Input", "NaN", ""])
 def test_words_for_nothing_read_are_missing_readings(tmp_path: Path, word: str) -> None:
     assert read(tmp_path, PLAIN.replace("12.5", word)).mask.flatten().tolist() == [True, True, False]

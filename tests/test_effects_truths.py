@@ -340,6 +340,8 @@ def test_a_quantized_reading_is_the_nearest_step() -> None:
     readings = torch.tensor([[0.1234, 0.1234, 0.1234], [0.1234, 0.1266, 0.1234]], dtype=torch.float64)
     assert quantized(readings, network)[:, 1].tolist() == pytest.approx([0.12, 0.13])
     assert torch.equal(quantized(readings, network)[:, ::2], readings[:, ::2])
+    coarse = quantized(readings, network, {"h2.sensor_quantization.step": 0.05})
+    assert coarse[:, 1].tolist() == pytest.approx([0.10, 0.15])
 
 
 def test_the_heads_of_a_pipe_lie_between_those_of_its_ends() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
+from dataclasses import replace
 
 import pytest
 import torch
@@ -48,3 +49,25 @@ def test_recordings_that_do_not_determine_the_constant_do_not_count() -> None:
     told = between_run_spread([own(1.0), own(1.02), own(1.5, std=0.09)], 0.1)
     assert told is not None and told.count == 2 and told.mean == pytest.approx(1.01)
     assert between_run_spread([own(1.0), own(1.5, std=0.09)], 0.1) is None
+
+
+@pytest.mark.parametrize(("spread", "error"), [(0.5, 0.45), (2.0, 0.45), (1.0, 0.3)])
+def test_the_prior_of_the_tolerance_narrows_no_spread(spread: float, error: float) -> None:
+    """Each recording's estimate lies between the plant file's value, 1.0, and what its readings say."""
+    share = 1.0 - error**2
+    values = 1.0 + share * (drawn(spread, error / math.sqrt(share), runs=12) - 1.05)
+    told = [
+        between_run_spread([replace(own(float(v), error), nominal=1.0, share=share) for v in row], 1.0)
+        for row in values
+    ]
+    held = sum(t is not None and t.low <= spread <= t.high for t in told)
+    assert 0.92 < held / 400 < 0.98
+    variances = [t.std**2 for t in told if t is not None]
+    assert statistics.mean(variances) == pytest.approx(spread**2, rel=0.05)
+
+
+def test_values_that_are_exact_but_for_rounding_have_a_spread() -> None:
+    for k in range(100):
+        values = [1.0 + 0.1 * math.sin(12.9898 * k + j) for j in range(4)]
+        told = between_run_spread([own(v, 1e-12) for v in values], 1.0)
+        assert told is not None and told.std == pytest.approx(statistics.stdev(values))

@@ -17,7 +17,7 @@ import fdi_torch
 from fdi_torch.cli import MISUSE, NOT_EXPLAINED, main
 from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.gap.preprocess.acquisition import CheckedRecording
-from fdi_torch.plant.description import PlantDescription
+from fdi_torch.plant.description import PlacedEffect, PlantDescription
 from fdi_torch.quantities import display_in
 from fdi_torch.recordings.check import data_warnings
 from fdi_torch.recordings.plant_units import doubtful_units, excessive_flows, wrong_units
@@ -371,6 +371,16 @@ def test_flows_follow_from_levels_not_from_readings(folder: Path) -> None:
     then, now = balance_along(plant, run), balance_along(shifted, replace(run, outputs=run.outputs + 0.3))
     for a, b in zip(now.tanks, then.tanks, strict=True):
         torch.testing.assert_close(a.by_flow, b.by_flow, rtol=1e-9, atol=1e-12)
+
+
+def test_flows_do_not_depend_on_the_time_of_the_first_sample() -> None:
+    """An onset in the plant file counts from the first sample of a recording, also of one that is cut."""
+    plant = replace(load_plant("three_tank"), effects=(PlacedEffect("leak", "T1", {"size": 0.3, "onset": 300.0}),))
+    run = fdi_torch.simulate(plant, inputs={"Q1": "50 cm^3/s", "Q2": "60 cm^3/s"}, duration="600 s")
+    for first, moved in zip(
+        balance_along(plant, run).tanks, balance_along(plant, replace(run, time=run.time + 450.0)).tanks, strict=True
+    ):
+        assert torch.allclose(first.by_flow, moved.by_flow)
 
 
 def test_swapped_sensors_are_no_wrong_unit(folder: Path) -> None:

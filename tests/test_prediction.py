@@ -299,6 +299,7 @@ def test_what_each_recording_has_for_itself_is_told_with_how_much_it_differs() -
     assert [own.source for own in gains] == ["a", "b", "c"]
     for own, truth in zip(gains, (0.9, 1.0, 1.1), strict=True):
         assert abs(own.value - truth) < 4.0 * own.std < 0.05
+        assert own.nominal == 1.0 and 0.9 < own.share < 1.0, "nearly all from the readings"
     told = between_run_spread(gains, 0.2)
     assert told is not None and told.std == pytest.approx(0.1, rel=0.05) and told.low < 0.1 < told.high
     assert "Q.gain" not in found.fitted

@@ -33,6 +33,12 @@ def test_missing_readings_do_not_count() -> None:
     assert recording([0, 1, 2], [1, 1, 1], [1, float("nan"), 3]).mask.flatten().tolist() == [True, False, True]
 
 
+def test_a_reading_that_is_no_number_does_not_count_whatever_the_mask_says() -> None:
+    gap = replace(ramp(3), outputs=torch.tensor([[1.0], [float("nan")], [3.0]]).double())
+    assert gap.mask.flatten().tolist() == [True, False, True]
+    assert gap.valid_readings("h1").tolist() == [1.0, 3.0]
+
+
 def test_window_keeps_the_clock() -> None:
     assert ramp(10).window(2.0, 5.0).time.tolist() == [2, 3, 4, 5]
 
@@ -75,6 +81,16 @@ def test_every_weighs_by_how_long_a_command_is_held() -> None:
     assert recording([0, 1, 4, 5], [6, 2, 3, 3], [0, 0, 0, 0]).every(2).inputs[0].item() == pytest.approx(
         (6 + 2 * 3) / 4
     )
+
+
+def test_every_keeps_the_volume_of_an_input_that_is_interpolated() -> None:
+    """A pump that runs at every tenth sample ran at every one that was kept: ten times the volume."""
+    pulses = recording([0, 1, 2, 3, 4, 5, 7, 9], [6, 0, 0, 0, 6, 0, 0, 2], [0] * 8)
+    thinned = replace(pulses, hold="linear").every(4)
+    assert (thinned.time.tolist(), thinned.hold) == ([0.0, 4.0], "zero_order")
+    volume = torch.trapezoid(pulses.inputs[:, 0], pulses.time)
+    assert thinned.inputs.flatten().tolist() == pytest.approx([6.0 / 4.0, (3.0 + 0.0 + 2.0 + 2.0 * 2.0) / 7.0])
+    assert float(volume) == pytest.approx(float(thinned.inputs[0] * 4.0 + thinned.inputs[1] * 7.0 - 2.0 * 2.0))
 
 
 def test_every_leaves_an_unknown_input_unknown() -> None:

@@ -151,3 +151,25 @@ def test_keys_that_a_log_cannot_have_are_refused(
             list(growing_rows(config, plant, tmp_path, idle=0.1))
         else:
             read_recording(config, plant, tmp_path)
+
+
+def test_a_reading_on_another_topic_counts_once(tmp_path: Path) -> None:
+    """A slow sensor has no more readings than messages; they were repeated at every message of the fast one."""
+    with (tmp_path / "rig.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        fast, slow, pump = (writer.register_channel(topic, "json", 0) for topic in ("/fast", "/slow", "/pump"))
+        for i in range(6):
+            now = 1_790_000_000 * 10**9 + i * 500_000_000
+            if i in (1, 4):
+                writer.add_message(slow, now - 1000, b'{"level": %d}' % i, now)
+                writer.add_message(pump, now - 1000, b'{"flow": %d}' % i, now)
+            writer.add_message(fast, now, b'{"level": %d}' % i, now)
+        writer.finish()
+    mapping = {"h1": ChannelSource("/fast:level", "cm"), "h2": ChannelSource("/slow:level", "cm")}
+    found = read_mcap(
+        tmp_path / "rig.mcap", ["Q1"], ["h1", "h2"], mapping | {"Q1": ChannelSource("/pump:flow", "cm^3/s")}
+    )
+    assert found.mask.T.tolist() == [[True] * 6, [False, True, False, False, True, False]]
+    assert found.valid_readings("h2").tolist() == [0.01, 0.04]
+    assert (1e6 * found.inputs[1:, 0]).tolist() == pytest.approx([1.0, 1.0, 1.0, 4.0, 4.0])

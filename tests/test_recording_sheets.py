@@ -16,7 +16,7 @@ from fdi_torch.plant.description import PlantDescription
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.check import check_recording, data_warnings
 from fdi_torch.recordings.csv_growing import GrowingCsv
-from fdi_torch.recordings.source import ChannelSource
+from fdi_torch.recordings.source import ChannelSource, ClockSource
 
 PLANT = """
 tanks: {T: {area: 0.5 m^2, height: 2 m}}
@@ -289,3 +289,54 @@ def test_stretches_may_be_named_by_stamps(plant: PlantDescription, tmp_path: Pat
     assert cut.mask[:, 0].tolist() == [True, False, False, True]
     with pytest.raises(ConfigError, match=r"expected a time in s as in '300 s', .* its clock has no date"):
         read(plant, tmp_path, PLAIN, start="2026-03-29 03:00:02")
+
+
+@pytest.mark.parametrize("offset", ["", "+01:00"])
+def test_stamps_without_an_offset_are_in_the_zone_of_the_file(
+    plant: PlantDescription, tmp_path: Path, offset: str
+) -> None:
+    head, *rows = PLAIN.replace("t_s", "Zeit").splitlines()
+    text = "\n".join([head, *(f"2026-03-01 08:00:0{row[0]}{offset}{row[1:]}" for row in rows)])
+    cut = read(plant, tmp_path, text, start="2026-03-01 08:00:02", mask=[["2026-03-01 08:00:03", "4 s"]])
+    assert cut.time.tolist() == [2.0, 3.0, 4.0, 5.0]
+    assert cut.mask[:, 0].tolist() == [True, False, False, True]
+
+
+def test_rows_with_tags_have_the_zone_of_their_stamps(plant: PlantDescription, tmp_path: Path) -> None:
+    long = LONG.replace("2026-03-29 08:30:0", "2026-03-29T08:30:0")
+    zoned = "\n".join(
+        ",".join(cell + ("+05:30" if k == 1 and n else "") for k, cell in enumerate(row.split(",")))
+        for n, row in enumerate(long.splitlines())
+    )
+    recording = read(plant, tmp_path, zoned, tags=TAGS, columns=LONG_COLUMNS)
+    assert recording.zone == 19800.0
+    local = read(plant, tmp_path, long, tags=TAGS, columns=LONG_COLUMNS)
+    assert recording.clock_zero == local.clock_zero
+    berlin = LONG_COLUMNS | {"t": {"zone": "Europe/Berlin"}}
+    assert read(plant, tmp_path, long, tags=TAGS, columns=berlin).clock_zero == local.clock_zero
+
+
+def test_local_time_goes_on_where_clocks_are_set_back_in_two_years(plant: PlantDescription, tmp_path: Path) -> None:
+    stamps = ["2025-10-26 02:59:00", "2025-10-26 02:00:00", "2026-10-25 01:30:00"]
+    stamps += ["2026-10-25 02:30:00", "2026-10-25 02:10:00", "2026-10-25 03:00:00"]
+    rows = PLAIN.replace("t_s", "Zeit").splitlines()
+    text = "\n".join([rows[0], *(s + row[1:] for s, row in zip(stamps, rows[1:], strict=True))])
+    recording = read(plant, tmp_path, text, columns={"t": {"zone": "Europe/Berlin"}})
+    assert torch.diff(recording.time).tolist() == [60.0, 31444200.0, 3600.0, 2400.0, 3000.0]
+
+
+def test_a_clock_without_dates_that_passes_midnight_is_not_to_be_sorted(
+    plant: PlantDescription, tmp_path: Path
+) -> None:
+    rows = PLAIN.replace("t_s", "Zeit").splitlines()
+    stamps = ["23:59:58", "23:59:59", "00:00:00", "00:00:01", "00:00:02", "00:00:03"]
+    text = "\n".join([rows[0], *(s + row[1:] for s, row in zip(stamps, rows[1:], strict=True))])
+    with pytest.raises(ConfigError, match=r"row 4, .* got -86398 s after 1 s .*midnight.*; add the date") as error:
+        read(plant, tmp_path, text, columns={"t": {"stamps": "%H:%M:%S"}})
+    assert "sort" not in str(error.value)
+
+
+def test_the_shift_of_a_clock_is_followed(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text(PLAIN)
+    growing = GrowingCsv(tmp_path / "run.csv", ["Q"], ["h"], {"t": ClockSource(shift=37.0)})
+    assert growing.new()[0].tolist() == [37.0, 38.0, 39.0, 40.0, 41.0, 42.0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,8 +13,8 @@ import torch
 from fdi_torch.cli.screen import Screen
 from fdi_torch.cli.study import show
 from fdi_torch.config.plant_file import load_plant
-from fdi_torch.config.problems import ConfigError
-from fdi_torch.config.study_file import Study, load_study
+from fdi_torch.config.problems import ConfigError, Source
+from fdi_torch.config.study_file import Study, build_study, load_study
 from fdi_torch.effects import build_network
 from fdi_torch.estimate.evolution import EvolutionResult, distant_members
 from fdi_torch.estimate.refinement import starting_points
@@ -355,3 +356,37 @@ def test_constants_that_count_as_exact_are_named_with_the_key_that_estimates_the
     assert without_tolerance_sentence(plant, exact, constants) == ""
     show(StudyResult((), None, {}, 0, 1.0, Path("study.mcap")), Screen(), sentence)
     assert f"{sentence}\n" in capsys.readouterr().out
+
+
+def two_separate_tanks(sensor: dict[str, str], second: Any, snr_db: float | None) -> Plan:
+    """Two tanks without a connection, in one of which a leak is estimated."""
+    tank, drain = {"area": "200 cm^2", "height": "60 cm"}, {"area": "0.5 cm^2", "discharge_coefficient": 0.6}
+    plant = {
+        "tanks": {"A": tank, "B": tank},
+        "pipes": {f"out{t}": {"source": t, "target": "outside", **drain} for t in "AB"},
+        "pumps": {f"Q{t}": {"target": t, "max_flow": "6 l/min"} for t in "AB"},
+        "sensors": {f"h{t}": {"tank": t, **sensor} for t in "AB"},
+    }
+    inputs = {"QA": {"steps": [["0 s", "3 l/min"], ["200 s", "4 l/min"]]}, "QB": second}
+    data = {
+        "plant": plant,
+        "simulate": {"inputs": inputs, "duration": "600 s", "sample_time": "5 s", "faults": {"A.leak": 0.2}},
+        "estimate": {"parameters": ["A.leak"], "calibrate": []},
+        "study": {"snr_db": [snr_db], "trials": 2, "data_step": "1 s", "steps": ["5 s"], "search_step": "5 s"},
+    }
+    return build_study(data, Path.cwd(), Source("study.yaml")).plan
+
+
+def test_bounds_without_noise_are_those_of_a_millimetre_in_any_unit_of_the_sensors() -> None:
+    bounds = []
+    for gain in ({}, {"gain": "98.1 mbar/m"}, {"gain": "0.27 mA/cm"}):
+        plan = two_separate_tanks(gain, {"steps": [["0 s", "3 l/min"], ["300 s", "2 l/min"]]}, None)
+        bounds.append(float(limits(plan.fitting.engines(5.0)[0], make_trials(plan, Block(0, 0, 1, 0))).bound))
+    assert bounds[1:] == pytest.approx([bounds[0]] * 2, rel=1e-6) and bounds[0] > 1e-5
+
+
+def test_a_constant_output_has_no_signal_to_noise_ratio() -> None:
+    with pytest.raises(
+        ValueError, match=r"study\.snr_db: expected outputs that vary in every trial, got a constant hB"
+    ):
+        make_trials(two_separate_tanks({}, "3 l/min", 30.0), Block(0, 0, 2, 0))

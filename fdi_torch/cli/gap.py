@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
     holdouts = [r for name in arguments.holdout for r in named_recordings(name, plant, Path.cwd())]
     for note in dict.fromkeys(note for r in (*recordings, *holdouts) for note in r.notes):
         screen.note(note)
-    show_clock(r.clock_zero for r in recordings)
+    show_clock((r.clock_zero for r in recordings), (float(r.time[0]) for r in recordings))
     library = library_entries(arguments.library) or None
     settings = Settings(library, arguments.leave_out, arguments.step, arguments.most, arguments.named_only)
     expect_adoptable(arguments.adopt, arguments.replace)

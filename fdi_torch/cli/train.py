@@ -60,7 +60,8 @@ def show(done: TrainResult, screen: Screen) -> None:
     """
     say_doubts(done.doubts, screen)
     final, diagnosis = done.result.estimate, done.result.diagnosis
-    show_clock(r.clock_zero for r in done.fitting.recordings)
+    recordings = done.fitting.recordings
+    show_clock((r.clock_zero for r in recordings), (float(r.time[0]) for r in recordings))
     network, space = done.fitting.networks[0], done.fitting.space
     onsets = [f"{place.prefix}.onset" for place in network.placements]
     onsets = [name for name in onsets if name in network.constants and name not in space][:1]

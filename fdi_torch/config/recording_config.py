@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from datetime import UTC, datetime
+from datetime import datetime, timedelta, timezone
 from pathlib import PurePath
 from typing import Annotated, Any, Literal
 from zoneinfo import ZoneInfo
@@ -144,7 +144,7 @@ Moment = Annotated[float | datetime, BeforeValidator(_moment)]
 
 
 def in_seconds(moment: float | datetime, recording: Recording, config: RecordingConfig) -> float:
-    """Time on the recording's clock, s. A stamp without offset is in the zone of `t`, or else UTC.
+    """Time on the recording's clock, s. A stamp without offset is in the zone of `t`, or else in that of the file.
 
     Raises ValueError if the clock has no date.
     """
@@ -153,7 +153,8 @@ def in_seconds(moment: float | datetime, recording: Recording, config: Recording
     if recording.began is None:
         raise ValueError(f"{config.file}: expected a time in s as in '300 s', got {moment}: its clock has no date")
     zone = config.columns["t"].zone if "t" in config.columns else None
-    local = moment if moment.tzinfo else moment.replace(tzinfo=ZoneInfo(zone) if zone else UTC)
+    of_file = ZoneInfo(zone) if zone else timezone(timedelta(seconds=recording.zone))
+    local = moment if moment.tzinfo else moment.replace(tzinfo=of_file)
     return local.timestamp() - recording.began
 
 

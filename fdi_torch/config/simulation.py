@@ -21,7 +21,7 @@ from fdi_torch.plant.description import PlantDescription, Sensor
 from fdi_torch.quantities import parse_quantity
 from fdi_torch.recording import Recording
 from fdi_torch.simulate.resampling import interpolate
-from fdi_torch.simulate.simulated_recording import noise_level
+from fdi_torch.simulate.simulated_recording import constant_outputs, noise_level
 
 
 class InputConfig(Strict):
@@ -115,9 +115,8 @@ def noise_std(config: NoiseConfig, plant: PlantDescription, clean: Tensor) -> Te
     std = clean.new_zeros(len(names))
     if config.snr_db is not None:
         std = noise_level(clean, config.snr_db, config.definition)
-        if bool((std <= 0).any()):
-            constant_output = names[int((std <= 0).nonzero()[0])]
-            sentence = f"expected outputs that vary, got a constant {constant_output}; give std"
+        if constant := constant_outputs(clean, plant, config.definition):
+            sentence = f"expected outputs that vary, got a constant {constant[0]}; give std"
             raise ConfigError([sentence], "simulate.noise.snr_db")
     for name, value in config.std.items():
         place = f"simulate.noise.std.{name}"

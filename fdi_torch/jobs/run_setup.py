@@ -19,10 +19,11 @@ from fdi_torch.estimate.levenberg_marquardt import RefineSettings
 from fdi_torch.estimate.refinement import HybridSettings
 from fdi_torch.gap.preprocess.acquisition import usable
 from fdi_torch.parameters import ParameterName, ParameterSpace
+from fdi_torch.plant.description import with_unlimited_sensors
 from fdi_torch.plant.operating_range import bounded_by_recording
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.plant_limits import input_findings
-from fdi_torch.simulate.simulated_recording import clean_readings, with_noise
+from fdi_torch.simulate.simulated_recording import clean_readings, limited, with_noise
 
 
 def recordings_of(run: Run) -> list[LoadedRecording]:
@@ -70,16 +71,17 @@ def simulate_recording(run: Run) -> Recording:
     network = build_network(run.plant, placements)
     levels, _ = start_levels(run.plant, network, planned, config.start_levels)
     tanks = tuple(replace(t, start_level=float(h)) for t, h in zip(run.plant.tanks, levels, strict=True))
-    network = build_network(replace(run.plant, tanks=tanks), placements)
+    plant = replace(run.plant, tanks=tanks)
+    network = build_network(plant, placements)
     with naming_source(run.source):
         values = parameter_values(config.faults, network.constants, run.plant)
         _expect_onsets_within(config.duration, values)
-        clean = clean_readings(network, planned, values)
-        std = noise_std(config.noise, run.plant, clean)
+        clean = clean_readings(build_network(with_unlimited_sensors(plant), placements), planned, values)
+        std = noise_std(config.noise, run.plant, limited(clean, plant))
     seed = run.config.seed if config.seed is None else config.seed
     generator = torch.Generator().manual_seed(seed)
     notes = tuple(f"{finding.channel} {finding.text}" for finding in input_findings(planned, run.plant))
-    recording = with_noise(planned, clean, std, generator, network)
+    recording = with_noise(planned, clean, std, generator, network, values)
     return replace(recording, notes=notes)
 
 
@@ -115,7 +117,7 @@ def fitting_of(run: Run, space: ParameterSpace, loaded: Sequence[LoadedRecording
     """The estimation problem of parameters and recordings, with all tensors on the configured device."""
     device = usable_device(run.config.device)
     recordings = [part.recording.to(device) for part in loaded]
-    space = bounded_by_recording(space, max(float(r.time[-1]) for r in recordings))
+    space = bounded_by_recording(space, max(float(r.time[-1] - r.time[0]) for r in recordings))
     fitting = set_up(run.plant, recordings, space, [part.start_levels for part in loaded], run.config.engine)
     expect_enough_samples(recordings, fitting.space)
     return fitting

@@ -81,8 +81,9 @@ def mapped_signals(
 ) -> Signals:
     """A recording from any log: signal -> (topic, field). The first output's topic is the clock.
 
-    Time is the log time in s since the clock's first message, or the number in `time_field`. Signals on other topics
-    are held from their last message, and NaN before their first.
+    Time is the log time in s since the clock's first message, or the number in `time_field`. On other topics, an input
+    is held from its last message, and NaN before its first; an output is present once for each message, at the next
+    time of the clock.
     """
     if not outputs:
         raise ValueError("expected at least one output, got none; map a signal to a topic and a field")
@@ -91,20 +92,24 @@ def mapped_signals(
     origin = next((message.log_time for message in run.messages([clock_topic])), EPOCH_NS)
     tables = {t: _mapped_table(run, t, sources, time_field, origin) for t in {t for t, _ in sources.values()}}
     clock = tables[clock_topic][0]
-    columns = {name: held(tables[topic][0], tables[topic][1][name], clock) for name, (topic, _) in sources.items()}
-    u, y = (np.array([columns[name] for name in part]).reshape(len(part), len(clock)).T for part in (inputs, outputs))
+
+    def columns(part: Mapping[str, Source], once: bool) -> np.ndarray:
+        found = [held(tables[topic][0], tables[topic][1][name], clock, once) for name, (topic, _) in part.items()]
+        return np.array(found).reshape(len(part), len(clock)).T
+
+    u, y = columns(inputs, once=False), columns(outputs, once=True)
     return Signals(
         clock, u, y, np.isfinite(y), tuple(inputs), tuple(outputs), ("",) * len(inputs), ("",) * len(outputs)
     )
 
 
-def held(clock: np.ndarray, values: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Each signal's last value at or before `time`; NaN before its first."""
+def held(clock: np.ndarray, values: np.ndarray, time: np.ndarray, once: bool = False) -> np.ndarray:
+    """Each signal's last value at or before `time`; NaN before its first. once: NaN where it repeats the one before."""
     if np.array_equal(clock, time):
         return values
     last = np.searchsorted(clock, time, side="right") - 1
     taken = values[np.maximum(last, 0)] if len(clock) else np.full((len(time), *values.shape[1:]), np.nan)
-    taken[last < 0] = np.nan
+    taken[(last < 0) | (once & (np.diff(last, prepend=-1) == 0))] = np.nan
     return taken
 
 

@@ -253,6 +253,11 @@ def with_tolerances(plant: PlantDescription, kept: Callable[[ParameterName], boo
     return replace(plant, tolerances=tolerances, varying=varying)
 
 
+def with_unlimited_sensors(plant: PlantDescription) -> PlantDescription:
+    """The plant with sensors whose readings have no limits."""
+    return replace(plant, sensors=tuple(replace(sensor, low=None, high=None) for sensor in plant.sensors))
+
+
 FLOW_KINDS: tuple[type[FlowComponent], ...] = tuple(
     f.metadata["kind"] for f in fields(PlantDescription) if "kind" in f.metadata
 )

@@ -164,13 +164,13 @@ def _tagged_rows(
 ) -> tuple[Bound, list[Bound], list[Rows], list[str], StampReader]:
     """As `_table_rows`, of a file with a row per value."""
     constant = [name for name in names if (source := file.columns.get(name)) and source.constant is not None]
-    clock, tagged = read_tags(file, [name for name in names if name not in constant])
+    clock, tagged, stamps = read_tags(file, [name for name in names if name not in constant])
     rows: list[Rows] = [
-        (f" ({bound.header})", numbers, stamps, [bound], (values * np.float64(bound.factor))[:, None])
-        for bound, numbers, stamps, values in tagged
+        (f" ({bound.header})", numbers, times, [bound], (values * np.float64(bound.factor))[:, None])
+        for bound, numbers, times, values in tagged
     ]
     bounds = [bound for bound, *_ in tagged] + [bind(file.path, (), name, file.columns[name]) for name in constant]
-    return clock, bounds, rows, [], StampReader()
+    return clock, bounds, rows, [], stamps
 
 
 def _columns(whole: Sheet, names: Sequence[str], constants: Mapping[str, float]) -> np.ndarray:

@@ -11,9 +11,9 @@ import numpy as np
 from fdi_torch.recordings.csv_binding import bind_table
 from fdi_torch.recordings.csv_cells import parse_carefully
 from fdi_torch.recordings.csv_files import SINCE_1970, channels_in_si, from_first
-from fdi_torch.recordings.csv_text import heading_of, joined, open_csv
+from fdi_torch.recordings.csv_text import WINDOWS, heading_of, joined, open_csv
 from fdi_torch.recordings.sheets import fill_held
-from fdi_torch.recordings.source import ChannelSource
+from fdi_torch.recordings.source import ChannelSource, clock_in
 from fdi_torch.recordings.table_files import TableText
 
 
@@ -31,7 +31,7 @@ class GrowingCsv:
         mapping: Mapping[str, ChannelSource] | None = None,
     ) -> None:
         mapping = mapping or {}
-        self.path = path
+        self.path, self._shift = path, clock_in(mapping).shift
         with open_csv(path) as handle:
             if isinstance(handle, TableText):
                 raise ValueError(f"{path}: expected a CSV or MCAP file that is followed, got a table of another format")
@@ -71,7 +71,7 @@ class GrowingCsv:
         self._place += len(whole)
         rows: list[np.ndarray] = []
         problems = []
-        for line in whole.decode(self._encoding, errors="replace").splitlines():
+        for line in whole.decode(self._encoding, errors=WINDOWS).splitlines():
             try:
                 row = parse_carefully([*joined([line], self._columns.heading)], self._columns, self._line)
                 rows += [values for values in row if np.isfinite(values[0])]
@@ -95,7 +95,7 @@ class GrowingCsv:
         return np.stack(filled, axis=1)[before:] if filled else inputs
 
     def _seconds(self, clock: np.ndarray) -> np.ndarray:
-        seconds = clock * self._clock.factor
+        seconds = clock * self._clock.factor + self._shift
         if self._first is None and len(seconds):
             self._first = float(seconds[0])
         return seconds if self._first is None else from_first(seconds, self._first, self._clock)

@@ -37,8 +37,8 @@ def tag_columns(header: Sequence[str]) -> TagRows | None:
     return TagRows(tag, value, quality) if tag and value else None
 
 
-def read_tags(file: FileSource, names: Sequence[str]) -> tuple[Bound, list[Tagged]]:
-    """The clock, and the rows of each channel in the order of the file.
+def read_tags(file: FileSource, names: Sequence[str]) -> tuple[Bound, list[Tagged], StampReader]:
+    """The clock, the rows of each channel in the order of the file, and the reader of time stamps.
 
     Raises ValueError, naming file and row, for a missing tag, a channel without unit, or a malformed cell.
     """
@@ -77,7 +77,7 @@ def read_tags(file: FileSource, names: Sequence[str]) -> tuple[Bound, list[Tagge
             except ValueError as error:
                 raise ValueError(f"{path}: row {number} ({cells[tag].strip()}): {error}") from None
             rows[name].append((number, time, reading))
-    return clock, [_tagged(path, name, sources[name], rows[name], other_tags) for name in names]
+    return clock, [_tagged(path, name, sources[name], rows[name], other_tags) for name in names], read
 
 
 def _tagged(

@@ -89,9 +89,22 @@ def open_csv(path: Path, sheet: str | None = None) -> TextIO | TableText:
     if sheet is not None:
         raise ValueError(f"{path}: sheet: expected this key of an Excel workbook only, got a CSV file; leave it out")
     encoding = _encoding(path, beginning)
+    errors = "strict" if encoding == "utf-16" else WINDOWS
     if path.suffix == ".gz":
-        return io.TextIOWrapper(io.BufferedReader(_Unpacked(path)), encoding=encoding, newline="")
-    return path.open(encoding=encoding, newline="")
+        return io.TextIOWrapper(io.BufferedReader(_Unpacked(path)), encoding, errors, newline="")
+    return path.open(encoding=encoding, errors=errors, newline="")
+
+
+WINDOWS = "windows-1252"
+"""Error handler that reads bytes which are not UTF-8 as Windows-1252, also far from the beginning of a file."""
+
+
+def _in_windows(error: UnicodeError) -> tuple[str, int]:
+    assert isinstance(error, UnicodeDecodeError)
+    return error.object[error.start : error.end].decode("cp1252", "replace"), error.end
+
+
+codecs.register_error(WINDOWS, _in_windows)
 
 
 class _Unpacked(io.RawIOBase):
@@ -155,10 +168,6 @@ def _encoding(path: Path, start: bytes) -> str:
     if foreign or b"\0" in start:
         got = foreign or "something that is not text"
         raise ValueError(f"{path}: expected a CSV, MCAP, Parquet, Feather, Excel, MATLAB or HDF5 file, got {got}")
-    try:
-        codecs.getincrementaldecoder("utf-8")().decode(start)
-    except UnicodeDecodeError:
-        return "cp1252"
     return "utf-8-sig"
 
 
@@ -209,7 +218,7 @@ _ALL_NUMBERS = re.compile(r"(?=.*\d)[\d\s.,;:+\-eE]+", re.DOTALL)  # also time s
 def _delimiter(line: str, header: bool) -> str:
     """The delimiter of the columns. In a row of numbers, a comma beside tabs or semicolons is a decimal comma."""
     if header:
-        return max(",;\t", key=line.count)
+        return max("\t;,", key=line.count)  # as many commas stand in the names
     return next((each for each in "\t;" if each in line), ",")
 
 

@@ -64,11 +64,13 @@ def in_order(
         )
     if not sort:
         drop = int(decreasing[0])
-        before, after = seconds[drop : drop + 2] - (seconds[0] if seconds[0] > LONG_AGO else 0.0)
+        before, after = seconds[drop : drop + 2] - (seconds[0] if abs(seconds[0]) > LONG_AGO else 0.0)
         fix = "correct the clock, or let rows be sorted: columns: {t: {sort: true}}"
         if (np.diff(seconds) >= 0).all():
             fix = "keep the last row of each time by columns: {t: {sort: true}}, or count rows: {t: {period: 50 ms}}"
         fix = summer if summer and abs(before - after - HOUR) < NEARLY else fix
+        if seconds[0] < -LONG_AGO:  # a format without a date means the year 1900
+            fix = "a clock without dates begins anew at midnight; add the date to its column"
         raise ValueError(
             f"{place.format(rows[drop + 1])}: expected time that increases, got {after:g} s after {before:g} s "
             f"({counted(len(decreasing), 'such row')}); {fix}"

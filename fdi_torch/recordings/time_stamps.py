@@ -79,15 +79,15 @@ def expect_zone(zone: str) -> None:
 def from_zone(local: np.ndarray, zone: str) -> np.ndarray:
     """Seconds since 1970 of local times (R,), which are given as seconds since 1970 as if they were UTC.
 
-    In the hour that occurs twice, times count as the first occurrence until the clock goes back, then as the second.
+    In an hour that occurs twice, times count as the first occurrence until the clock goes back, then as the second.
     """
     quarters, place = np.unique(np.floor(local / QUARTER), return_inverse=True)
     naive = [_EPOCH.replace(tzinfo=None) + timedelta(seconds=float(q) * QUARTER) for q in quarters]
     first, second = (np.array([_offset(moment, zone, fold) for moment in naive])[place] for fold in (0, 1))
     twice = first > second
-    back = np.zeros(len(local), dtype=bool)
-    back[1:] = (np.diff(local) < -BACK) & twice[1:]
-    return local - np.where(twice & np.logical_or.accumulate(back), second, first)
+    back, number = np.append(False, np.diff(local) < -BACK) & twice, np.arange(len(local))
+    last_back, last_once = (np.maximum.accumulate(np.where(each, number, -1)) for each in (back, ~twice))
+    return local - np.where(last_back > last_once, second, first)
 
 
 def offset_of_zone(seconds: float, zone: str) -> float:

@@ -136,7 +136,7 @@ def balance_along(plant: PlantDescription, recording: Recording, units: Mapping[
     columns = recording.input_columns(plant.channels())
     channels = [inputs[: len(recording) - 1, columns[channel]] for _, channel in network.actuators()]
     instant = recording.time.new_tensor(INSTANT)
-    clock = Clock(recording.time[:-1], instant, instant)
+    clock = Clock(recording.time[:-1] - recording.time[0], instant, instant)  # as of a simulation
     commands, _ = network.commands(channels, network.steady_command_memory(channels, clock, values), clock, values)
     middle = [0.5 * (level[1:] + level[:-1]) for level in levels]
     point = network.operating_point(middle, commands, clock, values)

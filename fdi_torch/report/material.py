@@ -154,7 +154,7 @@ class Material:
         written = (key.partition(".unit.") for key in self.about("data"))
         channels = {name: self.about("data")[f"{k}.unit.{name}"] for k, divided, name in written if divided}
         units = {**(units_for_display(self.plant) if self.plant else {}), **channels}
-        with clock_shown(self.clock_zeros), displayed_in(units):
+        with clock_shown(self.clock_zeros, self._first_times), displayed_in(units):
             yield
 
     @property
@@ -165,6 +165,13 @@ class Material:
         zeros = [_clock_zero(about.get(f"{k}.began")) for k in numbers]
         origins = [message.get("origin") for message in self.of(CLOCK)]
         return zeros or [float(zero) for zero in origins if isinstance(zero, int | float)]
+
+    @property
+    def _first_times(self) -> list[float]:
+        """Time of the first sample of each recording, s."""
+        about = self.about("data")
+        numbers = [key.removesuffix(".path") for key in about if key.endswith(".path")]
+        return [_seconds(about.get(f"{k}.first", "0")) for k in numbers] or [0.0]
 
     @property
     def meaning_of_shares(self) -> str:
@@ -180,6 +187,14 @@ def _clock_zero(began: str | None) -> float | None:
         return None if began is None else sum(of_stamp(began))
     except ValueError:
         return None
+
+
+def _seconds(text: str) -> float:
+    """A time of a log; 0 for anything else."""
+    try:
+        return float(text)
+    except ValueError:
+        return 0.0
 
 
 def gather(run: Run, plant: PlantDescription | None = None) -> Material:

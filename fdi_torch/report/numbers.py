@@ -65,7 +65,7 @@ def estimate_cells(
     numbers = (math.nan if value is None else float(value), math.inf if std is None else float(std))
     unit, value, std, low, high = in_display_unit(name, si_unit, *numbers, *limits)
     known = math.isfinite(value) and math.isfinite(std)
-    unit = clock_unit(unit, ParameterName.parse(name).field, value) if known else unit
+    unit = clock_unit(unit, ParameterName.parse(name).field, numbers[0]) if known else unit
     estimate = rounded(value, std) if end and known and std > 0.0 else with_error(value, std)
     return [unit, estimate, interval_words(value, std, low, high, end)]
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from fdi_torch.parameters import ParameterSpace
+from fdi_torch.plant.description import PlantDescription
 from fdi_torch.plant.effect import Stage
 from fdi_torch.plant.network import TankNetwork
 from fdi_torch.plant.scales import length_scale, time_scale
@@ -58,24 +59,48 @@ def noise_level(
     return (power * 10.0 ** (-snr_db / 10.0)).sqrt()
 
 
+def constant_outputs(
+    clean: Float[Tensor, "*batch T N"], plant: PlantDescription, definition: str = "variance"
+) -> list[str]:
+    """The outputs without a signal, whose signal-to-noise ratio is undefined.
+
+    The root of their power P, as in `noise_level`, is within the errors of the simulation and of its start at rest.
+    """
+    signal = noise_level(clean, 0.0, definition).reshape(-1, clean.shape[-1]).amin(dim=0)
+    error = 2.0 * TOLERANCE * length_scale(plant)
+    return [s.column for s, size in zip(plant.sensors, signal.tolist(), strict=True) if size <= error * abs(s.gain)]
+
+
 def with_noise(
     planned: Recording,
     clean: Float[Tensor, "T N"],
     std: Float[Tensor, " N"],
     generator: torch.Generator,
     network: TankNetwork,
+    values: Mapping[str, float] | None = None,
 ) -> Recording:
-    """The recording of clean readings (T, N) by sensors with white noise of standard deviation std (N,).
+    """The recording of clean readings (T, N), without the limits of the sensors, with white noise of standard deviation
+    std (N,). values: the constants that were changed for the clean readings.
 
-    A quantizing sensor rounds after the noise, with its nominal step.
+    A quantizing sensor rounds the noisy reading, and a limited one then limits it.
     """
     noise = torch.randn(clean.shape, generator=generator, dtype=clean.dtype) * std
-    return replace(planned, outputs=quantized(clean + noise, network), mask=torch.isfinite(clean), source="simulated")
+    outputs = limited(quantized(clean + noise, network, values), network.description)
+    return replace(planned, outputs=outputs, mask=torch.isfinite(clean), source="simulated")
 
 
-def quantized(readings: Float[Tensor, "T N"], network: TankNetwork) -> Float[Tensor, "T N"]:
-    """Readings (T, N) rounded by the plant's quantizing sensors."""
-    values = network.bind(ParameterSpace(), readings.new_zeros(0))
+def limited(readings: Float[Tensor, "T N"], plant: PlantDescription) -> Float[Tensor, "T N"]:
+    """Readings (T, N) limited to the ranges of the plant's sensors."""
+    columns = zip(plant.sensors, readings.unbind(-1), strict=True)
+    return torch.stack([sensor.clipped(column) for sensor, column in columns], dim=-1)
+
+
+def quantized(
+    readings: Float[Tensor, "T N"], network: TankNetwork, changed: Mapping[str, float] | None = None
+) -> Float[Tensor, "T N"]:
+    """Readings (T, N) rounded by the plant's quantizing sensors. changed: constants that differ from the plant's."""
+    space = ParameterSpace(network.constants[name] for name in changed or {})
+    values = network.bind(space, readings.new_tensor([*(changed or {}).values()]))
     columns = list(readings.unbind(-1))
     for placement in network.placements:
         if placement.effect.stage is Stage.READING and placement.effect.quantizes:

@@ -22,10 +22,10 @@ from fdi_torch.estimate.misfit import UNEXPLAINED_RATIO
 from fdi_torch.estimate.objectives import OBJECTIVES, Objective, Problem, Term, spread_of
 from fdi_torch.sample_noise import sample_noise
 from fdi_torch.simulate.engine import Engine, Readings
-from fdi_torch.simulate.simulated_recording import noise_level
+from fdi_torch.simulate.simulated_recording import constant_outputs, noise_level
 from fdi_torch.study.study_plan import Block, Plan
 
-# Noise (m) for which bounds are stated if the readings have none.
+# Noise of the level (m) for which bounds are stated if the readings have none.
 NOMINAL_NOISE = 1e-3
 
 
@@ -48,8 +48,13 @@ def make_trials(plan: Plan, block: Block) -> Trials:
     truth = setting.faults[block.first : block.last]
     clean = _clean(plan.fitting.engines(plan.method.data_step)[0], truth)
     if setting.snr_db is None:
-        zeros = torch.zeros_like(clean)
-        return Trials(truth, clean, zeros, torch.full_like(clean[:, 0], NOMINAL_NOISE))
+        gains = clean.new_tensor([abs(sensor.gain) for sensor in plan.fitting.plant.sensors])
+        return Trials(truth, clean, torch.zeros_like(clean), (NOMINAL_NOISE * gains).expand_as(clean[:, 0]))
+    if constant := constant_outputs(clean, plan.fitting.plant, plan.snr_definition):
+        raise ValueError(
+            f"study.snr_db: expected outputs that vary in every trial, got a constant {constant[0]}; change "
+            "simulate.inputs, or leave its sensor out of the plant file"
+        )
     std = noise_level(clean, setting.snr_db, plan.snr_definition)
     noise = plan.noise(block, tuple(clean.shape[1:])) * std[:, None, :]
     return Trials(truth, clean + noise, noise, std)

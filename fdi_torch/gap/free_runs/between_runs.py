@@ -13,13 +13,23 @@ DETERMINED = 0.5  # share of the tolerance; a larger standard error means that t
 
 @dataclass(frozen=True)
 class RunConstant:
-    """A constant in one recording: source and start (s) of the recording, value and standard error in SI."""
+    """A constant in one recording: source and start (s) of the recording, value and standard error in SI.
+
+    share: of the readings in the information on it; the rest is the prior about `nominal` by its tolerance.
+    """
 
     name: str
     source: str
     start: float
     value: float
     std: float
+    nominal: float = 0.0
+    share: float = 1.0
+
+    @property
+    def by_readings_alone(self) -> tuple[float, float]:
+        """Value and standard error without the prior, which draws the values of all recordings towards `nominal`."""
+        return self.nominal + (self.value - self.nominal) / self.share, self.std / math.sqrt(self.share)
 
 
 @dataclass(frozen=True)
@@ -36,7 +46,7 @@ class BetweenRunSpread:
 def between_run_spread(constants: Sequence[RunConstant], tolerance: float) -> BetweenRunSpread | None:
     """Between-run standard deviation s over the recordings that determine the constant; None for fewer than two.
 
-    The values x_i with the standard errors e_i are normal with the variances s^2 + e_i^2, so that
+    The values x_i by the readings alone with the standard errors e_i are normal with the variances s^2 + e_i^2, so that
 
         Q(s^2) = sum w_i (x_i - m)^2,   w_i = 1 / (s^2 + e_i^2),   m = sum w_i x_i / sum w_i,
 
@@ -50,8 +60,7 @@ def between_run_spread(constants: Sequence[RunConstant], tolerance: float) -> Be
     count = len(determined)
     if count < 2:
         return None
-    values = torch.tensor([o.value for o in determined], dtype=torch.float64)
-    errors = torch.tensor([o.std for o in determined], dtype=torch.float64)
+    values, errors = torch.tensor([o.by_readings_alone for o in determined], dtype=torch.float64).unbind(1)
     scale = float(values.var())
 
     def weighted(variance: float) -> tuple[float, float]:
@@ -63,7 +72,7 @@ def between_run_spread(constants: Sequence[RunConstant], tolerance: float) -> Be
     def variance_at(chi_square: float) -> float:
         if weighted(0.0)[1] <= chi_square:
             return 0.0
-        return float(brentq(lambda v: weighted(v)[1] - chi_square, 0.0, (count - 1) / chi_square))
+        return float(brentq(lambda v: weighted(v)[1] - chi_square, 0.0, 2.0 * (count - 1) / chi_square))
 
     high, estimate, low = (variance_at(q) for q in (chdtri(count - 1, 0.975), count - 1, chdtri(count - 1, 0.025)))
     std, low, high = (math.sqrt(v * scale) for v in (estimate, low, high))

@@ -168,11 +168,17 @@ def _all_errors(fitter: Fitter, fit: Fit) -> dict[str, tuple[float, float]]:
 
 def _run_constants(fitter: Fitter, fit: Fit) -> tuple[RunConstant, ...]:
     """Constants that vary between recordings, by name and then in the order of the recordings."""
-    errors, parts = _all_errors(fitter, fit), fitter.data.parts
+    errors, stds = _all_errors(fitter, fit), standard_errors(fitter, fit)
+
+    def constant(name: str, own: str, recording: Recording) -> RunConstant:
+        prior = fit.space[own]
+        share = 1.0 - (stds[own] / prior.std) ** 2
+        return RunConstant(name, recording.source, float(recording.time[0]), *errors[own], prior.nominal, share)
+
     return tuple(
-        RunConstant(name, part.recording.source, float(part.recording.time[0]), *errors[name_in_recording(name, k)])
+        constant(name, name_in_recording(name, k), part.recording)
         for name in fitter.data.plant.varying
-        for k, part in enumerate(parts)
+        for k, part in enumerate(fitter.data.parts)
     )
 
 

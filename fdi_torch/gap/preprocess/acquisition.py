@@ -35,7 +35,7 @@ FEWEST = 20
 class StuckSegment:
     """A segment in which a sensor is stuck: rows first to beyond - 1, at `value`, from start to stop (s).
 
-    for_good: whether the segment lasts until the end of the recording.
+    for_good: whether the segment lasts until the end of the recording. onset: of the effect, s after the first sample.
     """
 
     sensor: Sensor
@@ -45,6 +45,7 @@ class StuckSegment:
     start: float
     stop: float
     for_good: bool
+    onset: float
 
     @property
     def text(self) -> str:
@@ -197,7 +198,8 @@ def _segment(recording: Recording, sensor: Sensor, first: int = 0, beyond: int |
     rows = recording.mask[:, column].nonzero().flatten()
     a, b = int(rows[first]), int(rows[first:beyond][-1])
     value, start, stop = (float(x) for x in (recording.outputs[a, column], recording.time[a], recording.time[b]))
-    return StuckSegment(sensor, a, b + 1, value, start, stop, beyond in (None, len(rows)))
+    onset = start - float(recording.time[0])
+    return StuckSegment(sensor, a, b + 1, value, start, stop, beyond in (None, len(rows)), onset)
 
 
 def _typical_scatter(plant: PlantDescription, recording: Recording, sensor: Sensor) -> Scatter:

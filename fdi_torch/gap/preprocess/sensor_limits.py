@@ -19,7 +19,7 @@ from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
 from fdi_torch.gap.dataset import DataSet
-from fdi_torch.plant.description import PlantDescription, Sensor
+from fdi_torch.plant.description import PlantDescription, Sensor, with_unlimited_sensors
 from fdi_torch.plant.effect import Placement
 from fdi_torch.recording import Recording
 
@@ -106,9 +106,8 @@ def with_noise_limits(data: DataSet, null: Fit, noise: Noise) -> DataSet:
 
 def _unlimited(data: DataSet, null: Fit, noise: Noise) -> Tensor:
     """Readings (S, C) of a fit if no sensor had a limit."""
-    sensors = tuple(replace(s, low=None, high=None) for s in data.plant.sensors)
     nominal_effects = tuple(p for p in data.nominal_effects if p.effect.name not in LIMITS)
-    unlimited = replace(data, plant=replace(data.plant, sensors=sensors), nominal_effects=nominal_effects)
+    unlimited = replace(data, plant=with_unlimited_sensors(data.plant), nominal_effects=nominal_effects)
     return Fitter(unlimited, noise).engine(null.candidate, ()).read(null.linearised.levels, null.theta.unsqueeze(0))[0]
 
 
