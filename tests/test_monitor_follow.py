@@ -375,6 +375,19 @@ def test_what_comes_while_the_noise_is_learnt_is_kept_for_a_resumed_run(tmp_path
     assert not learning.path.exists() and sum(map(len, batches)) == len(rows) + 1 - taken
 
 
+def test_a_torn_line_of_what_was_kept_does_not_hide_what_follows(tmp_path: Path) -> None:
+    """A full disk or a lost power supply tears the last line of one run; the next run writes on."""
+    rows: list[Row | str] = [(float(k), [1.0], [2.0]) for k in range(20)]
+    path = LearningItems(tmp_path / "watch.mcap").path
+    for cut in (1, 4):
+        path.unlink(missing_ok=True)
+        list(LearningItems(tmp_path / "watch.mcap").keeping(iter(rows[:5]), lambda: None))
+        path.write_bytes(path.read_bytes()[:-cut])
+        assert LearningItems(tmp_path / "watch.mcap").read()[0] == rows[:4]
+        list(LearningItems(tmp_path / "watch.mcap").keeping(iter(rows), lambda: None))
+        assert LearningItems(tmp_path / "watch.mcap").read()[0] == rows
+
+
 def test_lateness_and_bursts_are_told_once_until_they_double() -> None:
     wall = [100.0]
     delay_watch = DelayWatch(lambda: wall[0])

@@ -199,7 +199,7 @@ class LearningItems:
         items, origin = list[Row | str](), None
         if self.path.exists():
             with suppress(orjson.JSONDecodeError):
-                for line in self.path.read_bytes().splitlines():
+                for line in self.path.read_bytes().split(b"\n")[:-1]:
                     zero, some = orjson.loads(line)
                     origin = zero if origin is None else origin
                     items += [item if isinstance(item, str) else _without_null(*item) for item in some]
@@ -221,9 +221,17 @@ class LearningItems:
 
     def _append(self, line: bytes) -> None:
         """Add a line, which is on its way to the disk at once, so that a killed run has left it."""
+        remaining = line + b"\n"
         with named_errors(self.path):
-            self._file = self._file or self.path.open("ab", buffering=0)
-            self._file.write(line + b"\n")
+            self._file = self._file or self._opened()
+            while remaining:  # a full disk takes a part of it and refuses the next
+                remaining = remaining[self._file.write(remaining) :]
+
+    def _opened(self) -> FileIO:
+        """The file without an unfinished last line, to which the next one would be joined."""
+        file = self.path.open("ab", buffering=0)
+        file.truncate(self.path.read_bytes().rfind(b"\n") + 1)
+        return file
 
     def _close(self) -> None:
         if self._file is not None:
