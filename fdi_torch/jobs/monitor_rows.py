@@ -115,9 +115,10 @@ def logged_origin(log: Log) -> float | None:
 
 
 def resumed_items(earlier: Sequence[Row | str], source: Iterable[Row | str]) -> Iterator[Row | str]:
-    """Rows and notices of an earlier log, and then what the source has delivered since.
+    """Rows and notices of an earlier log, and then what the growing file has beyond them.
 
-    A growing file begins with the rows that the log has, unless it was rotated.
+    The file begins with one of the logged rows, the first unless it was rotated, and repeats those after it; otherwise
+    it was rotated after the last one.
     """
     yield from earlier
     rows = rows_in(earlier)
@@ -126,12 +127,10 @@ def resumed_items(earlier: Sequence[Row | str], source: Iterable[Row | str]) -> 
         head.append(item)
         if not isinstance(item, str):
             break
-    later = chain(head, later)
-    if not (head and not isinstance(head[-1], str) and _equal_rows(head[-1], rows[0])):
-        yield from (item for item in later if isinstance(item, str) or item[0] > rows[-1][0])
-        return
-    repeated = 0
-    for item in later:
+    begins = (k for k, row in enumerate(rows) if head and not isinstance(head[-1], str) and _equal_rows(head[-1], row))
+    first = next(begins, len(rows))
+    later, repeated = chain(head, later), first
+    for item in later if first < len(rows) else ():
         repeated += not isinstance(item, str)
         if repeated == len(rows):
             break
