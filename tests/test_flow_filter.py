@@ -18,19 +18,21 @@ from benchmarks.monitor_rigs import Case, recordings
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import build_network, placements_for
 from fdi_torch.estimate.evidence import posterior
+from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.monitor import noise_model
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.fault_free_checks import QUESTION, false_alarm_rate_text
-from fdi_torch.monitor.flow_filter import forcing
+from fdi_torch.monitor.flow_filter import FlowFilter, forcing
 from fdi_torch.monitor.flow_noise_estimate import estimate_flow_filter
 from fdi_torch.monitor.hypothesis import Hypothesis
 from fdi_torch.monitor.hypothesis_fit import Prior, fit, misfit, no_change_fit
 from fdi_torch.monitor.isolation import with_flows_of_window
+from fdi_torch.monitor.level_forecast import POINTS, _grid, _random_flows
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
 from fdi_torch.monitor.noise_model import learn_noise, operating_point
 from fdi_torch.monitor.observer import Observer
 from fdi_torch.monitor.observer_bank import ObserverBank, ObserverWindow, no_change
-from fdi_torch.monitor.observer_gain import hand_gain, start_uncertainty
+from fdi_torch.monitor.observer_gain import Linear, hand_gain, start_uncertainty
 from fdi_torch.monitor.samples import Samples
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.build import BuildError
@@ -324,3 +326,19 @@ def test_the_estimate_has_the_flow_that_was_simulated(correlation_time: float) -
     assert flows.reading_std.tolist() == pytest.approx([STD] * 3, rel=0.05)
     assert float(flows.error_of_sums(100).max()) < 0.15
     assert operating_point(NETWORK, samples).transition.shape == (3, 3)
+
+
+@pytest.mark.parametrize(("interval", "horizon"), [(1.0, 800.0), (1.0, 4000.0), (7.0, 4000.0), (20.0, 1500.0)])
+def test_a_forecast_has_the_random_flows_that_were_learnt_at_any_sampling_interval(
+    interval: float, horizon: float
+) -> None:
+    """A tank without outflow integrates white flows of 1 mm/s over one second: a random walk."""
+    one, none = torch.eye(1, dtype=torch.float64), torch.zeros(0, 1, dtype=torch.float64)
+    white = StateNoise(1e-3 * interval * one[0], 0.0, one[0])
+    known = Linear(one, one), white, 1e-9 * one[0], hand_gain(one), one[0], interval
+    flows = FlowFilter(*known, none, none.unsqueeze(-1)[..., :0], none[0:0, 0])
+    points, span = _grid(horizon, interval)
+    assert points <= POINTS and points * span == pytest.approx(horizon, abs=0.5 * span)
+    memory, generator = torch.zeros(4000, 2, dtype=torch.float64), torch.Generator().manual_seed(1)
+    _, shocks = _random_flows(flows, memory, points, span, generator)
+    assert float(shocks.sum(1).std()) == pytest.approx(1e-3 * (points * span * interval) ** 0.5, rel=0.05)

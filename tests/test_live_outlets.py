@@ -9,6 +9,7 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from live_servers import broker, free_port
 from test_live_mqtt import Rig, source
@@ -16,6 +17,7 @@ from test_monitor_follow import FAULT, SAMPLES, config, monitored, written
 
 from fdi_torch.cli import main
 from fdi_torch.live.metrics import Metrics
+from fdi_torch.logbook import RunLog
 
 
 def test_events_are_published_and_the_state_is_retained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -74,6 +76,15 @@ def test_metrics_have_no_values_before_the_first_sample() -> None:
     samples = {s.name: s.value for family in Metrics(library).registry.collect() for s in family.samples}
     assert math.isnan(samples.pop("fdi_plant_time_seconds"))
     assert {name: value for name, value in samples.items() if not name.endswith("_created")} == {"fdi_samples_total": 0}
+
+
+def test_the_metric_of_a_missing_reading_is_no_earlier_one(tmp_path: Path) -> None:
+    """A dead sensor must not show its last level for ever."""
+    metrics = Metrics(pytest.importorskip("prometheus_client"))
+    with RunLog(tmp_path / "a.mcap", "monitor", listener=metrics) as log:
+        log.samples("/plant/output", [0.0, 1.0], np.array([[0.1, 0.2], [math.nan, 0.3]]), ["h1", "h2"], ["m", "m"])
+    shown = {name: metrics.registry.get_sample_value("fdi_reading", {"channel": name}) for name in ("h1", "h2")}
+    assert math.isnan(shown["h1"] or 0.0) and shown["h2"] == 0.3
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,31 @@ def test_a_clock_that_goes_back_is_followed() -> None:
     assert times(rows.rows(now=30.0)) == [50.0]
 
 
+def test_a_clock_that_goes_back_onto_known_times_is_followed_and_keeps_what_is_held() -> None:
+    """An hour of winter time has the stamps of the hour before, with other values. The input is sent on change only."""
+    rows = buffer()
+    rows.put(Value("q", 1000.0, 1.0), now=0.0)
+    for k in range(40):
+        rows.put(Value("h", 1000.0 + k, float(k)), now=0.0)
+    assert len(times(rows.rows(now=1.0))) == 40
+    for k in range(15):
+        rows.put(Value("h", 1010.0 + k, float(10 + k)), now=2.0)  # as a broker repeats them
+    assert rows.rows(now=9.0) == []
+    for k in range(15):
+        rows.put(Value("h", 1010.0 + k, -1.0), now=10.0)
+    got = rows.rows(now=20.0)
+    assert notices(got) == ["the clock of the source went back"]
+    assert equal(got[1:], [(1010.0 + k, [3.0], [-1.0]) for k in range(15)])
+
+
+def test_a_resumed_source_knows_held_inputs_and_where_its_clock_went_back() -> None:
+    earlier: list[Row] = [(float(k), [3.0], [float(k)]) for k in [*range(50), *range(20)]]
+    rows = RowBuffer([LiveChannel("Q", "q", held=math.inf)], [LiveChannel("h", "h")], 1.0, earlier=earlier)
+    for k in (18, 19, 20, 21):
+        rows.put(Value("h", float(k), float(k)), now=0.0)
+    assert equal(rows.rows(now=1.0), [(20.0, [3.0], [20.0]), (21.0, [3.0], [21.0])])
+
+
 def test_dates_count_from_the_first_row_to_the_microsecond() -> None:
     rows = buffer(align=0.1, dated=True)
     for stamp in (1.7e9 + 0.101, 1.7e9 + 0.199, 1.7e9 + 0.302):

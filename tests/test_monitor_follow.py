@@ -31,6 +31,7 @@ from fdi_torch.jobs.monitor_rows import LearningItems, resumed_items, rows_until
 from fdi_torch.jobs.replay import repeat_run
 from fdi_torch.live.row_buffer import Row
 from fdi_torch.logbook import RunLog, content_hash, follow, read_run, series
+from fdi_torch.recordings.csv_growing import GrowingCsv
 from tests.test_monitor import recorded, step_to
 
 FAULT, ONSET, SAMPLES = "T3.leak.size", 200.0, 300
@@ -375,6 +376,19 @@ def test_what_comes_while_the_noise_is_learnt_is_kept_for_a_resumed_run(tmp_path
     assert not learning.path.exists() and sum(map(len, batches)) == len(rows) + 1 - taken
 
 
+def test_a_torn_line_of_what_was_kept_does_not_hide_what_follows(tmp_path: Path) -> None:
+    """A full disk or a lost power supply tears the last line of one run; the next run writes on."""
+    rows: list[Row | str] = [(float(k), [1.0], [2.0]) for k in range(20)]
+    path = LearningItems(tmp_path / "watch.mcap").path
+    for cut in (1, 4):
+        path.unlink(missing_ok=True)
+        list(LearningItems(tmp_path / "watch.mcap").keeping(iter(rows[:5]), lambda: None))
+        path.write_bytes(path.read_bytes()[:-cut])
+        assert LearningItems(tmp_path / "watch.mcap").read()[0] == rows[:4]
+        list(LearningItems(tmp_path / "watch.mcap").keeping(iter(rows), lambda: None))
+        assert LearningItems(tmp_path / "watch.mcap").read()[0] == rows
+
+
 def test_lateness_and_bursts_are_told_once_until_they_double() -> None:
     wall = [100.0]
     delay_watch = DelayWatch(lambda: wall[0])
@@ -420,15 +434,30 @@ def logged_events(path: Path) -> list[dict[str, object]]:
     return [message.payload for message in read_run(path).messages(["/observer/alarm"])]
 
 
-@pytest.mark.parametrize("rotated", [False, True])
+def test_a_followed_file_that_becomes_shorter_is_named(tmp_path: Path) -> None:
+    file = written(tmp_path / "rig.csv")
+    growing = GrowingCsv(file, ["Q1", "Q2"], ["h1", "h2", "h3"])
+    assert len(growing.new()[0]) == SAMPLES
+    file.write_text(HEADER + row(0.0, [0.1, 0.1, 0.1]))
+    with pytest.raises(ValueError, match="has become shorter; it was replaced or cut"):
+        growing.new()
+
+
+@pytest.mark.parametrize(("rotated", "dated"), [(False, False), (True, False), (True, True)])
 def test_a_growing_file_is_followed_on_after_a_kill_to_the_same_events(
-    rotated: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    rotated: bool, dated: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Killed between alarm and isolation, with unreadable rows before and after; rotated: the file then holds only what
-    came since.
+    came since; dated: time 0 is the date of the first row of the first file.
     """
     whole, file = written(tmp_path / "all.csv"), tmp_path / "rig.csv"
     lines = whole.read_text().splitlines(keepends=True)
+    if dated:
+        moments = (f"2026-11-30T08:{k // 60:02}:{k % 60:02}+01:00" for k in range(SAMPLES))
+        lines = [
+            HEADER.replace("t_s", "time"),
+            *(f"{t},{line.partition(',')[2]}" for t, line in zip(moments, lines[1:], strict=True)),
+        ]
     if not rotated:  # their sentences name the line
         lines.insert(270, "50,oops,50,1,2,3\n")
     lines.insert(60, "50,oops,50,1,2,3\n")
@@ -468,7 +497,11 @@ def test_a_resumed_source_goes_on_after_the_logged_rows_and_notices() -> None:
     later: list[Row | str] = [rows[3], "late", rows[4], rows[5]]
     assert list(resumed_items(logged, file)) == [*logged, *later]
     assert list(resumed_items(logged[:-1], file)) == [*logged, *later]
-    assert list(resumed_items(logged, ["lost", *rows[2:4], "late", *rows[4:]])) == [*logged, "lost", *later]
+    assert list(resumed_items(logged, ["row 2 is no row", *rows[2:4], "late", *rows[4:]])) == [*logged, *later]
+    behind: list[Row | str] = [*rows[4:], "the clock jumps", *rows[1:3]]  # the clock goes back later
+    assert list(resumed_items(logged, [*rows[2:4], *behind])) == [*logged, rows[3], *behind]
+    restarted: list[Row | str] = [(0.0, [], [1.0]), (1.0, [], [1.0])]  # the clock of a new file begins again
+    assert list(resumed_items(logged, restarted)) == [*logged, *restarted]
     assert list(resumed_items(logged, [])) == logged
 
 

@@ -24,11 +24,13 @@ from fdi_torch.recordings.source import ChannelSource
 POLL = 0.1  # s
 
 
-def growing_rows(config: RecordingConfig, plant: PlantDescription, base: Path, idle: float) -> RowSource:
+def growing_rows(
+    config: RecordingConfig, plant: PlantDescription, base: Path, idle: float, origin: float | None = None
+) -> RowSource:
     """Samples in the order of writing, and a sentence for each row that cannot be read. The file is opened at once.
 
     Ends when the file is finished, or when nothing has arrived for `idle` s. The origin is as the file's clock shows
-    it. Raises ConfigError for an unusable file.
+    it; origin: that of an earlier run that is resumed. Raises ConfigError for an unusable file.
     """
     clock = config.columns.get("t", ColumnConfig())
     stamped = isinstance(config.start, datetime) or isinstance(config.stop, datetime)
@@ -49,7 +51,7 @@ def growing_rows(config: RecordingConfig, plant: PlantDescription, base: Path, i
         mapping = channel_mapping(config, plant)
         if is_log(path):
             return RowSource(_between(_mcap_rows(path, plant, mapping, idle), config.start, config.stop), lambda: None)
-        file = GrowingCsv(path, inputs, outputs, mapping)
+        file = GrowingCsv(path, inputs, outputs, mapping, origin)
         expect_units(str(path), (*inputs, *outputs), (*file.input_units, *file.output_units), plant)
     except (ValueError, LogError) as error:
         raise ConfigError([str(error)]) from None

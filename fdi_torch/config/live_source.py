@@ -92,8 +92,7 @@ def live_rows(
         connection = _connection(config, address, tags)
     own_stamps = address.scheme == "opcua" or (config.clock is None and address.scheme.startswith("mqtt"))
     align = config.align if config.align is not None else config.period if own_stamps else 0.0
-    seen = [row[0] for row in earlier]
-    buffer = RowBuffer(inputs, outputs, config.reorder, align, connection.dated, origin, seen)
+    buffer = RowBuffer(inputs, outputs, config.reorder, align, connection.dated, origin, earlier)
     return RowSource(_until_idle(connection, buffer, idle), lambda: buffer.origin if connection.dated else None)
 
 

@@ -135,7 +135,7 @@ def _source(run: MonitorRun, idle: float | None, origin: float | None, earlier_r
     """The rows of the live source, or else of the growing file."""
     if run.config.source is not None:
         return live_rows(run.config.source, run.plant, math.inf if idle is None else idle, origin, earlier_rows)
-    return growing_rows(run.config.recording, run.plant, run.base, IDLE if idle is None else idle)
+    return growing_rows(run.config.recording, run.plant, run.base, IDLE if idle is None else idle, origin)
 
 
 def _follow(
@@ -151,8 +151,11 @@ def _follow(
     after the fault-free part has ended; a monitor that is killed before then resumes from this file.
     """
     run = monitor.run
-    items = resumed_items(earlier, source) if rows_in(earlier) else source
-    batches = LiveBatches(items if kept is None else kept.keeping(items, lambda: source.origin))
+    if kept is not None:  # the connection knows the earlier rows
+        items = kept.keeping(chain(earlier, source), lambda: source.origin)
+    else:
+        items = resumed_items(earlier, source) if rows_in(earlier) else source
+    batches = LiveBatches(items)
     callbacks.tell(None, "waiting for samples")
     first = _until_fault_free_part_ends(run, callbacks, batches)
     zero = source.origin

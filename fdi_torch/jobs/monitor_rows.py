@@ -113,9 +113,10 @@ def logged_origin(log: Log) -> float | None:
 
 
 def resumed_items(earlier: Sequence[Row | str], source: Iterable[Row | str]) -> Iterator[Row | str]:
-    """Rows and notices of an earlier log, and then what the source has delivered since.
+    """Rows and notices of an earlier log, and then what the growing file has beyond them.
 
-    A growing file begins with the rows that the log has, unless it was rotated.
+    The file begins with one of the logged rows, the first unless it was rotated, and repeats those after it; otherwise
+    it was rotated after the last one.
     """
     yield from earlier
     rows = rows_in(earlier)
@@ -124,12 +125,10 @@ def resumed_items(earlier: Sequence[Row | str], source: Iterable[Row | str]) -> 
         head.append(item)
         if not isinstance(item, str):
             break
-    later = chain(head, later)
-    if not (head and not isinstance(head[-1], str) and _equal_rows(head[-1], rows[0])):
-        yield from (item for item in later if isinstance(item, str) or item[0] > rows[-1][0])
-        return
-    repeated = 0
-    for item in later:
+    begins = (k for k, row in enumerate(rows) if head and not isinstance(head[-1], str) and _equal_rows(head[-1], row))
+    first = next(begins, len(rows))
+    later, repeated = chain(head, later), first
+    for item in later if first < len(rows) else ():
         repeated += not isinstance(item, str)
         if repeated == len(rows):
             break
@@ -197,7 +196,7 @@ class LearningItems:
         items, origin = list[Row | str](), None
         if self.path.exists():
             with suppress(orjson.JSONDecodeError):
-                for line in self.path.read_bytes().splitlines():
+                for line in self.path.read_bytes().split(b"\n")[:-1]:
                     zero, some = orjson.loads(line)
                     origin = zero if origin is None else origin
                     items += [item if isinstance(item, str) else _without_null(*item) for item in some]
@@ -219,9 +218,17 @@ class LearningItems:
 
     def _append(self, line: bytes) -> None:
         """Add a line, which is on its way to the disk at once, so that a killed run has left it."""
+        remaining = line + b"\n"
         with named_errors(self.path):
-            self._file = self._file or self.path.open("ab", buffering=0)
-            self._file.write(line + b"\n")
+            self._file = self._file or self._opened()
+            while remaining:  # a full disk takes a part of it and refuses the next
+                remaining = remaining[self._file.write(remaining) :]
+
+    def _opened(self) -> FileIO:
+        """The file without an unfinished last line, to which the next one would be joined."""
+        file = self.path.open("ab", buffering=0)
+        file.truncate(self.path.read_bytes().rfind(b"\n") + 1)
+        return file
 
     def _close(self) -> None:
         if self._file is not None:

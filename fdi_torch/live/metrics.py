@@ -6,8 +6,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import orjson
-
+from fdi_torch.logbook.payload import decode
 from fdi_torch.logbook.topic_definitions import Channel
 from fdi_torch.tables import needed
 
@@ -47,7 +46,7 @@ class Metrics:
     def __call__(self, channel: Channel, log_time: int, data: bytes) -> None:
         if channel.topic not in TOPICS:
             return
-        payload = orjson.loads(data)
+        payload = decode(data)
         match channel.topic:
             case "/plant/input":
                 _set_all(self._inputs, payload)
@@ -58,8 +57,7 @@ class Metrics:
             case "/observer/residual":
                 tests = [name for name in payload if name.endswith(("_statistic", "_threshold"))]
                 for name in tests:
-                    if (value := payload.pop(name)) is not None:
-                        self._detector.labels(name.rpartition("_")[2]).set(value)
+                    self._detector.labels(name.rpartition("_")[2]).set(payload.pop(name))
                 _set_all(self._residuals, payload)
             case "/observer/alarm":
                 self._events.labels(payload["event"]).inc()
@@ -72,10 +70,10 @@ class Metrics:
 
 
 def _set_all(gauge: Any, payload: dict[str, Any]) -> None:
-    """Set a gauge for each named number; one without a value, as of a missing reading, becomes NaN."""
+    """Set a gauge for each named number, which is NaN for a missing reading."""
     for name, value in payload.items():
-        if name != "t" and (value is None or isinstance(value, int | float)):
-            gauge.labels(name).set(float("nan") if value is None else value)
+        if name != "t" and isinstance(value, int | float):
+            gauge.labels(name).set(value)
 
 
 @contextmanager

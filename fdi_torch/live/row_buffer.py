@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from fdi_torch.live.values import Value
 
 MOST_REMEMBERED = 100_000
-"""Stamps of released rows by which repeated values are recognised."""
+"""Released rows by which repeated values are recognised."""
 JUMP = 10
 """Rows before the last released one, with none after it in between, that count as a jump of the source's clock. The
 monitor likewise requires ten sampling intervals for a gap."""
@@ -66,7 +66,7 @@ class RowBuffer:
     align: interval to whose multiples stamps are rounded, s; 0 for none. origin: stamp of time 0; None for the stamp of
     the first row with a reading if the clock has dates (`dated`), which is then available as `origin`, and 0 otherwise.
     Earlier rows are only kept as inputs: a source begins with the present value of each input, which may be hours old.
-    seen: times of rows that are known from an earlier run.
+    earlier: rows of an earlier run that goes on; its inputs are still held.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class RowBuffer:
         align: float = 0.0,
         dated: bool = False,
         origin: float | None = None,
-        seen: Iterable[float] = (),
+        earlier: Iterable[Row] = (),
     ) -> None:
         self.channels = (*inputs, *outputs)
         self.origin = origin if dated or origin is not None else 0.0
@@ -88,9 +88,12 @@ class RowBuffer:
         self._pending: dict[float, _Pending] = {}
         self._late: dict[float, _Pending] = {}
         self._dated = dated
-        self._released: dict[float, None] = dict.fromkeys(self._stamp((self.origin or 0.0) + t) for t in seen)
-        self._last = max(self._released, default=-math.inf)
-        self._held: dict[int, tuple[float, float]] = {}
+        self._released: dict[float, list[float]] = {}
+        self._last = -math.inf
+        for t, commands, readings in earlier:
+            self._remember(self._stamp((self.origin or 0.0) + t), [*commands, *readings])
+        latest = enumerate(self._released.get(self._last, ()))
+        self._held: dict[int, tuple[float, float]] = {k: (self._last, value) for k, value in latest}
         self._count, self._reported = 0, 1
 
     def put(self, value: Value, now: float) -> None:
@@ -98,7 +101,7 @@ class RowBuffer:
         if not math.isfinite(value.stamp):
             return
         stamp = self._stamp(value.stamp)
-        if stamp in self._released:
+        if stamp == self._last:
             return
         rows = self._late if stamp <= self._last else self._pending
         row = rows.setdefault(stamp, _Pending(now, {}))
@@ -120,14 +123,14 @@ class RowBuffer:
         return round(stamp, 6) if self._dated or self._align else stamp
 
     def _late_rows(self, now: float) -> list[Row | str]:
-        """Drop rows that came too late, or follow the source's clock back if only earlier rows come."""
-        if self._pending and self._late:
-            self._count += len(self._late)
-            self._late = {}
-        elif len(self._late) >= JUMP:
-            self._pending, self._late, self._released = self._late, {}, {}
-            self._last = -math.inf
-            return ["the clock of the source went back"]
+        """Drop rows that are repeated or came too late, or follow the source's clock back if only earlier rows come."""
+        due = [stamp for stamp, row in self._late.items() if now - row.arrived >= self._reorder]
+        repeated = [stamp for stamp in due if self._is_repeated(stamp)]
+        if not self._pending and len(due) - len(repeated) >= JUMP:
+            return self._gone_back()
+        self._count += len(due) - len(repeated) if self._pending else 0
+        for stamp in due if self._pending else repeated:
+            del self._late[stamp]
         if self._count < self._reported:
             return []
         self._reported = 2 * self._count
@@ -136,20 +139,41 @@ class RowBuffer:
             "waits for them"
         ]
 
+    def _is_repeated(self, stamp: float) -> bool:
+        """Whether a late row has only values that the row of that stamp had already."""
+        known = self._released.get(stamp)
+        return known is not None and all(
+            x == known[k] or (x != x and known[k] != known[k]) for k, x in self._late[stamp].values.items()
+        )
+
+    def _gone_back(self) -> list[Row | str]:
+        """Follow the source's clock back to the late rows. Values that are held keep their age."""
+        back = min(self._late) - self._last
+        self._held = {k: (since + back, value) for k, (since, value) in self._held.items()}
+        self._pending, self._late, self._released = self._late, {}, {}
+        self._last = -math.inf
+        return ["the clock of the source went back"]
+
     def _release(self, stamp: float) -> Row | None:
         """The row with that stamp; None before the first reading."""
         received = self._pending.pop(stamp).values
         if self.origin is None and max(received, default=-1) >= self._inputs:
             self.origin = stamp
-        self._last = stamp
-        self._released[stamp] = None
-        if len(self._released) > MOST_REMEMBERED:
-            self._released.pop(next(iter(self._released)))
         values = [self._filled(k, received, stamp) for k in range(len(self.channels))]
+        self._remember(stamp, values)
         if self.origin is None:
             return None
         t = round(stamp - self.origin, 6) if self.origin else stamp
         return t, values[: self._inputs], values[self._inputs :]
+
+    def _remember(self, stamp: float, values: list[float]) -> None:
+        """Remember the values of a released row; those before a backward jump of the clock are forgotten."""
+        if stamp < self._last:
+            self._released = {}
+        self._last = stamp
+        self._released[stamp] = values
+        if len(self._released) > MOST_REMEMBERED:
+            self._released.pop(next(iter(self._released)))
 
     def _filled(self, k: int, found: Mapping[int, float], stamp: float) -> float:
         """The value of a channel in a row, or the last one while it is held."""

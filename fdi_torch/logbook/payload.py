@@ -149,7 +149,8 @@ def _restore(message: dict[str, Any]) -> None:
     entries = message.pop(NON_FINITE, ())
     for entry in entries if isinstance(entries, list) else ():
         match = _ENTRY.fullmatch(str(entry))
+        values = message.get(match["name"]) if match else None
         if match and match["index"] is None:
             message[match["name"]] = float(match["value"])
-        elif match and int(match["index"]) < len(message.get(match["name"], ())):
-            message[match["name"]][int(match["index"])] = float(match["value"])
+        elif match and isinstance(values, list) and int(match["index"]) < len(values):
+            values[int(match["index"])] = float(match["value"])

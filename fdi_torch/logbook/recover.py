@@ -67,15 +67,18 @@ def recover(source: str | Path, target: str | Path | None = None) -> Recovery:
     run = read_run(source, salvage=True)
     sink = Sink(target, run.library, run.profile)
     try:
-        messages = _copy_records(run, sink)
-        lost = tuple(sorted(run.damages, key=lambda damage: damage.start))
-        done = Recovery(source, target, messages, lost, run.ended)
-        sink.metadata(RECORD, _record(done))
+        try:
+            messages = _copy_records(run, sink)
+            lost = tuple(sorted(run.damages, key=lambda damage: damage.start))
+            done = Recovery(source, target, messages, lost, run.ended)
+            sink.metadata(RECORD, _record(done))
+        except BaseException:
+            sink.abandon()
+            raise
+        sink.finish()
     except BaseException:
-        sink.abandon()
         target.unlink(missing_ok=True)
         raise
-    sink.finish()
     return done
 
 

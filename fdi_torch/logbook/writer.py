@@ -189,16 +189,16 @@ class RunLog(Topics):
 
     def _write_end(self, sink: Sink) -> None:
         """Write results and status, and complete the file."""
-        if self._arrays:
-            sink.attachment("results.npz", "application/x-npz", _npz(self._arrays))
-        if self._results:
-            sink.metadata("fdi_torch.result", self._results)
         ended = self._clock()
         seconds = f"{(ended - self._started) * 1e-9:.3f}"
         status = {"status": self.status, "reason": self.reason, "ended": _wall_text(ended), "wall_seconds": seconds}
         try:
+            if self._arrays:
+                sink.attachment("results.npz", "application/x-npz", _npz(self._arrays))
+            if self._results:
+                sink.metadata("fdi_torch.result", self._results)
             sink.metadata("fdi_torch.status", status)
-        except LogError:
+        except BaseException:  # the process may go on, and must not keep the file locked
             sink.abandon()
             raise
         sink.finish()

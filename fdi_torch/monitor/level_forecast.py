@@ -7,6 +7,7 @@ grow continue to grow, and the random flows of the fault-free recording go on fr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -23,7 +24,7 @@ from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank
 from fdi_torch.monitor.samples import Samples
 
 DRAWS = 40
-POINTS = 1000  # times at which levels are computed
+POINTS = 1000  # largest number of times at which levels are computed
 EMPTY = 0.01  # share of a tank's height below which its outlet draws air
 SMALLEST_CHANCE = 0.05  # less likely limits are not reported
 
@@ -54,15 +55,17 @@ def forecast_limits(
     now, order, tanks = state.now, observer.network.order, len(observer.network.description.tanks)
     latest = state.samples.time > now - recent
     inputs = state.samples.inputs[latest].mean(dim=0)
-    time = now + torch.linspace(0.0, horizon, POINTS + 1, dtype=torch.float64)
+    flows = observer.whitening.flows
+    points, span = _grid(horizon, horizon / POINTS if flows is None else flows.interval)
+    time = now + torch.linspace(0.0, points * span, points + 1, dtype=torch.float64)
     chosen = _drawn_explanations(fits)
     before, changes = _drawn_parameters(observer, change, [fits[k] for k in chosen], now, horizon, generator)
     start, memory = _present_states(observer, state, change, fits)
-    deviation, shocks = _random_flows(observer.whitening.flows, memory[chosen], horizon / POINTS, generator)
+    deviation, shocks = _random_flows(flows, memory[chosen], points, span, generator)
     start = start[chosen]
     start[:, :order] += deviation
     start[:, :tanks].clamp_(min=0.0)  # states of effects, such as flows, may be negative
-    future = Samples(time, inputs.expand(POINTS + 1, -1), state.samples.readings.new_full((POINTS + 1, 1), torch.nan))
+    future = Samples(time, inputs.expand(points + 1, -1), state.samples.readings.new_full((points + 1, 1), torch.nan))
     levels = torch.cat([start.unsqueeze(1), observer.simulate(future, start, before, changes, shocks)], dim=1)
     limits = []
     for index, tank in enumerate(observer.network.description.tanks):
@@ -71,6 +74,12 @@ def forecast_limits(
         limits.append(limit_of(tank.name, "runs dry", _crossing_time(-path, -EMPTY * tank.height, time - now)))
     likely = (f for f in limits if f.chance >= SMALLEST_CHANCE and f.time > 0.0)
     return tuple(sorted(likely, key=lambda limit: limit.time))
+
+
+def _grid(horizon: float, interval: float) -> tuple[int, float]:
+    """Number of points in a horizon, at most POINTS, and the time between them: whole intervals (s) of random flows."""
+    span = max(math.ceil(horizon / (POINTS * interval) - 1e-9), 1) * interval
+    return max(round(horizon / span), 1), span
 
 
 def _drawn_explanations(fits: Sequence[HypothesisFit]) -> list[int]:
@@ -116,18 +125,18 @@ def _drawn_parameters(
 
 
 def _random_flows(
-    flows: FlowFilter | None, memory: Tensor, span: float, generator: torch.Generator
+    flows: FlowFilter | None, memory: Tensor, points: int, span: float, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Deviations (DRAWS, order) of the states from those of the observer now, and what random flows add to the states
-    between the points (DRAWS, POINTS, order), m.
+    between the points (DRAWS, points, order), m.
 
-    memory (DRAWS, F): state of the flow filter. span: s between the points.
+    memory (DRAWS, F): state of the flow filter. span: s between the points, a multiple of the filter's interval.
     """
     if flows is None:
         return memory.new_zeros(1, 1), memory.new_zeros(1, 1, 1)
-    transition, covariance = flows.over(max(round(span / flows.interval), 1))
+    transition, covariance = flows.over(round(span / flows.interval))
     n, size = len(transition) // 2, len(transition)
-    normal = torch.randn(POINTS + 1, DRAWS, 2 * n, generator=generator, dtype=memory.dtype)
+    normal = torch.randn(points + 1, len(memory), 2 * n, generator=generator, dtype=memory.dtype)
     present = memory[:, :size] + normal[0] @ _root(flows.covariance[:size, :size]).mT
     deviation, flow = present.split(n, dim=1)
     level_shocks, flow_shocks = (normal[1:] @ _root(covariance).mT).split(n, dim=2)

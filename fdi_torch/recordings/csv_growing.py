@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from io import SEEK_END
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
+from fdi_torch.disk import named_errors
 from fdi_torch.recordings.csv_binding import bind_table
 from fdi_torch.recordings.csv_cells import parse_carefully
 from fdi_torch.recordings.csv_files import SINCE_1970, channels_in_si, from_first
@@ -20,7 +22,8 @@ from fdi_torch.recordings.table_files import TableText
 class GrowingCsv:
     """Reader of the completed rows of a CSV file that is still being written. Columns as for `read_csv`.
 
-    input_units, output_units: SI. Raises ValueError if the file, its header or a column is missing.
+    origin: date of time 0 if it is not the first row, as `clock_zero` was before. input_units, output_units: SI.
+    Raises ValueError if the file, its header or a column is missing, and if the file is replaced while it is read.
     """
 
     def __init__(
@@ -29,6 +32,7 @@ class GrowingCsv:
         inputs: Sequence[str],
         outputs: Sequence[str],
         mapping: Mapping[str, ChannelSource] | None = None,
+        origin: float | None = None,
     ) -> None:
         mapping = mapping or {}
         self.path, self._shift = path, clock_in(mapping).shift
@@ -47,6 +51,7 @@ class GrowingCsv:
         self._held = {k: source.held for k, source in enumerate(sources) if source.held > 0.0}
         self._logged = np.empty((0, 1 + len(inputs)))  # the last rows with a logged value of a held input
         self._line = heading.lines
+        self._origin = origin
         self._first: float | None = None
         self.input_units = tuple(b.si_unit for b in self._inputs)
         self.output_units = tuple(b.si_unit for b in self._outputs)
@@ -55,16 +60,23 @@ class GrowingCsv:
 
     @property
     def clock_zero(self) -> float | None:
-        """Date of the file's time 0, s since 1970; None before the first row is read and if the file has no dates."""
-        dated = self._first is not None and (self._clock.stamps or self._first > SINCE_1970)
-        return self._first + self._columns.read_stamp.offset if dated and self._first is not None else None
+        """Date of time 0, s since 1970; None if the file has no dates, and before its first row without `origin`."""
+        if self._first is None:
+            return self._origin
+        dated = self._clock.stamps or self._first > SINCE_1970
+        return self._first + self._columns.read_stamp.offset if dated else None
 
     def new(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[tuple[int, str]]]:
         """The rows completed since the last call: times (R,) s, inputs (R, M), outputs (R, N), SI. Time may jump.
 
         The fourth result has, for each row that could not be read, the number of rows before it and a sentence.
         """
-        with self.path.open("rb") as raw:
+        with named_errors(self.path), self.path.open("rb") as raw:
+            if raw.seek(0, SEEK_END) < self._place:
+                raise ValueError(
+                    f"{self.path}: expected a file that grows, got one that has become shorter; it was replaced or "
+                    "cut, follow the present one with --resume"
+                )
             raw.seek(self._place)
             data = raw.read()
         whole = data[: data.rfind(b"\n") + 1]
@@ -97,5 +109,6 @@ class GrowingCsv:
     def _seconds(self, clock: np.ndarray) -> np.ndarray:
         seconds = clock * self._clock.factor + self._shift
         if self._first is None and len(seconds):
-            self._first = float(seconds[0])
+            origin = self._origin
+            self._first = float(seconds[0]) if origin is None else origin - self._columns.read_stamp.offset
         return seconds if self._first is None else from_first(seconds, self._first, self._clock)

@@ -93,3 +93,5 @@ def test_a_packed_array_of_another_type_is_refused() -> None:
 def test_a_hostile_list_of_lost_numbers_changes_nothing_else() -> None:
     back = decode(b'{"a":[1],"non_finite":["a[99]=nan","a","b[0]=inf",3]}')
     assert back == {"a": [1]}
+    no_lists = {"a": 1, "b": "x", "c": None, "d": {}}
+    assert decode(orjson.dumps({**no_lists, "non_finite": [f"{name}[0]=nan" for name in no_lists]})) == no_lists

@@ -177,3 +177,19 @@ def test_every_chunk_can_be_read_alone(golden: Path, tmp_path: Path) -> None:
     data[100:start] = bytes(start - 100)
     (tmp_path / "a.mcap").write_bytes(data[:end])
     assert saved(recover(tmp_path / "a.mcap").target) == messages
+
+
+def test_a_disk_that_is_full_at_the_last_bytes_leaves_no_torn_copy(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another attempt would take it for the log of a killed run."""
+
+    def full(self: object) -> None:
+        raise LogError("the disk is full; free some space")
+
+    target = tmp_path / "saved.mcap"
+    with monkeypatch.context() as patch:
+        patch.setattr("fdi_torch.logbook.sink.Sink._summary", full)
+        with pytest.raises(LogError, match="the disk is full"):
+            recover(finished, target)
+    assert not target.exists() and recover(finished, target).whole

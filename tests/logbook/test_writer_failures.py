@@ -105,6 +105,29 @@ def test_a_read_only_folder(tmp_path: Path) -> None:
     assert "may not be written or read" in done.stdout or "No such file" in done.stderr, done.stderr
 
 
+@pytest.mark.parametrize("result", ["log.result({'x': 1})", "log.result_arrays(x=[1.0])", ""])
+def test_a_process_that_outlives_a_full_disk_does_not_keep_the_log_locked(tmp_path: Path, result: str) -> None:
+    """As a notebook does, which then resumes the run."""
+    done = run_script(
+        f"""
+        import resource, sys
+        from pathlib import Path
+        from fdi_torch.logbook import LogError, RunLog, being_written
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+        try:
+            with RunLog(sys.argv[1] + "/a.mcap", "train", env={{}}, git={{}}) as log:
+                {result}
+                for i in range(100_000):
+                    log.trial(i, {{"x": i ** 0.5}})
+        except LogError as error:
+            print(error)
+        print(being_written(Path(sys.argv[1] + "/a.mcap.partial")))
+        """,
+        tmp_path,
+    )
+    assert done.stdout.splitlines()[1:] == ["False"], done.stdout + done.stderr
+
+
 def test_a_full_disk_ends_the_log_not_the_process(tmp_path: Path) -> None:
     """A limit on file size stands in for a full disk: both are an OSError at some write."""
     done = run_script(
