@@ -45,7 +45,8 @@ def level_filter(under: Fitter) -> LevelFilter:
 
 
 def gain_at(survey: DiscrepancyRegression, under: Fitter, null: Fit, place: str) -> float:
-    return promise.SingleRegressorGains(survey, under, torch.Generator().manual_seed(5)).at(place).net
+    (gain,) = promise.SingleRegressorGains(survey, [under], torch.Generator().manual_seed(5)).at(place)
+    return gain.net
 
 
 def products(

@@ -10,6 +10,8 @@ from torch import Tensor
 from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.parameters import ParameterName, ParameterSpace, is_effect_parameter
 from fdi_torch.plant.effect import Placement
+from fdi_torch.simulate.collocation import Collocation
+from fdi_torch.simulate.joint_collocation import JointCollocation
 from fdi_torch.simulate.linearised import Linearised
 
 Key = frozenset[tuple[str, str]]
@@ -32,19 +34,28 @@ class Candidate:
 class Fit:
     """The best fit of a candidate: parameters theta (P,), cost (chi-square with priors), linearised trajectory.
 
-    trajectory: computes the latter. converged: as that of `DescentResult`; of an explanation, under its own noise.
+    engine: the plant with the effects, differentiated by all parameters. trajectory: computes the latter. converged: as
+    that of `DescentResult`; of an explanation, under its own noise.
     """
 
     candidate: Candidate
-    space: ParameterSpace
+    engine: Collocation | JointCollocation
     theta: Tensor
     cost: float
     trajectory: Recomputed[Linearised]
     converged: bool
 
     @property
+    def space(self) -> ParameterSpace:
+        return self.engine.space
+
+    @property
     def linearised(self) -> Linearised:
         return self.trajectory()
+
+    def pieces(self, linearised: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:
+        """For each recording, its collocation, its parameters (1, P) and its part of a trajectory."""
+        return self.engine.apart(self.theta.unsqueeze(0), linearised)
 
     @property
     def values(self) -> dict[str, float]:

@@ -124,7 +124,7 @@ class Fitter:
         trajectory = partial(engine.linearise, descents.theta[lane], linearised.origin)
         return Fit(
             candidate,
-            engine.space,
+            engine,
             descents.theta[best],
             float(descents.cost[best]),
             Recomputed(trajectory, linearised),
@@ -181,7 +181,7 @@ class Fitter:
 
     def converged(self, fit: Fit) -> bool:
         """Whether a fit is at a minimum under this fitter's noise, which may differ from that of its descent."""
-        problem = TrajectoryProblem(self, self.engine(fit.candidate, list(fit.effect_values)))
+        problem = TrajectoryProblem(self, fit.engine)
         return bool(problem.converged(fit.theta.unsqueeze(0), fit.linearised, int(self.data.mask.sum())))
 
     def white(self, linearised: Linearised) -> tuple[Tensor, Tensor]:

@@ -165,7 +165,8 @@ def estimate_noise(residual: Tensor, mask: Tensor, rows: Sequence[slice], steps:
     return Noise(innovation, _CORRELATIONS.to(level)[torch.tensor(chosen)], int(_MEAN_LENGTHS[common]), tuple(steps))
 
 
-_AR = torch.cat([torch.linspace(-0.5, 0.9, 281), torch.linspace(0.901, 0.98, 80)])
+# Divided, so that white noise is exactly 0: with a correlation of 1e-8, the Kalman filter has a state for each sensor.
+_AR = torch.cat([torch.arange(-100, 181) / 200, torch.linspace(0.901, 0.98, 80)])
 _LENGTHS = torch.arange(2, LONGEST_MEAN + 1)  # of means, samples
 _MEAN_LENGTHS = torch.cat([torch.zeros(len(_AR), dtype=torch.long), _LENGTHS])  # samples; 0: for ever
 _CORRELATIONS = torch.cat([_AR, MEAN_DECAY ** (1.0 / _LENGTHS)])

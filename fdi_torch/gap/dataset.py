@@ -47,7 +47,7 @@ class RecordingPart:
         return levels
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DataSet:
     """A plant with its nominal effects, and one or several recordings of it.
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -25,6 +26,7 @@ from fdi_torch.estimate.state_noise import Likelihood, estimate_state_noise
 from fdi_torch.gap.answer import CauseName
 from fdi_torch.gap.candidate import Candidate, Fit
 from fdi_torch.gap.candidate_fit import Fitter
+from fdi_torch.gap.dataset import DataSet
 from fdi_torch.gap.recomputed import Recomputed
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.collocation import Collocation
@@ -56,7 +58,7 @@ def with_disturbances(fitter: Fitter, fit: Fit, noise: StateNoise, linearised: L
     """The fitter with this disturbance noise, propagated along a linearised trajectory, by default that of the fit."""
 
     def whitening() -> KalmanWhitening:
-        along = propagation_of(fitter, fit, linearised or fit.linearised)
+        along = propagation_of(fitter.data, fit, linearised or fit.linearised)
         return KalmanFilter(along, _sensors(fitter)).under(noise)
 
     return Fitter(fitter.data, fitter.noise, Recomputed(whitening))
@@ -76,22 +78,21 @@ def estimate_disturbances(
     """
     data = fitter.data
     scale, weight, deviation = fitter.priors(fit.space, fit.theta)
-    propagation, sensors = propagation_of(fitter, fit, linearised), _sensors(fitter)
+    propagation, sensors = propagation_of(data, fit, linearised), _sensors(fitter)
     residual, jacobian = data.readings - linearised.readings[0], linearised.jacobian[0] * scale
     if further is not None:
         jacobian = torch.cat([jacobian, further.columns], dim=-1)
         weight, deviation = torch.cat([weight, further.pull]), torch.cat([deviation, torch.zeros_like(further.pull)])
     # Unit of the flows: it moves a level by a tenth of the sensor noise from one sample to the next.
     gains = propagation.output.abs().amax(dim=0).amax(dim=-1).clamp(min=1e-12)
-    unit = _areas(fitter) * float((sensors.std / gains).median()) / (10.0 * propagation.usual_interval)
+    unit = _areas(data) * float((sensors.std / gains).median()) / (10.0 * propagation.usual_interval)
     return estimate_state_noise(propagation, sensors, residual, jacobian, weight, deviation, unit, start, climb)
 
 
-def propagation_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> Propagation:
+@lru_cache(maxsize=2)  # several noise models in succession, with the trajectory of the fit between
+def propagation_of(data: DataSet, fit: Fit, linearised: Linearised) -> Propagation:
     """Propagation of flow disturbances to the readings along a trajectory, for all recordings in sequence."""
-    data = fitter.data
-    pieces = pieces_of(fitter, fit, linearised)
-    matrices = [_between_samples(engine, theta, piece, _areas(fitter)) for engine, theta, piece in pieces]
+    matrices = [_between_samples(*piece, _areas(data)) for piece in fit.pieces(linearised)]
     transition, forcing, output = (with_blanks(each, dim=0) for each in zip(*matrices, strict=True))
     starts = torch.zeros(len(data.mask), dtype=torch.bool)
     starts[[rows.start for rows in data.rows]] = True
@@ -99,11 +100,6 @@ def propagation_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> Propagat
     for rows, experiment in zip(data.rows, data.experiments, strict=True):
         interval[rows.start : rows.stop - 1] = torch.diff(experiment.sample_times)
     return Propagation(transition, forcing, output, interval, starts, data.mask)
-
-
-def pieces_of(fitter: Fitter, fit: Fit, linearised: Linearised) -> list[tuple[Collocation, Tensor, Linearised]]:
-    """For each recording, its collocation, its parameters (1, P) and its part of a trajectory."""
-    return fitter.engine(fit.candidate, list(fit.effect_values)).apart(fit.theta.unsqueeze(0), linearised)
 
 
 def _between_samples(engine: Collocation, theta: Tensor, linearised: Linearised, areas: Tensor) -> Sequence[Tensor]:
@@ -128,8 +124,8 @@ def _sensors(fitter: Fitter) -> SensorNoise:
     return SensorNoise(fitter.noise.std, fitter.noise.lag_one)
 
 
-def _areas(fitter: Fitter) -> Tensor:
-    return torch.tensor([t.area for t in fitter.data.plant.tanks], dtype=torch.float64)
+def _areas(data: DataSet) -> Tensor:
+    return torch.tensor([t.area for t in data.plant.tanks], dtype=torch.float64)
 
 
 def log_evidence(fitter: Fitter, fit: Fit, choices: int) -> float:

@@ -143,8 +143,9 @@ def screen_under_each(fitters: Sequence[Fitter], fit: Fit, options: Sequence[Opt
     """Screen all options about a fit under the noise of each fitter."""
     regressions = [_ProjectedRegression.of(fitter, fit) for fitter in fitters]
     sums = torch.zeros(len(fitters), 2, len(options), dtype=fit.theta.dtype)
+    influence = _EffectColumns(fitters[0], fit, options)
     for k in range(0, len(options), BATCH):
-        columns = effect_columns(fitters[0], fit, options[k : k + BATCH])
+        columns = influence.of(options[k : k + BATCH])
         for regression, of_all in zip(regressions, sums, strict=True):
             of_all[:, k : k + BATCH] = torch.stack(regression.screened(columns))
     return [ScreeningResult(tuple(options), score, strength) for score, strength in sums]
@@ -213,49 +214,59 @@ class _ProjectedRegression:
 
 def effect_columns(fitter: Fitter, fit: Fit, options: Sequence[Option]) -> Tensor:
     """Changes of the readings (S, C, M), in their unit, for each start."""
-    engine = fitter.engine(fit.candidate, list(fit.effect_values))
-    pieces = engine.apart(fit.theta.unsqueeze(0), fit.linearised)
-    return with_blanks([_columns(fitter, fit, options, *piece) for piece in pieces], dim=0)
+    return _EffectColumns(fitter, fit, options).of(options)
 
 
-def _columns(
-    fitter: Fitter, fit: Fit, options: Sequence[Option], engine: Collocation, theta: Tensor, linearised: Linearised
-) -> Tensor:
-    """Changes of the readings (S, C, M) of one recording."""
-    experiment = engine.experiment
-    tried = {o.placement.prefix: o.placement for o in options}
-    union = fitter.network([*(p for p in fit.candidate.placements if p.prefix not in tried), *tried.values()])
-    values = zip(engine.space.names, theta.flatten().tolist(), strict=True)
-    constants = {n: v for n, v in values if n in union.constants}
-    present = {p.prefix for p in engine.network.placements} - tried.keys()
-    forcing_model = Forcing(
-        engine.network,
-        union,
-        present,
-        union.bind(*_named(union, constants)),
-        linearised.levels[0].T.contiguous(),
-        experiment,
-    )
-    groups = _groups(options)
-    moving = [i for group in groups if options[group[0]].placement.effect.stage is not Stage.READING for i in group]
-    sensors, count = len(fitter.data.plant.sensors), len(options)
-    columns = theta.new_zeros(sensors, count, len(experiment.sample_times))
-    forcing = theta.new_zeros(1, linearised.levels.shape[-1], len(moving), len(experiment.steps))
-    row = {option: k for k, option in enumerate(moving)}
-    for group in groups:
-        placement = options[group[0]].placement
-        starts = _starts([options[i] for i in group])
-        if placement.effect.stage is Stage.READING:
-            columns[:, group] = forcing_model.readings(placement, starts)
-        else:
-            first = row[group[0]]
-            forcing[0, :, first : first + len(group)] = forcing_model.rates(placement, starts)
-    if moving:
-        gain, transition = linearised.gain.permute(0, 2, 3, 1), linearised.transition.permute(0, 2, 3, 1)
-        initial = forcing.new_zeros(1, forcing.shape[1], len(moving))
-        paths = scan_in_time(transition, forcing, initial, gain)
-        columns[:, moving] = engine.look(linearised.levels, theta).along(paths, [-1] * len(moving))[0]
-    return columns.permute(2, 0, 1)
+class _EffectColumns:
+    """Influence of options on the readings about a fit, with what all options share computed once."""
+
+    def __init__(self, fitter: Fitter, fit: Fit, options: Sequence[Option]) -> None:
+        tried = {o.placement.prefix: o.placement for o in options}
+        present = [p for p in fit.candidate.placements if p.prefix not in tried]
+        self._pieces, self._union = fit.pieces(fit.linearised), fitter.network([*present, *tried.values()])
+        self._tried = tried.keys()
+        self._forcing = [self._forcing_of(*piece) for piece in self._pieces]
+        self._outputs = [engine.look(linearised.levels, theta) for engine, theta, linearised in self._pieces]
+
+    def _forcing_of(self, engine: Collocation, theta: Tensor, linearised: Linearised) -> Forcing:
+        values = zip(engine.space.names, theta.flatten().tolist(), strict=True)
+        constants = {n: v for n, v in values if n in self._union.constants}
+        return Forcing(
+            engine.network,
+            self._union,
+            {p.prefix for p in engine.network.placements} - self._tried,
+            self._union.bind(*_named(self._union, constants)),
+            linearised.levels[0].T.contiguous(),
+            engine.experiment,
+        )
+
+    def of(self, options: Sequence[Option]) -> Tensor:
+        """Changes of the readings (S, C, M) by some of the options."""
+        return with_blanks([self._along(k, options) for k in range(len(self._pieces))], dim=0)
+
+    def _along(self, recording: int, options: Sequence[Option]) -> Tensor:
+        """Changes of the readings (S, C, M) of one recording."""
+        (engine, theta, linearised), forcing_model = self._pieces[recording], self._forcing[recording]
+        experiment, outputs = engine.experiment, self._outputs[recording]
+        groups = _groups(options)
+        moving = [i for group in groups if options[group[0]].placement.effect.stage is not Stage.READING for i in group]
+        columns = theta.new_zeros(len(engine.network.description.sensors), len(options), len(experiment.sample_times))
+        forcing = theta.new_zeros(1, linearised.levels.shape[-1], len(moving), len(experiment.steps))
+        row = {option: k for k, option in enumerate(moving)}
+        for group in groups:
+            placement = options[group[0]].placement
+            starts = _starts([options[i] for i in group])
+            if placement.effect.stage is Stage.READING:
+                columns[:, group] = forcing_model.readings(placement, starts)
+            else:
+                first = row[group[0]]
+                forcing[0, :, first : first + len(group)] = forcing_model.rates(placement, starts)
+        if moving:
+            gain, transition = linearised.gain.permute(0, 2, 3, 1), linearised.transition.permute(0, 2, 3, 1)
+            initial = forcing.new_zeros(1, forcing.shape[1], len(moving))
+            paths = scan_in_time(transition, forcing, initial, gain)
+            columns[:, moving] = outputs.along(paths, [-1] * len(moving))[0]
+        return columns.permute(2, 0, 1)
 
 
 def _named(network: TankNetwork, values: Mapping[str, float]) -> tuple[ParameterSpace, Tensor]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -164,7 +165,7 @@ class Placement:
     location: str
     values: Mapping[str, float] | None = None
 
-    @property
+    @cached_property
     def prefix(self) -> str:
         return f"{self.location}.{self.effect.name}"
 

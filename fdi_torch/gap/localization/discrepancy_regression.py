@@ -94,7 +94,7 @@ class DiscrepancyRegression:
     def __init__(self, fitter: Fitter, fit: Fit, frequencies: Sequence[float], level_filter: LevelFilter) -> None:
         self.fitter, self.fit, self.level_filter = fitter, fit, level_filter
         self.frequencies = torch.tensor(frequencies, dtype=fit.theta.dtype)
-        self.engine = fitter.engine(fit.candidate, list(fit.effect_values))
+        self.engine = fit.engine
         self.theta = fit.theta.unsqueeze(0)
         self.levels = level_filter.levels(fitter, fit)
         self.linearised = self.engine.linearise(self.theta, self.levels)

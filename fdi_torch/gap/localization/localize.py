@@ -198,14 +198,15 @@ def _first_order_gains(
 ) -> dict[str, tuple[float, float]]:
     """First-order gain in log evidence of the best single regressor of each place under the best of the noises, with
     that of the noise; and the gain of the regressor alone, without the cost of its selection."""
-    fit, linearised, under_each = regression.fit, regression.linearised, []
-    for noise in noises:
-        under = with_disturbances(regression.fitter, fit, noise, linearised)
-        without = log_likelihood(under, fit, linearised) + noise.log_prior() - base
-        under_each.append((without, SingleRegressorGains(regression, under, torch.Generator().manual_seed(0))))
-    first_order = {}
+    fit, linearised, fitter = regression.fit, regression.linearised, regression.fitter
+    under = [with_disturbances(fitter, fit, noise, linearised) for noise in noises]
+    without = [
+        log_likelihood(each, fit, linearised) + noise.log_prior() - base
+        for each, noise in zip(under, noises, strict=True)
+    ]
+    gains, first_order = SingleRegressorGains(regression, under, torch.Generator().manual_seed(0)), {}
     for place in places:  # the regression keeps the regressors of one place only
-        each = [(without, gains.at(place)) for without, gains in under_each]
+        each = zip(without, gains.at(place), strict=True)
         first_order[place] = max(((w + g.net, g.gain) for w, g in each), key=itemgetter(0))
     return first_order
 

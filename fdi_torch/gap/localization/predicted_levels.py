@@ -18,7 +18,7 @@ from torch import Tensor
 from fdi_torch.estimate.noise_model import StateNoise
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
-from fdi_torch.gap.marginal_likelihood import estimate_disturbances, pieces_of, with_disturbances
+from fdi_torch.gap.marginal_likelihood import estimate_disturbances, with_disturbances
 from fdi_torch.plant.inverted_sensor import levels_from_readings
 from fdi_torch.simulate.linearised import Linearised
 from fdi_torch.simulate.resampling import interpolate
@@ -36,7 +36,7 @@ class LevelFilter:
 
     def levels(self, fitter: Fitter, fit: Fit) -> Tensor:
         """States (1, K+1, n) of all recordings at the parameters of a fit."""
-        linearised = fit.linearised if self.along is None else _linearised(fitter, fit, self.along)
+        linearised = fit.linearised if self.along is None else _linearised(fit, self.along)
         data, levels = fitter.data, linearised.levels.clone()
         whitening = with_disturbances(fitter, fit, self.noise, linearised).whitening
         assert whitening is not None
@@ -54,13 +54,12 @@ class LevelFilter:
 def measured_filter(fitter: Fitter, fit: Fit, noise: StateNoise) -> LevelFilter:
     """The filter about the measured levels, with the noise that is most likely there. noise: initial values."""
     along = measured_levels(fitter, fit)
-    return LevelFilter(estimate_disturbances(fitter, fit, _linearised(fitter, fit, along), start=noise).noise, along)
+    return LevelFilter(estimate_disturbances(fitter, fit, _linearised(fit, along), start=noise).noise, along)
 
 
-def _linearised(fitter: Fitter, fit: Fit, levels: Tensor) -> Linearised:
+def _linearised(fit: Fit, levels: Tensor) -> Linearised:
     """The plant at the parameters of a fit, linearised about levels."""
-    engine = fitter.engine(fit.candidate, list(fit.effect_values))
-    return engine.linearise(fit.theta.unsqueeze(0), levels)
+    return fit.engine.linearise(fit.theta.unsqueeze(0), levels)
 
 
 def measured_levels(fitter: Fitter, fit: Fit) -> Tensor:
@@ -70,7 +69,7 @@ def measured_levels(fitter: Fitter, fit: Fit) -> Tensor:
     A plant that is linearised about a reading contains its noise, and predicts the reading too well.
     """
     data, tanks, measured = fitter.data, len(fitter.data.plant.tanks), []
-    pieces = pieces_of(fitter, fit, fit.linearised)
+    pieces = fit.pieces(fit.linearised)
     for (engine, theta, linearised), rows in zip(pieces, data.rows, strict=True):
         experiment, states = engine.experiment, linearised.levels[0].unbind(-1)
         nodes, times = experiment.nodes, torch.cat([experiment.sample_times[1:], experiment.sample_times[-1:]])

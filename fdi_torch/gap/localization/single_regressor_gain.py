@@ -32,8 +32,8 @@ SIGNS = 64  # random sign vectors; the diagonal of C'C is then accurate to about
 
 @dataclass(frozen=True)
 class Adjoints:
-    """Residual and random signs (1 + SIGNS columns) mapped back to the readings (S, C, .), and per recording to the
-    flows into each tank and the rates of its level, (tanks, ., K)."""
+    """Whitened columns, such as a residual and random signs, mapped back to the readings (S, C, .), and per recording
+    to the flows into each tank and the rates of its level, (tanks, ., K)."""
 
     readings: Tensor
     inflows: list[Tensor]
@@ -52,36 +52,51 @@ class SingleRegressorGain(NamedTuple):
 
 
 class SingleRegressorGains:
-    """Gain in log evidence of the best single regressor of a place, for one noise model.
+    """Gain in log evidence of the best single regressor of a place, under each of some noise models.
 
-    under: fitter with the disturbance noise.
+    under: for each, the fitter with the disturbance noise.
     """
 
-    def __init__(self, regression: DiscrepancyRegression, under: Fitter, generator: torch.Generator) -> None:
-        self.regression, self.under, self._largest = regression, under, largest_influence(under)
-        basis = parameter_basis(under, regression.fit, regression.linearised)
-        residual = whitened_residual(under, regression.fit, regression.linearised)
-        columns = torch.cat([residual, random_signs(residual, generator)], dim=1)
-        self._adjoints = adjoints_of(regression, under, columns, basis)
+    def __init__(self, regression: DiscrepancyRegression, under: Sequence[Fitter], generator: torch.Generator) -> None:
+        self.regression, self.under, self._largest = regression, under, largest_influence(regression.fitter)
+        fit, linearised = regression.fit, regression.linearised
+        residuals = [whitened_residual(each, fit, linearised) for each in under]
+        signs = random_signs(residuals[0], generator)
+        readings = [
+            _whitened_adjoint(each, torch.cat([residual, signs], dim=1), parameter_basis(each, fit, linearised))
+            for each, residual in zip(under, residuals, strict=True)
+        ]
+        self._adjoints = _mapped_back(regression, torch.cat(readings, dim=-1))
 
-    def at(self, place: str) -> SingleRegressorGain:
+    def at(self, place: str) -> list[SingleRegressorGain]:
         weights = weights_of(self.regression, place, self._adjoints_at(place))
         grid, families = self._products(place, weights), position_products(self.regression, place, weights)
         groups = [(grid, len(grid)), *zip(families, choices_of(self.regression, place), strict=True)]
-        gains = (_largest_gain(group, choices, self._largest) for group, choices in groups if len(group))
-        return max(gains, key=lambda g: g.net)
+        gains = [self._largest_gains(group, choices) for group, choices in groups if len(group)]
+        return [max(of_noise, key=lambda g: g.net) for of_noise in zip(*gains, strict=True)]
 
     def _adjoints_at(self, place: str) -> Adjoints:
         """The adjoints at a place. For a sensor, the residual is that about the simulated level of its tank."""
         if self.regression.sensor(place) is None:
             return self._adjoints
         fit, linearised = self.regression.fit, self.regression.at(place)[1]
-        basis = parameter_basis(self.under, fit, linearised)
-        residual = _whitened_adjoint(self.under, whitened_residual(self.under, fit, linearised), basis)
-        return replace(self._adjoints, readings=torch.cat([residual, self._adjoints.readings[..., 1:]], dim=-1))
+        readings = self._adjoints.readings.clone()
+        for under, columns in zip(self.under, readings.split(1 + SIGNS, dim=-1), strict=True):
+            residual, basis = whitened_residual(under, fit, linearised), parameter_basis(under, fit, linearised)
+            columns[..., :1] = _whitened_adjoint(under, residual, basis)
+        return replace(self._adjoints, readings=readings)
+
+    def _largest_gains(self, products: Tensor, choices: int) -> list[SingleRegressorGain]:
+        """Largest gain among regressors under each noise. products: as `_products`. choices: number of regressors among
+        which one is selected."""
+        (cost,) = regressor_costs(torch.tensor([float(choices)]), self._largest).tolist()
+        return [
+            SingleRegressorGain(float(gains_of(each[:, 0], strengths_of(each[:, 1:])).max()), cost)
+            for each in products.split(1 + SIGNS, dim=1)
+        ]
 
     def _products(self, place: str, weights: Sequence[Tensor]) -> Tensor:
-        """Products (M, 1 + SIGNS) of the regressors of the grids with weights."""
+        """Products (M, N (1 + SIGNS)) of the regressors of the grids with the weights of N noise models."""
         shared, per_recording = list[Tensor](), list[Tensor]()
         for k, (regressors, net) in enumerate(zip(self.regression.at(place)[0], weights, strict=True)):
             products = regressors.functions @ net.T
@@ -92,13 +107,6 @@ class SingleRegressorGains:
             sinusoids = regressors.sinusoids(self.regression.frequencies).flatten(0, 1)
             per_recording.append(torch.cat([regressors.in_time, sinusoids]) @ net.T)
         return torch.cat([torch.stack(shared).sum(dim=0), *per_recording])
-
-
-def _largest_gain(products: Tensor, choices: int, largest: float) -> SingleRegressorGain:
-    """Largest gain among regressors. products (M, 1 + SIGNS): with the residual and random signs. choices: number of
-    regressors among which one is selected."""
-    (cost,) = regressor_costs(torch.tensor([float(choices)]), largest).tolist()
-    return SingleRegressorGain(float(gains_of(products[:, 0], strengths_of(products[:, 1:])).max()), cost)
 
 
 def position_products(regression: DiscrepancyRegression, place: str, weights: Sequence[Tensor]) -> list[Tensor]:
@@ -172,7 +180,11 @@ def parameter_basis(
 
 def adjoints_of(regression: DiscrepancyRegression, under: Fitter, columns: Tensor, basis: Tensor) -> Adjoints:
     """Columns (S C + P, .) without what the basis explains, mapped back."""
-    readings = _whitened_adjoint(under, columns, basis)
+    return _mapped_back(regression, _whitened_adjoint(under, columns, basis))
+
+
+def _mapped_back(regression: DiscrepancyRegression, readings: Tensor) -> Adjoints:
+    """The adjoints of columns that were mapped back to the readings (S, C, .)."""
     inflows, rates = [], []
     for piece in regression.pieces:
         by_rate = piece.to_rates(readings[piece.rows])
