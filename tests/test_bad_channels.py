@@ -100,7 +100,7 @@ def test_the_onset_of_a_stuck_sensor_counts_from_the_first_sample_of_a_part_of_a
     whole = from_sample(sound(), 1, 800, None)
     for run in (whole, whole.window(float(whole.time[200]))):
         first = 800 - len(whole) + len(run)
-        (known,) = problem_of(nominal_plant(), [run], [], PLAIN).known_effects
+        (known,) = problem_of(nominal_plant(), [run], [], DEFAULT_SETTINGS).known_effects
         assert known.values is not None
         assert known.values["onset"] == pytest.approx(float(run.time[first] - run.time[0]))
 

@@ -13,7 +13,7 @@ from typing import Any
 from fdi_torch.amounts import effect_words, probability_words
 from fdi_torch.effects import effect
 from fdi_torch.gap.answer import UNKNOWN
-from fdi_torch.gap.constant_remarks import MOVED
+from fdi_torch.gap.constant_remarks import OFF_TOLERANCES
 from fdi_torch.names import listed
 from fdi_torch.quantities import quantity_text
 
@@ -163,12 +163,12 @@ def _explained(answer: Named, *within: str) -> str:
 
 
 def _moved_constants(answer: Named) -> list[str]:
-    """Constants that are MOVED tolerances off or more: 'link.discharge_coefficient (3.1 tolerances off)'."""
+    """Constants that are OFF_TOLERANCES tolerances off or more: 'link.discharge_coefficient (3.1 tolerances off)'."""
     moved = []
     for name, constant in (answer.get("constants") or {}).items():
         numbers = [constant.get(key) for key in ("nominal", "augmented", "tolerance")]
         nominal, fitted, tolerance = (float(x) if isinstance(x, int | float) else math.nan for x in numbers)
-        if tolerance > 0.0 and abs(fitted - nominal) > MOVED * tolerance:
+        if tolerance > 0.0 and abs(fitted - nominal) > OFF_TOLERANCES * tolerance:
             moved.append(f"{name} ({(fitted - nominal) / tolerance:.2g} tolerances off)")
     return moved
 
