@@ -112,7 +112,7 @@ def problem_of(
     holdouts, holdout_outliers = _without_outliers(plant, nominal_effects, holdouts, settings.step)
     known_effects = limits_from_readings(plant, recordings, nominal_effects, library)
     nominal_effects += known_effects
-    known_effects += [replace(freezing[n], values={"size": 1.0, "onset": s.start}) for n, s in stuck_for_good.items()]
+    known_effects += [replace(freezing[n], values={"size": 1.0, "onset": s.onset}) for n, s in stuck_for_good.items()]
     outliers = _as_outliers([s for s in stuck if s.sensor.name not in stuck_for_good]) + outliers
     data, *holdout_data = (
         checked_data_set(plant, nominal_effects, r, settings.step) for r in (recordings, *((h,) for h in holdouts))
