@@ -26,7 +26,7 @@ from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.monitor.alarm_state import State
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.events import Event
-from fdi_torch.monitor.fault_free_checks import residual_warnings
+from fdi_torch.monitor.fault_free_checks import learning_times, residual_warnings
 from fdi_torch.monitor.hypothesis import Fault, Hypothesis, faults_of
 from fdi_torch.monitor.hypothesis_fit import Prior, fit
 from fdi_torch.monitor.isolation import isolate
@@ -40,7 +40,14 @@ from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.observer import Observation
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
 from fdi_torch.monitor.observer_gain import hand_gain
-from fdi_torch.monitor.samples import ClockState, Samples, samples_of_recording, split_at_gaps, usual_interval
+from fdi_torch.monitor.samples import (
+    ClockState,
+    Samples,
+    mean_interval,
+    samples_of_recording,
+    split_at_gaps,
+    usual_interval,
+)
 from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.network import TankNetwork
@@ -207,6 +214,21 @@ def test_random_sample_times_are_not_gaps() -> None:
         ClockState(float(samples.time[0])), samples.segment(1, 3000), usual_interval(samples.time)
     )
     assert [notice for _, notice in stretches] == [""] and arrived.last == float(samples.time[-1])
+
+
+def test_a_detector_counts_the_time_between_false_alarms_also_where_rows_are_missing() -> None:
+    """45 % of the rows are missing: most intervals are 1 s, their mean is 1.8 s."""
+    whole = recorded(lambda t: SPACE.nominal(), 3000, seed=99)
+    kept = torch.rand(3000, generator=torch.Generator().manual_seed(2)) < 0.55
+    part = PLANT.recording(whole.time[kept], whole.inputs[kept], whole.readings[kept], hold=whole.hold, source="rig")
+    prepared = prepare_monitor(PLANT, part, NAMES, time_between_false_alarms=2000.0)
+    design, mean = prepared.monitor.detector.design, float(torch.diff(part.time).mean())
+    assert design.run_length * mean == pytest.approx(2000.0)
+    assert learning_times(prepared.monitor.noise, prepared.monitor.detector)[0] == pytest.approx(3000.0, rel=0.01)
+    flows = prepared.monitor.noise.whitening.flows
+    assert flows is not None and flows.interval == pytest.approx(mean)
+    gap = torch.tensor([0.0, 1.0, 1.0, 3.0, 503.0, 505.0], dtype=torch.float64)
+    assert mean_interval(gap) == pytest.approx(5.0 / 3.0)
 
 
 def test_a_fault_that_ends_is_reported_as_recovered() -> None:
