@@ -35,7 +35,7 @@ from fdi_torch.monitor.level_forecast import DRAWS, limit_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
-from fdi_torch.monitor.monitor_state import MonitorState
+from fdi_torch.monitor.monitor_state import FaultTrack, HiddenFault, MonitorState
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.observer import Observation
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
@@ -406,6 +406,20 @@ def test_gaps_jumps_bursts_and_unknown_inputs_are_reported() -> None:
     assert "the clock jumps back by 499 s" in events[1].text
     assert "an input is unknown" in events[2].text
     assert float(state.samples.time[-1]) == float(time[-1])
+
+
+def test_known_faults_go_back_with_the_clock() -> None:
+    """A growing fault is as large as before the jump, and a hidden one is examined as soon as without it."""
+    samples, watch = recorded(lambda t: SPACE.nominal(), 200, seed=6), monitor()
+    state, _ = followed(watch, samples.segment(0, 100))
+    grown = FaultTrack(0, 1, 20.0, 1.0, (20.0, 0.0, 1e-3), (90.0, 0.07, 1e-3), 1.0, 90.0)
+    state = replace(state, tracks=(grown,), hidden=(HiddenFault(grown, 0.07, 50.0, 95.0),))
+    later = replace(samples.segment(100, 120), time=samples.time[100:120] - 5000.0)
+    state, _ = watch.advance(state, later)
+    [track], [hidden] = state.tracks, state.hidden
+    assert track.at(state.now)[0] == pytest.approx(grown.at(state.now + 5000.0)[0], abs=2e-3)
+    assert track.onset == pytest.approx(-4980.0, abs=1.0) and hidden.seen == pytest.approx(-4905.0, abs=1.0)
+    assert watch.alarms.next_fit(state) < state.now + watch.settings.confirm
 
 
 def test_an_observer_offset_is_reported_if_significant_and_relevant() -> None:
