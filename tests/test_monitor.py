@@ -26,7 +26,7 @@ from fdi_torch.jobs.monitor import run_monitor
 from fdi_torch.monitor.alarm_state import State
 from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.events import Event
-from fdi_torch.monitor.fault_free_checks import residual_warnings
+from fdi_torch.monitor.fault_free_checks import learning_times, residual_warnings
 from fdi_torch.monitor.hypothesis import Fault, Hypothesis, faults_of
 from fdi_torch.monitor.hypothesis_fit import Prior, fit
 from fdi_torch.monitor.isolation import isolate
@@ -35,12 +35,19 @@ from fdi_torch.monitor.level_forecast import DRAWS, limit_of
 from fdi_torch.monitor.monitor import Monitor
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.monitor_setup import fault_free_part, prepare_monitor
-from fdi_torch.monitor.monitor_state import MonitorState
+from fdi_torch.monitor.monitor_state import FaultTrack, HiddenFault, MonitorState
 from fdi_torch.monitor.noise_model import NoiseModel, learn_noise
 from fdi_torch.monitor.observer import Observation
 from fdi_torch.monitor.observer_bank import ChangeHypotheses, ObserverBank, ObserverWindow, no_change
 from fdi_torch.monitor.observer_gain import hand_gain
-from fdi_torch.monitor.samples import ClockState, Samples, samples_of_recording, split_at_gaps, usual_interval
+from fdi_torch.monitor.samples import (
+    ClockState,
+    Samples,
+    mean_interval,
+    samples_of_recording,
+    split_at_gaps,
+    usual_interval,
+)
 from fdi_torch.monitor.whitening import Whitening
 from fdi_torch.parameters import ParameterName, ParameterSpace
 from fdi_torch.plant.network import TankNetwork
@@ -207,6 +214,21 @@ def test_random_sample_times_are_not_gaps() -> None:
         ClockState(float(samples.time[0])), samples.segment(1, 3000), usual_interval(samples.time)
     )
     assert [notice for _, notice in stretches] == [""] and arrived.last == float(samples.time[-1])
+
+
+def test_a_detector_counts_the_time_between_false_alarms_also_where_rows_are_missing() -> None:
+    """45 % of the rows are missing: most intervals are 1 s, their mean is 1.8 s."""
+    whole = recorded(lambda t: SPACE.nominal(), 3000, seed=99)
+    kept = torch.rand(3000, generator=torch.Generator().manual_seed(2)) < 0.55
+    part = PLANT.recording(whole.time[kept], whole.inputs[kept], whole.readings[kept], hold=whole.hold, source="rig")
+    prepared = prepare_monitor(PLANT, part, NAMES, time_between_false_alarms=2000.0)
+    design, mean = prepared.monitor.detector.design, float(torch.diff(part.time).mean())
+    assert design.run_length * mean == pytest.approx(2000.0)
+    assert learning_times(prepared.monitor.noise, prepared.monitor.detector)[0] == pytest.approx(3000.0, rel=0.01)
+    flows = prepared.monitor.noise.whitening.flows
+    assert flows is not None and flows.interval == pytest.approx(mean)
+    gap = torch.tensor([0.0, 1.0, 1.0, 3.0, 503.0, 505.0], dtype=torch.float64)
+    assert mean_interval(gap) == pytest.approx(5.0 / 3.0)
 
 
 def test_a_fault_that_ends_is_reported_as_recovered() -> None:
@@ -384,6 +406,20 @@ def test_gaps_jumps_bursts_and_unknown_inputs_are_reported() -> None:
     assert "the clock jumps back by 499 s" in events[1].text
     assert "an input is unknown" in events[2].text
     assert float(state.samples.time[-1]) == float(time[-1])
+
+
+def test_known_faults_go_back_with_the_clock() -> None:
+    """A growing fault is as large as before the jump, and a hidden one is examined as soon as without it."""
+    samples, watch = recorded(lambda t: SPACE.nominal(), 200, seed=6), monitor()
+    state, _ = followed(watch, samples.segment(0, 100))
+    grown = FaultTrack(0, 1, 20.0, 1.0, (20.0, 0.0, 1e-3), (90.0, 0.07, 1e-3), 1.0, 90.0)
+    state = replace(state, tracks=(grown,), hidden=(HiddenFault(grown, 0.07, 50.0, 95.0),))
+    later = replace(samples.segment(100, 120), time=samples.time[100:120] - 5000.0)
+    state, _ = watch.advance(state, later)
+    [track], [hidden] = state.tracks, state.hidden
+    assert track.at(state.now)[0] == pytest.approx(grown.at(state.now + 5000.0)[0], abs=2e-3)
+    assert track.onset == pytest.approx(-4980.0, abs=1.0) and hidden.seen == pytest.approx(-4905.0, abs=1.0)
+    assert watch.alarms.next_fit(state) < state.now + watch.settings.confirm
 
 
 def test_an_observer_offset_is_reported_if_significant_and_relevant() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -34,6 +35,7 @@ from fdi_torch.study.summary import (
     column,
     count_modes,
     covered,
+    mean_with_error,
     rms_ratio,
     rms_with_error,
     share,
@@ -283,6 +285,16 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     assert 0.92 < sum(r.low <= truth <= r.high for r in ratios) / 400 < 0.975
     hits = [covered(row, torch.ones(500, dtype=torch.float64)) for row in draws]
     assert 0.92 < sum(h.low <= 0.95 <= h.high for h in hits) / 400 < 0.985
+
+
+def test_intervals_of_few_trials_are_wide_enough() -> None:
+    draws = torch.randn(1000, 10, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    means = [mean_with_error(row) for row in draws]
+    assert 0.93 < sum(m.low <= 0.0 <= m.high for m in means) / 1000 < 0.97
+    rms = [rms_with_error(row) for row in draws]
+    assert 0.88 < sum(r.low <= 1.0 <= r.high for r in rms) / 1000 < 0.97
+    assert rms_with_error(torch.zeros(3)) == Ratio(0.0, 0.0, 0.0)
+    assert rms_with_error(torch.ones(1)) == Ratio(1.0, 0.0, math.inf)
 
 
 def test_wilsons_interval() -> None:

@@ -23,6 +23,8 @@ Select = Callable[[Iterable[Message]], Iterable[Message]]
 Outcome = Literal["bit-equal", "within tolerance", "differs"]
 ABSOLUTE, RELATIVE = 1e-12, 1e-9
 """Absolute and relative part of the tolerance of a number."""
+UNFINISHED = ("", "interrupted", "failed")
+"""Statuses of a run that did not come to its end; a killed one has none."""
 
 
 @dataclass(frozen=True)
@@ -61,22 +63,32 @@ def replay(
 
     rerun: receives the opened log and returns the new log's path, or its messages. Numbers are within tolerance if |a -
     b| <= ABSOLUTE + RELATIVE max(|a|, |b|). select: chooses and orders the messages to compare on each side; by default
-    all as logged. Sentences on `/log` are not compared. Raises LogError for an unreadable log.
+    all as logged. Sentences on `/log` are not compared. Of a run that did not come to its end, the logged events are
+    compared with the first ones of the replay. Raises LogError for an unreadable log.
     """
     run = read_run(path)
     repeated = rerun(run)
     replayed = read_run(repeated).messages() if isinstance(repeated, str | Path) else repeated
     logged, again = (select(side) if select else side for side in (run.messages(), replayed))
-    return compare_events(logged, again, version_changes(run, environment() if env is None else env))
+    changes = version_changes(run, environment() if env is None else env)
+    return compare_events(logged, again, changes, run.about("status").get("status", "") in UNFINISHED)
 
 
 def compare_events(
-    logged: Iterable[Message], replayed: Iterable[Message], versions: dict[str, tuple[str, str]]
+    logged: Iterable[Message],
+    replayed: Iterable[Message],
+    versions: dict[str, tuple[str, str]],
+    unfinished: bool = False,
 ) -> Replay:
-    """Compare two ordered streams of events, up to the first difference beyond the tolerance."""
+    """Compare two ordered streams of events, up to the first difference beyond the tolerance, or up to the last logged
+    event of an unfinished run.
+    """
     events, largest, first_inexact = 0, 0.0, None
     streams = ((m for m in stream if m.topic != "/log") for stream in (logged, replayed))
-    for events, (then, now) in enumerate(zip_longest(*streams), 1):
+    for then, now in zip_longest(*streams):
+        if then is None and unfinished:
+            break
+        events += 1
         for deviation in _deviations(then, now):
             event = _event(then or now)  # one of both is there
             difference = Difference(events, *event, deviation.field, repr(deviation.then), repr(deviation.now))

@@ -128,7 +128,10 @@ class Monitor:
         return [self.writer.summary(state, alarm) for alarm in state.alarms]
 
     def _restart(self, state: MonitorState, samples: Samples, notice: str) -> tuple[MonitorState, list[Event]]:
-        """Restart the observer after a gap. Isolated faults stay in its parameters; a pending alarm is retired."""
+        """Restart the observer after a gap. Isolated faults stay in its parameters; a pending alarm is retired.
+
+        If the clock went back, the times of the faults go back with it: they would otherwise lie in the future.
+        """
         fresh = initial_state(
             self.observer,
             samples.segment(0, 1),
@@ -136,11 +139,12 @@ class Monitor:
             state.healthy,
             correlation_time=self.settings.lookback,
         )
+        back = min(fresh.now - state.now, 0.0)
         fresh = replace(
             fresh,
             alarms=state.alarms,
-            tracks=state.tracks,
-            hidden=state.hidden,
+            tracks=tuple(track.moved(back) for track in state.tracks),
+            hidden=tuple(fault.moved(back) for fault in state.hidden),
             pending=state.pending,
             learning_until=state.learning_until,
             errors=replace(fresh.errors, constants=state.errors.constants).as_calibrated(),

@@ -24,7 +24,7 @@ from fdi_torch.monitor.monitor import Monitor, ResidualTrace
 from fdi_torch.monitor.monitor_settings import MonitorSettings
 from fdi_torch.monitor.noise_model import effects_of_constants, learn_beside_errors
 from fdi_torch.monitor.observer import Observer
-from fdi_torch.monitor.samples import samples_of_recording, usual_interval
+from fdi_torch.monitor.samples import mean_interval, samples_of_recording, usual_interval
 from fdi_torch.monitor.stepper import usual_step
 from fdi_torch.monitor.whitening import FEWEST_SAMPLES
 from fdi_torch.parameters import ParameterName, ParameterSpace
@@ -105,7 +105,7 @@ def prepare_monitor(
     effects = effects_of_constants(observed, samples, space, believed, calibrated)
     constants = constant_errors([*calibrated, *others], effects, noise.whitening.flows, expected)
     noise = replace(noise, constants=constants)
-    sampling = float(torch.diff(samples.time).median())
+    sampling = mean_interval(samples.time)
     generator = torch.Generator().manual_seed(seed)
     every = time_between_false_alarms
     detector = make_detector(chart, every, sampling, len(plant.sensors), generator, learnt=noise.whitening)

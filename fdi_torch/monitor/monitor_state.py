@@ -40,6 +40,17 @@ class FaultTrack:
         significant = t1 > t0 and abs(size1 - size0) > 3.0 * math.hypot(std0, std1)
         return (size1 - size0) / (t1 - t0) if significant else None
 
+    def moved(self, by: float) -> FaultTrack:
+        """The track by a clock that is this much ahead, s."""
+        return replace(
+            self,
+            onset=self.onset + by,
+            first=(self.first[0] + by, *self.first[1:]),
+            last=(self.last[0] + by, *self.last[1:]),
+            announced=self.announced + by,
+            adjusted=self.adjusted + by,
+        )
+
     def at(self, time: float) -> tuple[float, float]:
         """Size and standard deviation at a time, s: those of the latest estimate, grown since at the same rate."""
         (t0, _, std0), (t1, size, std) = self.first, self.last
@@ -60,6 +71,10 @@ class HiddenFault:
     size: float
     ended: float
     seen: float
+
+    def moved(self, by: float) -> HiddenFault:
+        """The fault by a clock that is this much ahead, s."""
+        return replace(self, track=self.track.moved(by), ended=self.ended + by, seen=self.seen + by)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from fdi_torch.monitor.observer_gain import (
     start_uncertainty,
     with_effects,
 )
-from fdi_torch.monitor.samples import Samples, usual_interval
+from fdi_torch.monitor.samples import Samples, mean_interval, usual_interval
 from fdi_torch.monitor.stepper import Stepper
 from fdi_torch.monitor.whitening import Whitening, score_whitenings
 from fdi_torch.parameters import ParameterSpace
@@ -205,7 +205,7 @@ def _whitening(
     uncorrelated in time, the sensors' noise may be correlated: flows and sensor noise are then estimated together.
     Without a compiler there is no flow filter.
     """
-    residual, interval = seen.steady_residual, usual_interval(seen.time)
+    residual, interval = seen.steady_residual, mean_interval(seen.time)
     std, start = residual.square().nanmean(dim=0).sqrt(), start_uncertainty(network.description, residual)
     estimate = partial(estimate_flow_filter, linear, gain, residual, effects, expected, std, start, interval)
     try:
@@ -244,5 +244,5 @@ def operating_point(
     levels = initial_levels(network, median, values)
     heights = network.nominal.new_tensor([tank.height for tank in network.description.tanks])
     lowest = 0.02 * heights  # the outflow law has no finite slope in an empty tank
-    span = float(torch.diff(samples.time).median())
+    span = mean_interval(samples.time)
     return linearised(Stepper(network, longest_step), torch.maximum(levels, lowest), inputs, span, values)

@@ -63,6 +63,13 @@ def usual_interval(time: Tensor) -> float:
     return float(steps[steps > 0].quantile(USUAL_QUANTILE, interpolation="lower")) if bool((steps > 0).any()) else 1.0
 
 
+def mean_interval(time: Tensor) -> float:
+    """Mean interval between sample times (S,) without gaps, s: what counts per sample happens once in this time."""
+    steps = torch.diff(time)
+    steps = steps[(steps > 0) & (steps <= GAP * usual_interval(time))]
+    return float(steps.mean()) if len(steps) else usual_interval(time)
+
+
 @dataclass(frozen=True)
 class Restart:
     """A restart of the observer that waits for a reading of each sensor.

@@ -162,25 +162,36 @@ def _failures(name: str, error: Tensor, trials: Sequence[Trial], setting: Settin
 
 
 def mean_with_error(values: Float[Tensor, " N"]) -> Ratio:
-    """Mean with its 95 % interval from the sample variance."""
-    mean = float(values.mean())
-    reach = _REACH * float(values.std()) / math.sqrt(len(values)) if len(values) > 1 else math.inf
+    """Mean with its 95 % interval from the sample variance (Student's t)."""
+    mean, reach = float(values.mean()), _reach(values)
     return Ratio(mean, mean - reach, mean + reach)
 
 
 def rms_with_error(values: Float[Tensor, " N"]) -> Ratio:
-    """Root mean square with its 95 % interval from the variance of the squares."""
-    square = mean_with_error(values.square())
-    return Ratio(math.sqrt(square.value), math.sqrt(max(square.low, 0.0)), math.sqrt(square.high))
+    """Root mean square with its 95 % interval from the variance of the squares (delta method, of the logarithm)."""
+    squares = values.square()
+    mean = squares.mean()
+    return _within(math.sqrt(float(mean)), squares / mean.clamp(min=torch.finfo(mean.dtype).tiny))
 
 
 def rms_ratio(errors: Float[Tensor, " N"], others: Float[Tensor, " N"]) -> Ratio:
     """Ratio of the root mean squares of paired errors, with its 95 % interval (delta method)."""
     a, b = errors.square(), others.square()
-    ratio = math.sqrt(float(a.mean() / b.mean()))
-    error = float((a / a.mean() - b / b.mean()).std()) / math.sqrt(len(a)) if len(a) > 1 else math.inf
-    factor = math.exp(0.5 * _REACH * error)
-    return Ratio(ratio, ratio / factor, ratio * factor)
+    return _within(math.sqrt(float(a.mean() / b.mean())), a / a.mean() - b / b.mean())
+
+
+def _within(root: float, squares: Float[Tensor, " N"]) -> Ratio:
+    """A root with its 95 % interval from the relative deviations of the squares."""
+    factor = math.exp(0.5 * _reach(squares))
+    return Ratio(root, root / factor, root * factor)
+
+
+def _reach(values: Float[Tensor, " N"]) -> float:
+    """Half of the 95 % interval of a mean."""
+    from scipy.special import stdtrit  # takes a while to load
+
+    count = len(values)
+    return float(stdtrit(count - 1, 0.975) * values.std()) / math.sqrt(count) if count > 1 else math.inf
 
 
 def covered(error: Float[Tensor, " N"], std: Float[Tensor, " N"]) -> Ratio:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -156,6 +157,29 @@ def test_a_replay_that_is_bit_equal(finished: Path, tmp_path: Path) -> None:
     found = replay(finished, rerun, env={"python": "3.11"})
     assert found.outcome == "bit-equal" and found.first is None and found.largest == 0 and found.versions == {}
     assert found.events == sum(message.topic != "/log" for message in read_run(finished).messages())
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), ValueError("no water"), None])
+def test_the_replay_of_an_interrupted_run_may_go_on(tmp_path: Path, error: BaseException | None) -> None:
+    """Its log lacks what the run had not computed yet; without a status, it was killed."""
+    path = tmp_path / "a.mcap"
+    with suppress(KeyboardInterrupt, ValueError), RunLog(path, "train", **FIXED) as log:
+        log.alarm(1.0, "alarm", "h1")
+        log.flush()
+        if error is None:
+            path = tmp_path / "killed.mcap"
+            path.write_bytes(log.partial_path.read_bytes())
+        else:
+            raise error
+
+    def onward(run: Run) -> list[Message]:
+        [first] = run.messages()
+        return [first, replace(first, log_time=first.log_time + 10**9)]
+
+    found = replay(path, onward)
+    assert (found.outcome, found.events) == ("bit-equal", 1)
+    assert replay(path, lambda run: onward(run)[1:]).outcome == "differs"
+    assert replay(path, lambda run: []).outcome == "differs"
 
 
 def changed(run: Run, topic: str, **fields: Any) -> Iterator[Message]:
