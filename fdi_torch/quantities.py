@@ -128,6 +128,28 @@ def quantity_text(value: float, si_unit: str, digits: int = 4, name: str = "") -
     return f"{significant(scale * value, digits)} {unit}".rstrip()
 
 
+NOT_METRIC_VOLUMES = ("gal", "ft^3", "in^3")
+
+
+def small_length_text(value: float, digits: int = 3) -> str:
+    """The width of a hole, m, as text: in mm if the unit of lengths for display is metric, else in that unit."""
+    unit, scale = display_unit("m")
+    decade = math.log10(scale)
+    if abs(decade - round(decade)) < 1e-6:
+        unit, scale = "mm", 1000.0
+    return f"{scale * value:.{digits}g} {unit}"
+
+
+def volume_unit() -> str:
+    """The unit for display of a tank's volume: l, or that of the flows if it is not metric, as gal for gal/min."""
+    chosen = _DISPLAYED.get().get("m^3")
+    if chosen:
+        return chosen
+    flow = unit_factor(display_unit("m^3/s")[0], "m^3/s")
+    of_flow = ((v, flow / unit_factor(f"{v}/{t}", "m^3/s")) for v in NOT_METRIC_VOLUMES for t in ("s", "min", "h"))
+    return next((volume for volume, ratio in of_flow if abs(ratio - 1.0) < 1e-6), "l")
+
+
 def displayed_words(name: str, otherwise: str) -> str:
     """The words for an effect at a place, 'back.pump_gain', in this context; `otherwise` if it has none of its own."""
     return _DISPLAYED.get().get(name, otherwise)

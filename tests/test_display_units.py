@@ -15,10 +15,12 @@ from fdi_torch.config.plant_file import build_plant, load_plant
 from fdi_torch.config.plant_patch import patched_plant
 from fdi_torch.config.plant_writer import dump_plant
 from fdi_torch.config.problems import ConfigError
+from fdi_torch.estimate.misfit import flow_words
 from fdi_torch.gap.answer import with_constants
 from fdi_torch.jobs.report import report
 from fdi_torch.plant.description import PlacedEffect
-from fdi_torch.quantities import display_in, display_unit, displayed_in, quantity_text
+from fdi_torch.plant.scales import tank_table
+from fdi_torch.quantities import display_in, display_unit, displayed_in, quantity_text, volume_unit
 
 PLANT = """name: rig
 tanks:
@@ -113,6 +115,20 @@ def test_units_survive_the_log_and_the_plant_file() -> None:
     plain = build_plant(yaml.safe_load(PLANT), "plant.yaml")
     assert "height: 500 mm" in dump_plant(plain) and "max_flow: 6 l/min" in dump_plant(plain)
     assert "units:" not in dump_plant(plain)
+
+
+def test_holes_and_volumes_follow_a_plant_in_inches_and_gallons() -> None:
+    text = PLANT.replace("16000 mm^2", "31 in^2").replace("500 mm", "24 in").replace("6 l/min", "1.6 gal/min")
+    plant = build_plant(yaml.safe_load(text.replace("60 mm^2", "0.093 in^2")), "plant.yaml")
+    with displayed_in(plant.units):
+        assert flow_words(6.309e-5, 0.00508, True) == (
+            "changes the flow by 1 gal/min at the mean levels, as a sharp-edged hole of 0.2 in would"
+        )
+        table = tank_table(plant)
+    assert table.header[1:4] == ("area, in^2", "height, in", "volume, gal")
+    assert table.rows[0][3] == pytest.approx(31.0 * 24.0 / 231.0)  # a US gallon has 231 cubic inches
+    with displayed_in({"m": "m", "m^3/s": "m^3/h"}):
+        assert "hole of 5.08 mm" in flow_words(6.309e-5, 0.00508, True) and volume_unit() == "l"
 
 
 def test_an_adopted_effect_is_written_in_the_units_of_the_file() -> None:

@@ -32,12 +32,14 @@ def run(arguments: argparse.Namespace, screen: Screen) -> int:
 
 def show(result: StudyResult, screen: Screen, remark: str = "") -> None:
     """Print a table per setting, a remark on them, the isolation of modes, and the path of the log."""
-    tables = result.tables()
+    tables = result.tables(brief=True)
     for table in tables:
         screen.show(table)
         screen.say()
     if len(tables) == len(result.summaries):
         screen.say(LEGEND)
+        if any(len(short) < len(whole) for short, whole in zip(tables, result.tables(), strict=True)):
+            screen.say(f"of each estimator but the first, the worst parameter; all: fdi report {result.log}")
     if remark:
         screen.say(remark)
     if result.isolation is not None:

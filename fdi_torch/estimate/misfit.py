@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from fdi_torch.names import listed
 from fdi_torch.plant.description import PlantDescription
-from fdi_torch.quantities import quantity_text
+from fdi_torch.quantities import quantity_text, small_length_text
 from fdi_torch.recording import Recording
 from fdi_torch.recordings.repeated_readings import resolution
 from fdi_torch.sample_noise import sample_noise
@@ -75,7 +75,9 @@ def flow_words(flow: float, hole: float | None, explained: bool) -> str:
     """'changes the flow by 30 cm^3/s at the mean levels, as a sharp-edged hole of 4.8 mm would', from SI values."""
     change = "changes" if explained else "would change"
     words = f"{change} the flow by {quantity_text(flow, 'm^3/s', 3)} at the mean levels"
-    return f"{words}, as a sharp-edged hole of {1e3 * hole:.3g} mm would" if hole and math.isfinite(hole) else words
+    return (
+        f"{words}, as a sharp-edged hole of {small_length_text(hole)} would" if hole and math.isfinite(hole) else words
+    )
 
 
 @dataclass(frozen=True)

@@ -44,11 +44,13 @@ class StudyResult(Shown):
         return f"{counted(len(self.trials), 'trial')} in {counted(len(self.summaries), 'setting')}"
 
     @in_its_units
-    def tables(self) -> list[Table]:
-        """The scores of each setting, as `fdi study` prints them."""
+    def tables(self, brief: bool = False) -> list[Table]:
+        """The scores of each setting. brief: as `fdi study` prints them, of each estimator but the first only its worst
+        parameter.
+        """
         units = {score.parameter: score.unit for summary in self.summaries for score in summary.scores}
         units |= {sensor: unit for summary in self.summaries for sensor, (_, unit) in summary.noise.items()}
-        return setting_tables([(s.setting, s.trials, s.numbers()) for s in self.summaries], units)
+        return setting_tables([(s.setting, s.trials, s.numbers()) for s in self.summaries], units, brief)
 
     @in_its_units
     def table(self) -> Table:

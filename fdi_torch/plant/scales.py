@@ -12,7 +12,7 @@ from statistics import geometric_mean
 
 from fdi_torch.plant.constants import flow_scale, nominal_capacity
 from fdi_torch.plant.description import PlantDescription, Tank
-from fdi_torch.quantities import display_unit, significant
+from fdi_torch.quantities import display_unit, significant, unit_factor, volume_unit
 from fdi_torch.tables import Table
 
 # Height, m, and emptying time A H / (C_d a sqrt(2 g H)), s, of the tanks of three_tank.
@@ -22,13 +22,15 @@ _EMPTYING_TIME = 0.016 * _HEIGHT / (0.6 * 0.6e-4 * math.sqrt(2.0 * 9.81))
 
 def tank_table(plant: PlantDescription) -> Table:
     """Size and emptying time of each tank, in the units for display."""
-    (area, per_area), (height, per_height) = display_unit("m^2"), display_unit("m")
+    (area, per_area), (height, per_height), volume = display_unit("m^2"), display_unit("m"), volume_unit()
+    per_volume = 1.0 / unit_factor(volume, "m^3")
     rows = []
     for tank in plant.tanks:
-        sizes = (per_area * tank.area, per_height * tank.height, 1e3 * tank.area * tank.height)
+        sizes = (per_area * tank.area, per_height * tank.height, per_volume * tank.area * tank.height)
         time = emptying_time(plant, tank)
         rows.append([tank.name, *sizes, significant(time, 3) if math.isfinite(time) else "never"])
-    return Table(("tank", f"area, {area}", f"height, {height}", "volume, l", "empties from full in, s"), rows, digits=4)
+    sizes_in = (f"area, {area}", f"height, {height}", f"volume, {volume}")
+    return Table(("tank", *sizes_in, "empties from full in, s"), rows, digits=4)
 
 
 def emptying_time(plant: PlantDescription, tank: Tank) -> float:

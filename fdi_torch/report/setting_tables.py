@@ -26,13 +26,16 @@ Numbers = Mapping[str, Any]
 """The numbers of a setting by their dotted names, `Summary.numbers`."""
 
 
-def setting_tables(settings: Sequence[tuple[str, Any, Numbers]], units: Mapping[str, str]) -> list[Table]:
+def setting_tables(
+    settings: Sequence[tuple[str, Any, Numbers]], units: Mapping[str, str], brief: bool = False
+) -> list[Table]:
     """The scores of settings, given as name, number of trials and numbers; of many, one table with their failures.
 
-    units: SI units by parameter, and by sensor if the numbers have their noise.
+    units: SI units by parameter, and by sensor if the numbers have their noise. brief: of each estimator but the first,
+    only the parameter with the largest error relative to the bound.
     """
     if len(settings) <= MOST_SETTINGS:
-        return [_setting_table(*setting, units) for setting in settings]
+        return [_setting_table(*setting, units, brief) for setting in settings]
     rows = []
     for setting, trials, numbers in settings:
         name = next((name for name in ESTIMATORS if f"{name}.failures" in numbers), "")
@@ -47,10 +50,11 @@ def isolation_sentence(counts: Mapping[str, Any]) -> str:
     return f"{right} of {trials} modes stated correctly; {missed} faults missed, {false} false faults."
 
 
-def _setting_table(setting: str, trials: Any, numbers: Numbers, units: Mapping[str, str]) -> Table:
-    """One row per estimator and parameter. The summary says how the trials ended."""
+def _setting_table(setting: str, trials: Any, numbers: Numbers, units: Mapping[str, str], brief: bool = False) -> Table:
+    """One row per estimator and parameter; brief: as of `setting_tables`. The summary says how the trials ended."""
     rows = []
-    for score in (key.removesuffix(".rmse") for key in numbers if key.endswith(".rmse")):
+    scores = [key.removesuffix(".rmse") for key in numbers if key.endswith(".rmse")]
+    for score in _first_and_worst(scores, numbers) if brief else scores:
         estimator, _, parameter = score.partition(".")
         errors = (as_float(numbers.get(f"{score}.{key}")) for key in ("bias", "bias_error", "rmse"))
         unit, bias, error, rmse = in_display_unit(parameter, units[parameter], *errors)
@@ -64,6 +68,20 @@ def _setting_table(setting: str, trials: Any, numbers: Numbers, units: Mapping[s
     header += [cell for name in RATIOS.values() for cell in (name, "95 %")]
     title = f"{setting}: {trials} trials, {number(as_float(numbers.get('converged')))} converged"
     return Table(header, rows, title, summary="; ".join(filter(None, [*_accuracies(numbers, units), _ending(numbers)])))
+
+
+def _first_and_worst(scores: Sequence[str], numbers: Numbers) -> list[str]:
+    """The scores of the first estimator, and of each other one that with the largest error relative to the bound."""
+    by_estimator: dict[str, list[str]] = {}
+    for score in scores:
+        by_estimator.setdefault(score.partition(".")[0], []).append(score)
+    first, *others = by_estimator.values() or [[]]
+
+    def error(score: str) -> float:
+        ratio = as_float(numbers.get(f"{score}.over_bound"))
+        return ratio if math.isfinite(ratio) else -1.0
+
+    return [*first, *(max(each, key=error) for each in others)]
 
 
 def _accuracies(numbers: Numbers, units: Mapping[str, str]) -> list[str]:

@@ -59,6 +59,18 @@ def test_the_settings_of_a_study_are_the_same_everywhere(tmp_path: Path, capsys:
     assert len(many) == 1 and many[0].cells()[3] == ["3", "20", "3", "0.5"]
 
 
+def test_a_short_table_has_the_worst_parameter_of_each_further_estimator() -> None:
+    names, numbers = ("T1.leak.size", "T2.leak.size"), {"free.failures": 0}
+    for estimator, ratios in (("free", (1.01, 1.02)), ("correlation", (1.6, 3.5))):
+        for name, ratio in zip(names, ratios, strict=True):
+            numbers |= {f"{estimator}.{name}.{key}": 0.001 for key in ("bias", "bias_error", "rmse")}
+            numbers[f"{estimator}.{name}.over_bound"] = ratio
+    settings, units = [("SNR 30", 20, numbers)], dict.fromkeys(names, "1")
+    assert len(setting_tables(settings, units)[0]) == 4
+    rows = setting_tables(settings, units, brief=True)[0].rows
+    assert [row[:2] for row in rows] == [("free", "T1.leak"), ("free", "T2.leak"), ("correlation", "T2.leak")]
+
+
 def test_a_page_adds_the_finding_to_the_estimates_of_the_terminal(tmp_path: Path) -> None:
     material = material_of(write_train(tmp_path / "run.mcap"))
     final = last_estimate(material)

@@ -19,6 +19,7 @@ from fdi_torch.plant.flow_component import (
 )
 from fdi_torch.plant.local_conditions import Local, Values
 from fdi_torch.plant.orifice import regular_width
+from fdi_torch.quantities import quantity_text
 from fdi_torch.recording import LARGEST
 
 BOW_TIE = ((-0.12, 0.08), (-0.12, -0.08), (0.12, 0.08), (0.12, -0.08))
@@ -86,8 +87,8 @@ class Pipe(FlowComponent):
             yield f"unrecorded: expected an opening from 0 to 1, got {self.unrecorded:g}"
         if not 0 <= self.elevation <= LARGEST:
             yield (
-                f"elevation: expected at least 0 m above both floors, got {self.elevation:g} m; move the zero of the "
-                "tanks' levels below the pipe"
+                f"elevation: expected at least 0 m above both floors, got {quantity_text(self.elevation, 'm')}; move "
+                "the zero of the tanks' levels below the pipe"
             )
 
     def actuated(self, value: torch.Tensor) -> torch.Tensor:
