@@ -1,6 +1,6 @@
 """Weights of hypotheses: how the weight of a discrepancy is divided among the laws that may be behind it.
 
-Four cases share weight. A discrepancy at a place with an effect is the error of that effect's law, or an unknown law. An
+There are four cases. A discrepancy at a place with an effect is the error of that effect's law, or an unknown law. An
 unknown may be an effect of the library at its place whose law is inexact. A second effect at a place may only describe
 the error of the first one's law. An effect whose size may be zero may be absent.
 """
