@@ -119,7 +119,7 @@ def test_a_discrepancy_is_tried_at_other_places_beside_the_same_effects(monkeypa
     for name in ("_with_fewer_effects", "_with_more_effects"):
         monkeypatch.setattr(HypothesisSearch, name, lambda self, best: [])
     monkeypatch.setattr(HypothesisSearch, "_with_discrepancies", with_discrepancies)
-    assert at_outlet in search._climbed(at_tank)
+    assert at_outlet in search._local_search(at_tank)
     assert tried == [(explanation, ("T1", "OUT1"))], "once for each explanation"
 
 
@@ -156,7 +156,7 @@ def test_a_discrepancy_is_tried_at_other_places_beside_the_effect_that_names_it(
         monkeypatch.setattr(HypothesisSearch, name, lambda self, best: [])
     monkeypatch.setattr(HypothesisSearch, "_fit_effects_at", lambda self, h, unknown: None)
     monkeypatch.setattr(HypothesisSearch, "_with_discrepancies", with_discrepancies)
-    assert moved in search._climbed(best)
+    assert moved in search._local_search(best)
 
 
 @pytest.mark.slow

@@ -236,7 +236,7 @@ class Valley:
     ) -> Linearisation:
         return self.linearise(theta, torch.arange(len(theta)))
 
-    def bend(self, known: Linearisation, trial: Linearisation, step: Tensor) -> Tensor:
+    def nonlinearity(self, known: Linearisation, trial: Linearisation, step: Tensor) -> Tensor:
         here, there = known.state, trial.state
         assert isinstance(here, Point) and isinstance(there, Point)
         return apply(here.jacobian.mT, there.residual - here.residual - apply(here.jacobian, step))

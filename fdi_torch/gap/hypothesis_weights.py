@@ -1,8 +1,8 @@
 """Weights of hypotheses: how the weight of a discrepancy is divided among the laws that may be behind it.
 
-A discrepancy at a place with an effect is the error of the effect's law, or another law; an unknown may be an effect of
-the library at its place whose law is inexact; a second effect at a place may describe the error of the first one's law;
-and an effect whose size may be zero is none.
+There are four cases. A discrepancy at a place with an effect is the error of that effect's law, or an unknown law. An
+unknown may be an effect of the library at its place whose law is inexact. A second effect at a place may only describe
+the error of the first one's law. An effect whose size may be zero may be absent.
 """
 
 from __future__ import annotations

@@ -150,9 +150,11 @@ def _without_common(key: str, texts: Sequence[str]) -> dict[str, tuple[str, ...]
 
 
 def _differing_leaves(key: str, values: Sequence[Any]) -> dict[str, Sequence[Any]]:
-    """The deepest keys that differ. Lists of tables are compared entry by entry if all runs have as many without a
-    name; lists of other things as a whole if they are short and one holds nothing but what every run has, else without
-    what every run has.
+    """The deepest keys whose values differ between runs, with the value of each run.
+
+    Lists of mappings without a name are compared entry by entry if those of all runs have equally many entries. Of any
+    other list, only the entries that some run lacks are kept; but a list stays whole if all are short and one run has
+    no entry of its own.
     """
     if all(value == values[0] for value in values):
         return {}
