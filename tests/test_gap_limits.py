@@ -8,8 +8,10 @@ import torch
 
 from fdi_torch.config.plant_file import load_plant
 from fdi_torch.effects import place
-from fdi_torch.gap.diagnose import Settings, diagnose
+from fdi_torch.effects.clipping import clipping_bias
+from fdi_torch.gap.diagnose import Settings, diagnose, recalibrate
 from fdi_torch.gap.preprocess.sensor_limits import limits_from_readings, limits_of
+from fdi_torch.gap.problem import problem_of
 from fdi_torch.recording import Recording
 from tests.test_gap import noise, nominal_plant, recorded
 
@@ -65,6 +67,27 @@ def test_clipped_noise_is_no_further_gap(behind: bool) -> None:
         nominal_plant(), sensors=tuple(replace(s, high=limit) if s.name == "h1" else s for s in nominal_plant().sensors)
     )
     assert diagnose(known, replace(recording, outputs=reading), settings=Settings(library)).verdict == "no_gap"
+
+
+def test_the_noise_that_a_limit_clips_is_that_of_a_reading_and_not_of_a_mean_of_readings() -> None:
+    """Rows of two readings each, and a plugged pipe that the fit without effects does not have: it predicts the level
+    wrongly, by centimetres."""
+    std, seed, samples = 4e-3, 11, 2000
+    recording = recorded({"P13.plugging.size": 0.5}, seed, samples, std)
+    e = noise(samples, 0.0, std, seed + 1)
+    level = recording.outputs - e
+    limit = float(level[:, 0].quantile(0.7))
+    limits = torch.tensor([limit, math.inf, math.inf], dtype=torch.float64)
+    reading = torch.minimum(torch.minimum(level, limits) + e, limits)
+    settings = Settings(("sensor_saturation", "plugging"), step=2.0)
+    data = problem_of(nominal_plant(), [replace(recording, outputs=reading)], [], settings).data
+    fitter, _, _ = recalibrate(data)
+    (clipped,) = (p for p in fitter.data.nominal_effects if p.effect.name == "sensor_saturation")
+    assert clipped.values is not None
+    assert clipped.values["noise"] == pytest.approx(std, rel=0.1)
+    values = {name: torch.tensor(value, dtype=torch.float64) for name, value in clipped.values.items()}
+    bias = float(clipping_bias(torch.tensor(1.0, dtype=torch.float64), values))
+    assert bias == pytest.approx(std / math.sqrt(2.0 * math.pi), rel=0.1), "of readings far beyond the limit"
 
 
 def test_the_last_bits_of_readings_change_nothing() -> None:

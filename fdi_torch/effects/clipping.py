@@ -61,3 +61,13 @@ def clipping_bias(beyond: torch.Tensor, p: Values) -> torch.Tensor:
     one_limit = torch.log(1.0 + torch.exp(-torch.abs(beyond) / positive_scale))
     two_limits = torch.log(1.0 + torch.exp(torch.clamp(beyond, max=0.0) / positive_scale))
     return scale * (one_limit + p["behind"] * (two_limits - one_limit))
+
+
+def clipped_noise(depth: float, std: float) -> dict[str, float]:
+    """The parameters `noise` and `behind` with which the mean of readings far beyond a limit lies `depth` inside of it.
+
+    std: standard deviation of the readings' noise; a greater one is stated if that is too small for the depth.
+    """
+    all_behind = max(depth, 0.0) / (LOGISTIC * math.log(2.0))
+    noise = max(std, all_behind)
+    return {"noise": noise, "behind": all_behind / noise if noise > 0.0 else 0.0}

@@ -7,6 +7,7 @@ deviations of the noise, which with 3600 samples is a gap by itself.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,11 +15,11 @@ import torch
 from torch import Tensor
 
 from fdi_torch.effects import EFFECTS
-from fdi_torch.effects.clipping import ReadingLimit
+from fdi_torch.effects.clipping import ReadingLimit, clipped_noise
 from fdi_torch.gap.candidate import Fit
 from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.channel_noise import Noise
-from fdi_torch.gap.dataset import DataSet
+from fdi_torch.gap.dataset import DataSet, at_recorded_times
 from fdi_torch.plant.description import PlantDescription, Sensor, with_unlimited_sensors
 from fdi_torch.plant.effect import Placement
 from fdi_torch.recording import Recording
@@ -61,7 +62,7 @@ def limits_from_readings(
 
 
 def noise_before_clipping(noise: Noise, data: DataSet, predicted: Tensor) -> Noise:
-    """The noise before clipping: its level is estimated from the samples far from the limits, by differences of
+    """The noise before clipping: its level is estimated from the readings far from the limits, by differences of
     neighbours, which contain little model error. The correlation is that of all samples, since short segments determine
     it badly.
 
@@ -71,7 +72,7 @@ def noise_before_clipping(noise: Noise, data: DataSet, predicted: Tensor) -> Noi
     for c, ends in enumerate(_limits_per_sensor(data)):
         unclipped = data.mask[:, c]
         for name, end in ends.items():
-            unclipped = unclipped & (_beyond(name, predicted[:, c], end) < -CLEAR * float(noise.std[c]))
+            unclipped = unclipped & (_beyond(name, data.readings[:, c], end) < -CLEAR * float(noise.std[c]))
         if ends and int(unclipped.sum()) > FEWEST * int(data.mask[:, c].sum()):
             differences = torch.diff(residual[:, c])[unclipped[1:] & unclipped[:-1]]
             std[c] = torch.sqrt(differences.square().mean() / (2.0 * (1.0 - noise.lag_one[c])))
@@ -91,17 +92,35 @@ def with_noise_limits(data: DataSet, null: Fit, noise: Noise) -> DataSet:
     rms = torch.sqrt(residual.square().sum(dim=0) / data.mask.sum(dim=0))  # the level of slow noise is determined badly
     effects = {p.prefix: p for p in data.nominal_effects}
     for c, (sensor, ends) in enumerate(zip(data.plant.sensors, _limits_per_sensor(data), strict=True)):
-        std = min(float(noise.std[c]), float(rms[c]))
+        # A row may be the mean of several readings, each of which was clipped.
+        a_row = math.sqrt(len(data.recorded(c)) / int(data.mask[:, c].sum()))
+        std = a_row * min(float(noise.std[c]), float(rms[c]))
         for name, end in ends.items():
             placement = effects.get(f"{sensor.name}.{name}", Placement(LIMITS[name], sensor.name))
             values = dict(placement.values or {})
             stated = [limit for limit in (values.get("limit"), _of_plant(sensor, name)) if limit is not None]
             if stated and all(abs(limit - end) < std for limit in stated):
-                beyond = data.mask[:, c] & (_beyond(name, levels[:, c], end) > CLEAR * std)
-                behind = _share_after_limit(data.readings[beyond, c] == end)
-                values = {"limit": end, **values, "noise": std, "behind": behind}
+                depth = _mean_depth(data, levels, c, name, end, std)
+                values = {"limit": end, **values, **clipped_noise(depth, std)}
                 effects[placement.prefix] = replace(placement, values=values)
     return replace(data, nominal_effects=tuple(effects.values()))
+
+
+def _mean_depth(data: DataSet, levels: Tensor, channel: int, name: str, end: float, std: float) -> float:
+    """Mean distance of readings from a limit where the level is far beyond it and the reading before is at it, in their
+    unit; 0 if there are none. levels (S, C): readings without limits.
+
+    The reading before confirms the predicted level, of which other effects may be left out.
+    """
+    depths = [levels.new_zeros(0)]
+    for k, rows in enumerate(data.rows):
+        part = data.alone(k)
+        column = part.recording.output_columns([data.plant.sensors[channel].column])[0]
+        readings, valid = part.recording.outputs[:, column], part.recording.mask[:, column]
+        beyond = valid & (_beyond(name, at_recorded_times(part, levels[rows])[:, channel], end) > CLEAR * std)
+        depths.append(-_beyond(name, readings, end)[1:][beyond[1:] & valid[:-1] & (readings[:-1] == end)])
+    depth = torch.cat(depths)
+    return float(depth.mean()) if len(depth) else 0.0
 
 
 def _unlimited(data: DataSet, null: Fit, noise: Noise) -> Tensor:
@@ -121,15 +140,9 @@ def _of_plant(sensor: Sensor, name: str) -> float | None:
     return sensor.high if LIMITS[name].upper else sensor.low
 
 
-def _share_after_limit(at_end: Tensor) -> float:
-    """Share of the noise that is added after the limit: half of the samples far beyond with such noise are off the
-    limit."""
-    return min(2.0 * float((~at_end).double().mean()), 1.0) if len(at_end) else 0.0
-
-
 def _limits_per_sensor(data: DataSet) -> list[dict[str, float]]:
-    """Limits of each sensor, as in `limits_of`."""
-    return [limits_of(data.readings[valid, c]) for c, valid in enumerate(data.mask.T)]
+    """Limits of each sensor that its readings show, as in `limits_of`."""
+    return [limits_of(data.recorded(c)) for c in range(len(data.plant.sensors))]
 
 
 def _longest_run(flags: Tensor) -> int:
