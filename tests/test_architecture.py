@@ -68,6 +68,7 @@ DOORS = {
         "monitor/detection.py",
         "monitor/monte_carlo/detection_plan.py",
         "monitor/structural_analysis.py",
+        "study/summary.py",
     ),
     "mcap": ("logbook/",),
     "yaml": ("config/",),

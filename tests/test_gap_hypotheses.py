@@ -160,7 +160,7 @@ def test_a_cross_section_is_no_error_of_the_law_of_a_leak(
         fit = fitter.fit(Candidate((left,), (both.fit.values_of([left]),)), null)
         return RankedExplanation(fit, fitter, both.noise, 0.0)
 
-    pool = cast(ExplanationPool, SimpleNamespace(fitter=fitter, choices=CHOICES, without=without))
+    pool = cast(ExplanationPool, SimpleNamespace(fitter=fitter, choices=CHOICES, refitted_without=without))
     options = options_of([leak, other], fitter, operating_range_of(fitter.data.recording, THREE_TANK))
     variants = HypothesisWeights(pool, options, 1).with_inexact_laws(
         CauseHypothesis(both, causes_in_order(both.fit), 0.0)

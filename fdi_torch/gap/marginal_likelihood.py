@@ -165,17 +165,23 @@ def occam(
 ) -> float:
     """Log of the volume of the posterior over that of the prior (Occam factor).
 
-    jacobian (S, C, P): whitened. residual (S, C): whitened, if the bounds of the parameters are counted: the posterior
-    of a parameter that its bound holds back lies between the bound and the inside of its range only.
+    jacobian (S, C, P): whitened. residual (S, C): whitened, if the bounds of the parameters are counted.
     """
     j, widths = jacobian.flatten(0, 1), [math.exp(log_width(fitter, space, i)) for i in range(len(space))]
-    weight, slope = 1.0 / space.std(theta), None
-    if residual is not None:
-        gradient = (theta - space.nominal(theta)) * weight**2 - j.T @ residual.flatten()
-        low, high, _ = fitter.box(space)
-        held = held_back(theta[None], gradient[None], low[None], high[None])[0]
-        slope = torch.where(held, gradient.abs(), 0.0)
-    return log_volume(j.T @ j + torch.diag(weight**2), torch.tensor(widths, dtype=torch.float64), slope)
+    slope = None if residual is None else slope_at_bounds(fitter, space, theta, jacobian, residual)
+    return log_volume(j.T @ j + torch.diag(space.std(theta) ** -2.0), torch.tensor(widths, dtype=torch.float64), slope)
+
+
+def slope_at_bounds(fitter: Fitter, space: ParameterSpace, theta: Tensor, jacobian: Tensor, residual: Tensor) -> Tensor:
+    """Magnitude (P,) of the derivatives of half of chi-square by the parameters that a bound holds back, 0 for others.
+
+    The posterior of such a parameter lies between its bound and the inside of its range only. residual (S, C),
+    jacobian (S, C, P): whitened.
+    """
+    gradient = (theta - space.nominal(theta)) / space.std(theta) ** 2 - jacobian.flatten(0, 1).T @ residual.flatten()
+    low, high, _ = fitter.box(space)
+    held = held_back(theta[None], gradient[None], low[None], high[None])[0]
+    return torch.where(held, gradient.abs(), 0.0)
 
 
 def log_prior(causes: Iterable[CauseName], choices: int) -> float:

@@ -159,7 +159,7 @@ class DiscrepancyAscent:
         whitened = WhitenedDiscrepancy(under, fit, discrepancy)
         costs = regressor_costs(discrepancy.choices, self.largest)
         regressed = whitened.sparse_fit(discrepancy.regressor, costs, start, exchanges=exchanges)
-        without = log_likelihood(under, fit, discrepancy.linearised) + noise.log_prior() - self.base
+        without = log_likelihood(under, fit, discrepancy.linearised, bounded=False) + noise.log_prior() - self.base
         return EvaluatedDiscrepancy(place, noise, under, regression, discrepancy, whitened, regressed, without)
 
     def about(

@@ -201,7 +201,7 @@ def _first_order_gains(
     fit, linearised, fitter = regression.fit, regression.linearised, regression.fitter
     under = [with_disturbances(fitter, fit, noise, linearised) for noise in noises]
     without = [
-        log_likelihood(each, fit, linearised) + noise.log_prior() - base
+        log_likelihood(each, fit, linearised, bounded=False) + noise.log_prior() - base
         for each, noise in zip(under, noises, strict=True)
     ]
     gains, first_order = SingleRegressorGains(regression, under, torch.Generator().manual_seed(0)), {}

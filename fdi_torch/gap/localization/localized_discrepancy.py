@@ -16,7 +16,7 @@ from fdi_torch.gap.candidate_fit import Fitter
 from fdi_torch.gap.localization.discrepancy_columns import Selection
 from fdi_torch.gap.localization.predicted_levels import LevelFilter
 from fdi_torch.gap.localization.regressors import HARMONICS
-from fdi_torch.gap.marginal_likelihood import occam, with_disturbances
+from fdi_torch.gap.marginal_likelihood import occam, slope_at_bounds, with_disturbances
 from fdi_torch.parameters import ParameterSpace
 from fdi_torch.simulate.linearised import Linearised
 
@@ -111,11 +111,12 @@ class LocalizedDiscrepancy:
         return tuple(period / k for period in first for k in range(1, HARMONICS + 1))
 
 
-def log_likelihood(fitter: Fitter, fit: Fit, linearised: Linearised) -> float:
+def log_likelihood(fitter: Fitter, fit: Fit, linearised: Linearised, bounded: bool = True) -> float:
     """Log evidence of a fit about a linearised trajectory, without prior odds.
 
-    Minus infinity if it is not finite, or if the innovations are lost to rounding. A plant linearised about levels that
-    are none of its trajectories may be unstable: where the cross-section of a tank falls to a tenth within millimetres,
+    bounded: whether parameters that a bound holds back stay there; beside a discrepancy they may leave it. Minus
+    infinity if it is not finite, or if the innovations are lost to rounding. A plant linearised about levels that are
+    none of its trajectories may be unstable: where the cross-section of a tank falls to a tenth within millimetres,
     deviations grew by a factor of 100 per second, up to 1e57 m. Such innovations are rounding errors, or exactly zero.
     """
     space, theta = fit.space, fit.theta
@@ -127,9 +128,11 @@ def log_likelihood(fitter: Fitter, fit: Fit, linearised: Linearised) -> float:
     total = fitter.log_det + float(residual.square().sum() + jacobian.square().sum())
     if not (math.isfinite(total) and in_noise < ROUNDED):
         return -math.inf
-    basis, _ = decomposed((jacobian * scale).flatten(0, 1), pull)
-    remaining = without(basis, torch.cat([residual.flatten(), -off]).unsqueeze(1))
-    return -0.5 * float(remaining.square().sum()) - 0.5 * fitter.log_det + occam(fitter, space, theta, jacobian)
+    free = slope_at_bounds(fitter, space, theta, jacobian, residual) == 0.0 if bounded else torch.ones_like(off) > 0.0
+    basis, _ = decomposed((jacobian * scale)[..., free].flatten(0, 1), pull[free])
+    remaining = without(basis, torch.cat([residual.flatten(), -off[free]]).unsqueeze(1))
+    chi_square = float(remaining.square().sum() + off[~free].square().sum())
+    return -0.5 * (chi_square + fitter.log_det) + occam(fitter, space, theta, jacobian, residual if bounded else None)
 
 
 def log_evidence(fitter: Fitter, fit: Fit, noise: StateNoise, linearised: Linearised) -> float:
