@@ -167,7 +167,7 @@ class Monitor:
     def _process(
         self, state: MonitorState, samples: Samples, show: Callable[[ResidualTrace], None] | None
     ) -> tuple[MonitorState, int, list[Event]]:
-        """Process samples up to the next alarm, outage or scheduled fit, and carry that out. Returns the number processed."""
+        """Process samples up to the next alarm, notice or scheduled fit, and carry that out. Returns their number."""
         learning = state.learning_until > LONG_AGO
         due = samples.time >= (state.learning_until if learning else self.alarms.next_fit(state))
         count = int(due.to(torch.int8).argmax()) + 1 if bool(due.any()) else len(samples)
