@@ -339,6 +339,6 @@ def test_a_forecast_has_the_random_flows_that_were_learnt_at_any_sampling_interv
     flows = FlowFilter(*known, none, none.unsqueeze(-1)[..., :0], none[0:0, 0])
     points, span = _grid(horizon, interval)
     assert points <= POINTS and points * span == pytest.approx(horizon, abs=0.5 * span)
-    memory, generator = torch.zeros(4000, 2, dtype=torch.float64), torch.Generator().manual_seed(1)
+    memory, generator = torch.zeros(4000, 5, dtype=torch.float64), torch.Generator().manual_seed(1)
     _, shocks = _random_flows(flows, memory, points, span, generator)
     assert float(shocks.sum(1).std()) == pytest.approx(1e-3 * (points * span * interval) ** 0.5, rel=0.05)

@@ -204,27 +204,56 @@ class FlowFilter:
             step, shocks, samples = step @ step, step @ shocks @ step.mT + shocks, samples // 2
         return transition, total
 
-    def __call__(self, residual: Tensor, number: int = 0, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Innovations (*batch, S, sensors) in the readings' units, and the filter's state (*batch, S, D) after
-        each sample: states (n), flows (n), and the noise of sensors if it is correlated.
+    def covariance_after(self, memory: Tensor) -> Tensor:
+        """Covariance (D, D) of the state in a memory (G,): the steady one, unless readings were missing lately."""
+        size = len(self.transition)
+        packed, (row, column) = memory[size:], torch.tril_indices(size, size)
+        if not bool(packed.any()):
+            return self.covariance
+        covariance = memory.new_zeros(size, size)
+        covariance[row, column] = covariance[column, row] = packed
+        return covariance
 
+    @cached_property
+    def _opening_covariances(self) -> Tensor:
+        """Covariance (K, D, D) of the predicted state at the first samples, where the gain is not steady yet."""
+        levels = with_effects(self.start_std, len(self.linear.transition))
+        predicted = torch.diag(torch.cat([levels, self.flow_std, self.reading_std[: self._noises]]) ** 2)
+        path, process = [predicted[:0].new_zeros(0, *predicted.shape)], torch.diag(self.process_std**2)
+        for gain in self.gain.opening:
+            path.append(predicted[None])
+            corrected = predicted - gain @ self.joint.output @ predicted
+            predicted = self.transition @ corrected @ self.transition.mT + process
+        return torch.cat(path)
+
+    def __call__(
+        self, residual: Tensor, number: int = 0, memory: Tensor | None = None, states: bool = True
+    ) -> tuple[Tensor, Tensor]:
+        """Innovations (*batch, S, sensors) in the readings' units, and the filter's memory (*batch, S, G) after each
+        sample: the state, that is, states (n), flows (n), and the noise of sensors if it is correlated; then the lower
+        triangle of its covariance, 0 where that is the one without missing readings. Without `states`, G = 0.
+
+        Beside missing readings the innovations are scaled, so that they keep the covariance of the steady state.
         residual (*batch, S, sensors): scaled to the steady variance (`Observation.steady_residual`). number: samples
-        of the run before the first. memory (*batch, D): state before the first sample, 0 where the filter starts.
+        of the run before the first. memory (*batch, G): before the first sample, 0 where the filter starts.
         """
         batch, (count, channels) = residual.shape[:-2], residual.shape[-2:]
         size, lanes = len(self.transition), batch.numel()
+        whole = size + size * (size + 1) // 2
         raw = (residual * self.observer.spread(number, count)).reshape(lanes, count, channels).contiguous()
-        state = raw.new_zeros(size) if memory is None or number == self.begins else memory
-        state = state.expand(*batch, size).reshape(lanes, size).contiguous()
-        out, path = torch.empty_like(raw), raw.new_empty(lanes, count, size)
+        state = raw.new_zeros(whole) if memory is None or number == self.begins else memory
+        state = state.expand(*batch, whole).reshape(lanes, whole).contiguous()
+        out, path = torch.empty_like(raw), raw.new_empty(lanes, count, whole if states else 0)
         processed = number - self.begins
-        tables = [self.gain.table(processed, count).contiguous(), self.observer.table(number, count).contiguous()]
-        fixed = [self.transition.contiguous(), self.joint.output.contiguous()]
-        pointers = [ctypes.c_void_p(x.data_ptr()) for x in (*fixed, *tables, raw, state, out, path)]
+        opening = self._opening_covariances[processed : processed + count]
+        fixed = [self.transition, self.joint.output, self.process_std**2, self.white_std**2, self.covariance, opening]
+        tables = [self.gain.table(processed, count), self.gain.spread(processed, count)]
+        given = [x.contiguous() for x in (*fixed, *tables, self.observer.table(number, count), raw, state)]
+        pointers = [ctypes.c_void_p(x.data_ptr()) for x in (*given, out)]
         library = _library(len(self.linear.transition), channels, size)
-        library.flow_filter(ctypes.c_int64(lanes), ctypes.c_int64(count), *pointers)
-        out = out.reshape(residual.shape) / self.gain.spread(processed, count)
-        return out, path.reshape(*batch, count, size)
+        counts = (ctypes.c_int64(n) for n in (lanes, count, len(opening)))
+        library.flow_filter(*counts, *pointers, ctypes.c_void_p(path.data_ptr() if states else None))
+        return out.reshape(residual.shape), path.reshape(*batch, *path.shape[1:])
 
 
 def forcing(transition: Tensor) -> Tensor:

@@ -94,7 +94,7 @@ def _drawn_explanations(fits: Sequence[HypothesisFit]) -> list[int]:
 def _present_states(
     observer: ObserverBank, state: MonitorState, change: DetectedChange, fits: Sequence[HypothesisFit]
 ) -> tuple[Tensor, Tensor]:
-    """The observer's state (fits, order + M) and that of the flow filter (fits, F) now, under each explanation."""
+    """The observer's state (fits, order + M) and the flow filter's memory (fits, G) now, under each explanation."""
     window = state.window(min(f.onset for f in fits))
     path, residual = observer.run(window, change.before, changes_of(fits))
     memory = observer.whitening.innovations(residual, window.number, window.memory)[1]
@@ -130,14 +130,15 @@ def _random_flows(
     """Deviations (DRAWS, order) of the states from those of the observer now, and what random flows add to the states
     between the points (DRAWS, points, order), m.
 
-    memory (DRAWS, F): state of the flow filter. span: s between the points, a multiple of the filter's interval.
+    memory (DRAWS, G): of the flow filter, with one covariance for all. span: s between the points, a multiple of the
+    filter's interval.
     """
     if flows is None:
         return memory.new_zeros(1, 1), memory.new_zeros(1, 1, 1)
     transition, covariance = flows.over(round(span / flows.interval))
     n, size = len(transition) // 2, len(transition)
     normal = torch.randn(points + 1, len(memory), 2 * n, generator=generator, dtype=memory.dtype)
-    present = memory[:, :size] + normal[0] @ _root(flows.covariance[:size, :size]).mT
+    present = memory[:, :size] + normal[0] @ _root(flows.covariance_after(memory[0])[:size, :size]).mT
     deviation, flow = present.split(n, dim=1)
     level_shocks, flow_shocks = (normal[1:] @ _root(covariance).mT).split(n, dim=2)
     added = []

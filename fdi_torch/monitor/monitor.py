@@ -147,6 +147,7 @@ class Monitor:
             hidden=tuple(fault.moved(back) for fault in state.hidden),
             pending=state.pending,
             learning_until=state.learning_until,
+            outages=state.outages,
             errors=replace(fresh.errors, constants=state.errors.constants).as_calibrated(),
         )
         events = [self.writer.notice(fresh, notice)]
@@ -155,16 +156,24 @@ class Monitor:
                 fresh, state.pending.number, "the samples that would explain it are missing"
             )
             events.append(event)
-        return fresh, events
+        fresh, notices = self._with_outages(fresh, samples.segment(0, 1))
+        return fresh, [*events, *notices]
+
+    def _with_outages(self, state: MonitorState, samples: Samples) -> tuple[MonitorState, list[Event]]:
+        """The state with the outages of sensors after its last samples, and the notices about them."""
+        outages, notices = state.outages.along(samples, state.learning_until)
+        return replace(state, outages=outages), [self.writer.notice(state, text) for _, text in notices]
 
     def _process(
         self, state: MonitorState, samples: Samples, show: Callable[[ResidualTrace], None] | None
     ) -> tuple[MonitorState, int, list[Event]]:
-        """Process samples up to the next alarm or scheduled fit, and carry that out. Returns the number processed."""
+        """Process samples up to the next alarm, notice or scheduled fit, and carry that out. Returns their number."""
         learning = state.learning_until > LONG_AGO
         due = samples.time >= (state.learning_until if learning else self.alarms.next_fit(state))
         count = int(due.to(torch.int8).argmax()) + 1 if bool(due.any()) else len(samples)
         count = min(count, LARGEST_BATCH)
+        outages = state.outages.along(samples.segment(0, count), state.learning_until)[1]
+        count = min([count, *(first + 1 for first, _ in outages)])
         moved, statistic = self._observed(state, samples.segment(0, count))
         above = statistic > self.detector.threshold
         listens = state.pending is None or state.pending.attempts > 0
@@ -174,6 +183,7 @@ class Monitor:
             moved, statistic = self._observed(state, samples.segment(0, count))
         if show is not None:
             show(ResidualTrace(moved.samples.time[-count:], moved.residual[-count:], statistic))
+        moved, notices = self._with_outages(moved, samples.segment(0, count))
         earliest = max(moved.earliest_start, self.alarms.earliest_start(moved))
         moved = drop_old_samples(replace(moved, earliest_start=earliest), self.fewest)
         if learning:
@@ -185,11 +195,11 @@ class Monitor:
                     earliest_start=state.learning_until,
                     errors=moved.errors.as_learnt(),
                 )
-            return moved, count, []
+            return moved, count, notices
         state, events = self.alarms.on_threshold(moved) if raised else (moved, [])
         if not raised and state.now >= self.alarms.next_fit(state):
             state, events = self.alarms.on_schedule(state)
-        return state, count, events
+        return state, count, [*notices, *events]
 
     def _observed(self, state: MonitorState, samples: Samples) -> tuple[MonitorState, Tensor]:
         """The state after the samples, and the detector's statistic (S,) at each of them."""

@@ -12,6 +12,7 @@ from fdi_torch.monitor.hypothesis import HypothesisFit
 from fdi_torch.monitor.law_errors import LawErrors
 from fdi_torch.monitor.observer_bank import LONG_AGO, ObserverWindow
 from fdi_torch.monitor.samples import ClockState, Samples
+from fdi_torch.monitor.sensor_outages import SensorOutages
 
 
 @dataclass(frozen=True)
@@ -123,9 +124,9 @@ class MonitorState:
     Parameters:
       believed (P,): values that the observer uses; healthy (P,): the same with every fault at nominal.
     Bookkeeping:
-      clock: time of the last sample. detector_memory: None after a restart of the detector. alarms: all so far.
-      pending: the alarm that is not isolated yet. change: the latest. tracks: the known faults. hidden: faults whose
-      end the readings have not shown yet. learning_until: no alarm is raised before it, s.
+      clock: time of the last sample. outages: of the sensors. detector_memory: None after a restart of the detector.
+      alarms: all so far. pending: the alarm that is not isolated yet. change: the latest. tracks: the known faults.
+      hidden: faults whose end the readings have not shown yet. learning_until: no alarm is raised before it, s.
     """
 
     samples: Samples
@@ -141,6 +142,7 @@ class MonitorState:
     healthy: Tensor
     reachable: float
     clock: ClockState
+    outages: SensorOutages
     earliest_start: float = LONG_AGO
     detector_memory: Tensor | None = None
     alarms: tuple[Alarm, ...] = ()

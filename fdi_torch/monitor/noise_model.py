@@ -138,7 +138,7 @@ def _likely_errors(flows: FlowFilter, residual: Tensor, effects: Tensor) -> Tens
     with the means `flows.expected` and unit variance."""
     std = flows.innovation_std
     rest = residual - _sum(effects, flows.expected)
-    x, y = ((flows(values)[0] / std).nan_to_num() for values in (effects, rest))
+    x, y = ((flows(values, states=False)[0] / std).nan_to_num() for values in (effects, rest))
     x, y = x.flatten(1), y.flatten()
     return flows.expected + torch.linalg.solve(x @ x.mT + torch.eye(len(x), dtype=x.dtype), x @ y)
 

@@ -62,7 +62,7 @@ class ObserverWindow:
     """A time window in which a change is searched for.
 
     samples: the first one only sets the start; `state` (order + M,) is the observer's state after its correction,
-    `number` the count of samples that the observer had processed by then, and `memory` the state of the flow filter
+    `number` the count of samples that the observer had processed by then, and `memory` that of the flow filter
     (None: zero). The later samples are compared.
     """
 
@@ -139,7 +139,8 @@ class ObserverBank:
 
     def _white(self, window: ObserverWindow, residual: Tensor) -> Tensor:
         """The white innovations of residuals if all constants are exact."""
-        white = self.whitening.of_innovations(self.whitening.innovations(residual, window.number, window.memory)[0])
+        innovations, _ = self.whitening.innovations(residual, window.number, window.memory, states=False)
+        white = self.whitening.of_innovations(innovations)
         white[:, : self.whitening.order] = 0.0
         return torch.nan_to_num(white, nan=0.0)
 

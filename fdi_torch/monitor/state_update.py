@@ -18,6 +18,7 @@ from fdi_torch.monitor.law_errors import SIZE_ERROR, STEP, LawErrors, normalized
 from fdi_torch.monitor.monitor_state import DetectedChange, MonitorState
 from fdi_torch.monitor.observer_bank import LONG_AGO, ChangeHypotheses, ObserverBank, ObserverWindow
 from fdi_torch.monitor.samples import ClockState, Samples, concatenated
+from fdi_torch.monitor.sensor_outages import SensorOutages
 
 
 def initial_state(
@@ -58,6 +59,7 @@ def initial_state(
         healthy=healthy,
         reachable=now,
         clock=ClockState(now),
+        outages=SensorOutages.at_start(observer.network.description.outputs()).along(first, now)[0],
     )
 
 

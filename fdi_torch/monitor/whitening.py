@@ -75,23 +75,49 @@ class Whitening:
         """Residuals of a run from its first sample on, scaled to the steady variance (*batch, S, C) -> white
         (*batch, S, C), NaN if one that it depends on is missing.
         """
-        return self.of_innovations(self.innovations(residual)[0])
+        return self.of_innovations(self.innovations(residual, states=False)[0])
 
-    def innovations(self, residual: Tensor, number: int = 0, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Innovations of the flow filter and its states after each sample; see `FlowFilter.__call__`."""
+    def innovations(
+        self, residual: Tensor, number: int = 0, memory: Tensor | None = None, states: bool = True
+    ) -> tuple[Tensor, Tensor]:
+        """Innovations of the flow filter and its memory after each sample; see `FlowFilter.__call__`."""
         if self.flows is None:
             return residual, residual[..., :0]
-        return self.flows(residual, number, memory)
+        return self.flows(residual, number, memory, states)
 
     def of_innovations(self, innovations: Tensor) -> Tensor:
-        """White e of innovations (*batch, S, C). Innovations before the first sample are taken to equal their mean."""
+        """White e of innovations (*batch, S, C), NaN where one is missing, or an earlier one of the same channel on
+        which it depends.
+
+        Innovations before the first sample, and missing ones of other channels, are taken to equal their mean.
+        """
         deviation = innovations - self.mean
         own = deviation
         for lag, matrix in enumerate(self.coefficients, start=1):
             before = torch.zeros_like(deviation)
             before[..., lag:, :] = deviation[..., :-lag, :]
-            own = own - _apply(matrix, before)
-        return _apply(self.whitener, own)
+            unknown = torch.isnan(before)
+            moved = own - _apply(matrix, torch.where(unknown, 0.0, before))
+            own = torch.where(unknown & (matrix.diagonal() != 0.0), torch.nan, moved)
+        missing = torch.isnan(own)
+        if not bool(missing.any()):
+            return _apply(self.whitener, own)
+        lanes, channels = own.reshape(-1, *own.shape[-2:]), own.shape[-1]
+        if not bool((missing.reshape(lanes.shape) == missing.reshape(lanes.shape)[0]).all()):
+            lanes = lanes.reshape(1, -1, channels)
+        white = torch.full_like(lanes, torch.nan)
+        patterns, kind = torch.unique(~torch.isnan(lanes[0]), dim=0, return_inverse=True)
+        for index, present in enumerate(patterns):
+            rows, columns = (kind == index).nonzero(), present.nonzero()[:, 0]
+            white[:, rows, columns] = _apply(self._whitener_of(columns), lanes[:, rows, columns])
+        return white.reshape(own.shape)
+
+    def _whitener_of(self, columns: Tensor) -> Tensor:
+        """The whitener of some channels alone: the inverse Cholesky factor of their own covariance."""
+        if len(columns) == len(self.whitener):
+            return self.whitener
+        factor = torch.linalg.inv(self.whitener)[columns]
+        return torch.linalg.inv(torch.linalg.cholesky(factor @ factor.mT))
 
 
 def score_whitenings(residual: Tensor, highest_order: int = HIGHEST_ORDER) -> list[tuple[float, Whitening]]:

@@ -12,7 +12,9 @@ from fdi_torch.estimate.fitting import Fitting, set_up
 from fdi_torch.monitor.events import Event, Explanation, Kind, size_of
 from fdi_torch.monitor.monitor import Monitor, ResidualTrace
 from fdi_torch.monitor.monitor_state import MonitorState
+from fdi_torch.monitor.observer_bank import LONG_AGO
 from fdi_torch.monitor.samples import Samples, split_at_gaps
+from fdi_torch.monitor.sensor_outages import SensorOutages
 from fdi_torch.monitor.state_update import advance_observer, drop_old_samples, initial_state
 from fdi_torch.monitor.window_estimators import ESTIMATORS, WindowData, WindowEstimate
 
@@ -62,7 +64,9 @@ class WindowMonitor:
         for segment, notice in segments:
             if notice:
                 events.append(self._event(state.observer, float(segment.time[0]), "notice", notice))
-                state = replace(self.start(segment.segment(0, 1), state.observer.believed), number=state.number)
+                fresh = replace(self.start(segment.segment(0, 1), state.observer.believed), number=state.number)
+                state, told = self._with_outages(fresh, segment.segment(0, 1), state.observer.outages)
+                events += told
                 segment = segment.segment(1, len(segment))
             while len(segment):
                 due = segment.time >= state.next_end
@@ -94,10 +98,21 @@ class WindowMonitor:
             observer=drop_old_samples(replace(moved, earliest_start=moved.now - 2.0 * self.length), fewest),
             alarmed=alarmed,
         )
+        state, notices = self._with_outages(state, samples, moved.outages)
+        events = sorted([*notices, *events], key=lambda event: event.time)
         if moved.now < state.next_end:
             return state, events
         state, event = self._estimate(state)
         return state, [*events, event]
+
+    def _with_outages(
+        self, state: WindowState, samples: Samples, before: SensorOutages
+    ) -> tuple[WindowState, list[Event]]:
+        """The state with the outages of sensors after its last samples, and the notices about them."""
+        outages, notices = before.along(samples, LONG_AGO)
+        observer = replace(state.observer, outages=outages)
+        told = [self._event(observer, float(samples.time[k]), "notice", text) for k, text in notices]
+        return replace(state, observer=observer), told
 
     def _estimate(self, state: WindowState) -> tuple[WindowState, Event]:
         """Fit the window that ends now, and give the estimate to the observer."""
