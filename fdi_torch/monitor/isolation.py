@@ -14,7 +14,14 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.evidence import posterior
-from fdi_torch.monitor.hypothesis import Fault, Hypothesis, HypothesisFit, with_posterior, with_unlisted_as_one
+from fdi_torch.monitor.hypothesis import (
+    NO_CHANGE,
+    Fault,
+    Hypothesis,
+    HypothesisFit,
+    with_posterior,
+    with_unlisted_as_one,
+)
 from fdi_torch.monitor.hypothesis_fit import Prior, changes_of, fit, misfit, no_change_fit, point_of
 from fdi_torch.monitor.initial_guesses import (
     oscillation_guess,
@@ -133,7 +140,8 @@ def with_flows_of_window(
 
     First, the hypotheses are fitted again with the flows that are most likely under the likeliest change, apart from
     those that are far from plausible with their previous values, both with the earlier flows and with these. Then the
-    evidence of each plausible hypothesis is raised by the log-likelihood that flows learnt under it add.
+    evidence of each plausible hypothesis, and of no change, is raised by the log-likelihood that flows learnt under it
+    add.
     """
     likeliest = next(f for f in ranked if f.hypothesis.columns)
     observer = observer.learning_from(window, believed, changes_of([likeliest]))[0]
@@ -148,7 +156,9 @@ def with_flows_of_window(
     starts, hypotheses = torch.stack([point_of(f) for f in changes]), [f.hypothesis for f in changes]
     fits = fit(observer, window, believed, hypotheses, starts, misfit(base), prior)
     fits.append(no_change_fit(observer, window, believed, base))
-    likely = {f.hypothesis for f in (*ranked, *with_posterior(fits)) if f.probability > SMALLEST_PROBABILITY}
+    plausible = (f for f in (*ranked, *with_posterior(fits)) if f.probability > SMALLEST_PROBABILITY)
+    # Chance may be implausible beside the flows of a change, although its own flows explain the window.
+    likely = {NO_CHANGE, *(f.hypothesis for f in plausible)}
     for i, f in enumerate(fits):
         if f.hypothesis in likely:
             gain = observer.learning_from(window, believed, changes_of([f]))[2]
