@@ -167,7 +167,7 @@ def with_flows_of_window(
         if f.hypothesis in likely:
             own = observer.learning_from(window, believed, changes_of([f]))[1]
             fits[i] = replace(f, evidence=f.evidence + f.misfit + own - start)
-    return observer, with_posterior(fits)
+    return observer, with_posterior(fits, [f.misfit for f in fits])  # no misfit is left that an excess could divide
 
 
 def _beyond_range(
