@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -24,7 +25,7 @@ from fdi_torch.monitor.detection import make_detector
 from fdi_torch.monitor.fault_free_checks import QUESTION, false_alarm_rate_text
 from fdi_torch.monitor.flow_filter import FlowFilter, forcing
 from fdi_torch.monitor.flow_noise_estimate import estimate_flow_filter
-from fdi_torch.monitor.hypothesis import Hypothesis
+from fdi_torch.monitor.hypothesis import NO_CHANGE, Hypothesis, HypothesisFit
 from fdi_torch.monitor.hypothesis_fit import Prior, fit, misfit, no_change_fit
 from fdi_torch.monitor.isolation import with_flows_of_window
 from fdi_torch.monitor.level_forecast import POINTS, _grid, _random_flows
@@ -143,34 +144,54 @@ def test_flows_learnt_from_a_window_too_are_those_of_the_whole_recording(correla
     assert spread_of_sums(white).tolist() == pytest.approx([1.0] * 3, abs=4.0 * 0.11)
 
 
+def ranked_beside_small_flows(
+    names: Sequence[str], run: Samples, share: float, hypotheses: Sequence[Hypothesis], starts: Tensor
+) -> tuple[ObserverBank, ObserverWindow, list[HypothesisFit], Prior]:
+    """The hypotheses from the 300th sample on, likeliest first, beside flows with a share of the intensity that was
+    learnt from the first 300 samples. starts (H, P+1): values and onsets.
+    """
+    network = build_network(PLANT, placements_for(names))
+    space = ParameterSpace([network.constants[name] for name in names])
+    nominal = space.nominal()
+    learnt, _ = learn_noise(network, run.segment(0, 300), space, nominal)
+    flows = learnt.whitening.flows
+    assert flows is not None
+    small = replace(flows, noise=replace(flows.noise, intensity=share * flows.noise.intensity))
+    whitener = learnt.whitening.whitener * (flows.innovation_std / small.innovation_std)
+    bank = ObserverBank(network, space, learnt.gain, replace(learnt.whitening, flows=small, whitener=whitener))
+    seen = Observer(network, learnt.gain, space, nominal).run(run)
+    window = ObserverWindow(run.segment(299, len(run)), seen.state[299], 300, small(seen.steady_residual)[1][299])
+    base = bank.white_innovations(window, nominal, no_change(nominal))
+    prior = Prior(space.names, 4, (300.0, 8000.0))
+    fits = fit(bank, window, nominal, hypotheses, starts, misfit(base), prior)
+    ranked = sorted([*fits, no_change_fit(bank, window, nominal, base)], key=lambda f: -f.evidence)
+    shares = posterior([f.evidence for f in ranked])
+    return bank, window, [replace(f, probability=p) for f, p in zip(ranked, shares, strict=True)], prior
+
+
 def test_a_fault_is_fitted_again_however_much_flows_learnt_as_too_small_favour_a_second_one() -> None:
     """A bias of h1 from 700 s on, and flows learnt with a twentieth of their intensity: plugging beside it explains
     what the flows do. With the flows of the window it does not.
     """
-    names = ("P32.plugging.size", "h1.sensor_bias.bias")
-    network = build_network(PLANT, placements_for(names))
-    space = ParameterSpace([network.constants[name] for name in names])
-    nominal, run = space.nominal(), disturbed(150.0, 1500)
+    names, run = ("P32.plugging.size", "h1.sensor_bias.bias"), disturbed(150.0, 1500)
     run.readings[700:, 0] += 0.03
-    learnt, _ = learn_noise(network, run.segment(0, 300), space, nominal)
-    flows = learnt.whitening.flows
-    assert flows is not None
-    small = replace(flows, noise=replace(flows.noise, intensity=0.05 * flows.noise.intensity))
-    whitener = learnt.whitening.whitener * (flows.innovation_std / small.innovation_std)
-    bank = ObserverBank(network, space, learnt.gain, replace(learnt.whitening, flows=small, whitener=whitener))
-    seen = Observer(network, learnt.gain, space, nominal).run(run)
-    memory = small(seen.steady_residual)[1]
-    window = ObserverWindow(run.segment(299, 1500), seen.state[299], 300, memory[299])
-    start = torch.cat([space.vector({names[1]: 0.03}), nominal.new_tensor([700.0])])
-    hypotheses, prior = [Hypothesis((1,)), Hypothesis((0, 1))], Prior(space.names, 4)
-    base = bank.white_innovations(window, nominal, no_change(nominal))
-    fits = fit(bank, window, nominal, hypotheses, start.repeat(2, 1), misfit(base), prior)
-    ranked = sorted([*fits, no_change_fit(bank, window, nominal, base)], key=lambda f: -f.evidence)
+    starts, hypotheses = torch.tensor([[0.0, 0.03, 700.0]], dtype=torch.float64), [Hypothesis((1,)), Hypothesis((0, 1))]
+    bank, window, ranked, prior = ranked_beside_small_flows(names, run, 0.05, hypotheses, starts.repeat(2, 1))
     assert ranked[0].hypothesis.columns == (0, 1) and ranked[0].evidence - ranked[1].evidence > 20.0
-    shares = posterior([f.evidence for f in ranked])
-    ranked = [replace(f, probability=p) for f, p in zip(ranked, shares, strict=True)]
-    again = with_flows_of_window(bank, window, nominal, ranked, prior)[1]
+    again = with_flows_of_window(bank, window, bank.space.nominal(), ranked, prior)[1]
     assert again[0].hypothesis.columns == (1,) and again[0].probability > 0.99
+
+
+def test_chance_is_compared_with_the_flows_that_are_most_likely_without_a_fault() -> None:
+    """No fault, and flows learnt with half their intensity: in 160 s, a leak of T3 explains what the flows do. Beside
+    the flows that are most likely with this leak, chance has odds of 1 to 5000; beside its own, of 1 to 1.
+    """
+    run, start = disturbed(80.0, 460), torch.tensor([[0.02, 310.0]], dtype=torch.float64)
+    hypotheses = [Hypothesis((0,)), Hypothesis((0,), incipient=True)]
+    bank, window, ranked, prior = ranked_beside_small_flows(("T3.leak.size",), run, 0.5, hypotheses, start.repeat(2, 1))
+    assert ranked[0].hypothesis.columns and ranked[0].evidence > 20.0
+    again = with_flows_of_window(bank, window, bank.space.nominal(), ranked, prior)[1]
+    assert next(f for f in again if f.hypothesis == NO_CHANGE).probability > 0.2
 
 
 @pytest.mark.parametrize(

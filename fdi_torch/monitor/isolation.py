@@ -14,7 +14,14 @@ import torch
 from torch import Tensor
 
 from fdi_torch.estimate.evidence import posterior
-from fdi_torch.monitor.hypothesis import Fault, Hypothesis, HypothesisFit, with_posterior, with_unlisted_as_one
+from fdi_torch.monitor.hypothesis import (
+    NO_CHANGE,
+    Fault,
+    Hypothesis,
+    HypothesisFit,
+    with_posterior,
+    with_unlisted_as_one,
+)
 from fdi_torch.monitor.hypothesis_fit import Prior, changes_of, fit, misfit, no_change_fit, point_of
 from fdi_torch.monitor.initial_guesses import (
     oscillation_guess,
@@ -132,8 +139,8 @@ def with_flows_of_window(
     them uncertain.
 
     First, the hypotheses are fitted again with the flows that are most likely under the likeliest change, apart from
-    those that are far from plausible with their previous values, both with the earlier flows and with these. Then the
-    evidence of each plausible hypothesis is raised by the log-likelihood that flows learnt under it add.
+    those that are far from plausible with their previous values, both with the earlier flows and with these. Then each
+    plausible hypothesis, and no change, has the likelihood of the flows that are most likely under it.
     """
     likeliest = next(f for f in ranked if f.hypothesis.columns)
     observer = observer.learning_from(window, believed, changes_of([likeliest]))[0]
@@ -148,12 +155,19 @@ def with_flows_of_window(
     starts, hypotheses = torch.stack([point_of(f) for f in changes]), [f.hypothesis for f in changes]
     fits = fit(observer, window, believed, hypotheses, starts, misfit(base), prior)
     fits.append(no_change_fit(observer, window, believed, base))
-    likely = {f.hypothesis for f in (*ranked, *with_posterior(fits)) if f.probability > SMALLEST_PROBABILITY}
+    plausible = (f for f in (*ranked, *with_posterior(fits)) if f.probability > SMALLEST_PROBABILITY)
+    # Chance may be implausible beside the flows of a change, although its own flows explain the window.
+    likely = {NO_CHANGE, *(f.hypothesis for f in plausible)}
+    # The likelihoods replace the misfits, also those before the flows are learnt anew: they begin at unknown levels, so
+    # that a hypothesis that explains little gains more from its flows than it has lost by its misfit.
+    closest = min(fits, key=lambda f: f.misfit)
+    _, likelihood, gain = observer.learning_from(window, believed, changes_of([closest]))
+    start = likelihood - gain + closest.misfit
     for i, f in enumerate(fits):
         if f.hypothesis in likely:
-            gain = observer.learning_from(window, believed, changes_of([f]))[2]
-            fits[i] = replace(f, evidence=f.evidence + gain)
-    return observer, with_posterior(fits)
+            own = observer.learning_from(window, believed, changes_of([f]))[1]
+            fits[i] = replace(f, evidence=f.evidence + f.misfit + own - start)
+    return observer, with_posterior(fits, [f.misfit for f in fits])  # no misfit is left that an excess could divide
 
 
 def _beyond_range(
