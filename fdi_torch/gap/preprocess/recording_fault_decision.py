@@ -80,7 +80,10 @@ class FaultSearch:
         """
         fits, as_is = self.fits, self.fits.as_is
         most = as_is.most + fits.prior - SURE  # what a perfect fit of a corrected recording allows the others
-        if most < as_is.log_likelihood:
+        rivals = [as_is.log_likelihood]
+        if explanation is not None and most >= as_is.log_likelihood:
+            rivals.append(self._weight_of(explanation))
+        if most < max(rivals):
             return None
         corrections = suspected(fits, self.constant, thorough)
         if not corrections:
@@ -88,9 +91,7 @@ class FaultSearch:
         silent_columns = {c for _, each in corrections if each.fault.silent for c in each.fault.channels}
         silent = frozenset(s.name for s in self.plant.sensors if s.column in silent_columns)
         others = self._weights_of_effects(silent, as_is.log_likelihood + corrections[0][0] - SURE)
-        rivals = [as_is.log_likelihood]
-        explained = [] if explanation is None else [self._weight_of(explanation)]
-        for rival in chain(explained, islice(others, RIVALS)):
+        for rival in islice(others, RIVALS):
             rivals.append(rival)
             if most < rival:
                 return None
