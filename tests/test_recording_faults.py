@@ -20,7 +20,7 @@ from fdi_torch.gap.diagnose import Settings, diagnose
 from fdi_torch.gap.preprocess.acquisition import examined, thorough_findings
 from fdi_torch.gap.preprocess.blockwise_likelihood import blocked_recording, blockwise_fit, noise_of
 from fdi_torch.gap.preprocess.corrected_fit import CorrectedFits, Correction
-from fdi_torch.gap.preprocess.recording_fault_decision import _log_weight, recording_fault
+from fdi_torch.gap.preprocess.recording_fault_decision import FaultSearch, _log_weight
 from fdi_torch.gap.preprocess.recording_faults import _units
 from fdi_torch.plant.description import Pipe, PlacedEffect, PlantDescription, Pump, Sensor, Tank
 from fdi_torch.plant.effect import Placement
@@ -232,7 +232,7 @@ def test_no_fault_is_fitted_where_one_effect_explains_the_recording(monkeypatch:
 
     monkeypatch.setattr(CorrectedFits, "first_order_gain", counted)
     monkeypatch.setattr(CorrectedFits, "fit", refused)
-    assert recording_fault(plant, recording) is None
+    assert FaultSearch(plant, recording).fault() is None
     assert suspected
 
 

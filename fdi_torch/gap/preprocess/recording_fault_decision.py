@@ -44,13 +44,6 @@ RIVALS, MOST_EFFECTS = 6, 2
 """Maximum numbers of rival effects fitted and of effects in one combination; they limit computing time as well."""
 
 
-def recording_fault(
-    plant: PlantDescription, recording: Recording, constant: tuple[str, ...] = (), thorough: bool = False
-) -> RecordingFault | None:
-    """The likeliest fault of a recording, or None if faults have less than 95 % together; as `FaultSearch.fault`."""
-    return FaultSearch(plant, recording, constant).fault(thorough)
-
-
 @dataclass(frozen=True)
 class FaultSearch:
     """The hypotheses about the faults of a recording; their fits are kept, so that a thorough search goes on from them.
